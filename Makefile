@@ -1,6 +1,7 @@
 # Two commands on a bare machine with python3 >= 3.11, python3-venv and make: `make solve` and `make test`.
 PYTHON ?= python3
-BIN := .venv/bin
+VENV ?= .venv
+BIN := $(VENV)/bin
 # One BLAS thread per process: the matrices are small and the work is spread over processes.
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
@@ -23,6 +24,24 @@ tests: setup-test
 test-room: setup-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal tests/$(ROOM)
 
+# The room that one works in, a folder of tests/: `make test-fast ROOM=pages`.
+ROOM ?= synthesis
+test-fast: setup-test
+	$(BIN)/python -m pytest -n 2 --dist worksteal tests/$(ROOM)
+
+# The same with each Python that the package claims and that is found, in an environment of its own.
+VERSIONS ?= 3.11 3.12 3.13 3.14
+test-pythons:
+	@for version in $(VERSIONS); do \
+	  python=; \
+	  for place in python$$version $$HOME/.pyenv/versions/$$version.*/bin/python; do \
+	    $$place -c "import ensurepip" 2>/dev/null && python=$$place; \
+	  done; \
+	  echo "Python $$version: $${python:-not found}"; \
+	  [ -z "$$python" ] || $(MAKE) --no-print-directory test-fast VENV=.venv-$$version \
+	    PYTHON=$$python || exit 1; \
+	done
+
 # The suite under the kernels that OpenBLAS has for other processors, three times each, with
 # examples drawn anew: an hour or more on two cores.
 test-processors: setup-test
@@ -43,19 +62,26 @@ bench: setup-test
 	$(BIN)/python benchmarks/synthesis.py
 
 # What runs offline beside other people's tools and designs; see docs/development/peers.md.
+# DRIVE and MIRROR are checkouts of the two repositories that are read, if there are any.
 peers: setup-test
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/back_ends.py 10 10
 	$(BIN)/python benchmarks/disk_drive.py
 	$(BIN)/python benchmarks/guided_beam.py
+	$(BIN)/python benchmarks/mathworks.py
+	$(BIN)/python benchmarks/stage_judge.py
+	$(BIN)/python benchmarks/mirror_held_out.py
+	test -z "$(DRIVE)" || $(BIN)/python benchmarks/drive_error.py --theirs $(DRIVE)
+	test -z "$(MIRROR)" || $(BIN)/python benchmarks/mirror_held_out.py --theirs $(MIRROR)
+	$(BIN)/python benchmarks/peer_table.py
 
-setup: .venv/.ready
-setup-test: .venv/.ready-test
+setup: $(VENV)/.ready
+setup-test: $(VENV)/.ready-test
 
 # The kernels are compiled once here, so that the first solve does not wait for them; what they need
 # is installed first, the other wheels meanwhile.
-.venv/.ready: requirements.lock pyproject.toml
-	test -d .venv || $(PYTHON) -m venv .venv
+$(VENV)/.ready: requirements.lock pyproject.toml
+	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(PIP) -c requirements.lock numba scipy
 	$(BIN)/python -c "from ccd_casadi.kernels import compilation; compilation.ensure_compiled()" & \
 	kernels=$$!; \
@@ -65,10 +91,10 @@ setup-test: .venv/.ready-test
 	wait $$kernels
 	touch $@
 
-.venv/.ready-test: .venv/.ready requirements-test.lock
+$(VENV)/.ready-test: $(VENV)/.ready requirements-test.lock
 	$(PIP) -r requirements-test.lock
 	touch $@
 
 clean:
-	rm -rf .venv site *.egg-info
+	rm -rf .venv .venv-* site *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -26,7 +26,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.inner_problem.sections_search import least_error_at, prepared
+from ccd_casadi.inner_problem.sections_search import least_value_at, prepared
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -169,7 +169,7 @@ def main() -> None:
                         ready, controller=replace(ready.controller, bandwidth_least=least)
                     )  # fmt: skip
                     began = time.process_time()
-                    ready, found = least_error_at(ready, theta, raced)
+                    ready, found = least_value_at(ready, theta, raced)
                     made = found.design
                     told(f"{label}, least RMS at {least / HZ:.1f} Hz and more",
                          made.bandwidth / HZ, made.controller, ready, began)  # fmt: skip

@@ -16,7 +16,7 @@ def table(comparison: "Comparison") -> str:
     """The methods in a few columns for the terminal."""
     from ccd_casadi.reporting.verdict import head_words
 
-    head = f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'box look':>10}"
+    head = f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'check':>10}"
     lines = [f"{head}{'s':>8}  status"]
     for method in comparison.methods:
         f = method.figures

@@ -20,7 +20,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
     folder = options.run
     if not folder.is_dir():
-        raise UserError(f"{folder}: is no folder; name the run folder of a finished solve")
+        raise UserError(f"{folder}: is not a folder; name the run folder of a finished solve")
     below = (path.parent for path in sorted(folder.glob(f"*/{NAME}")))
     drawn = []
     for place in (folder, *(own for own in below if not (own / "result.json").exists())):

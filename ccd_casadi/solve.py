@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
-    from ccd_casadi.codesign.design_entries import budget_lines
+    from ccd_casadi.codesign.design_entries import budget_lines, move_lines
     from ccd_casadi.inner_problem.sections_words import channel_words
     from ccd_casadi.reporting.facts import cost_words, loop_lines, theta_words
     from ccd_casadi.reporting.verdict import advice, terminal_lines
@@ -45,6 +45,7 @@ def summary(solution: "Solution") -> str:
         f"compliance    {result.get('compliance_words', 'not known')}",
         *loop_lines(result),
         *budget_lines(result),
+        *move_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         *design_plant_lines(result.get("robust") or {}),
         f"cost          {spent_words(result)}",
@@ -94,16 +95,17 @@ def _gains(controller: Mapping[str, Any]) -> str:
 
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     """What J counts of the controller, and what was predicted of it."""
+    from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
+
     error = f"(error {result['verification_error']:.1e})"
     where = " on every plant" if "plants" in result["certificate"] else ""
     bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{where}"
-    if result.get("minimise") != "rms_error":
+    v = FIGURES[result.get("minimise", BANDWIDTH.key)]
+    if v is BANDWIDTH:
         return [f"{bandwidth}   predicted {result['surrogate_bandwidth_hz']:.4f} Hz {error}"]
-    nm = [1e9 * result[key] for key in ("error_rms_of_set", "surrogate_error_rms")]
-    return [
-        f"RMS error     {nm[0]:.6g} nm over the set   predicted {nm[1]:.6g} nm {error}",
-        bandwidth,
-    ]
+    of, guess = (result[key] for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}"))
+    words = f"{v.words:<13} {v.shown(of, 6)} over the set   predicted {v.shown(guess, 6)} {error}"
+    return [words, bandwidth]
 
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:

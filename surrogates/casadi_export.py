@@ -65,7 +65,9 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     lengths = p.length_scales
     n, d = process.X.shape
     unit = in_unit_box(process, x)
-    z, s = squared_distances(unit, process.X, lengths)
+    # Columns are samples: CasADi stores by column, and this repeats x contiguously.
+    z = ca.repmat(unit / lengths, 1, n) - ca.DM((process.X / lengths).T)
+    s = ca.sum1(z * z).T
     phi = radial_expression(process.kernel, s, int(process.has_gradients))
     weights = process.weights.reshape(-1, n)
     total = ca.dot(ca.DM(weights[0]), phi[0])
@@ -109,13 +111,6 @@ def legendre_products(exponents: Array, v: ca.MX) -> ca.MX:
     for k in range(1, int(exponents.max(initial=1))):
         powers.append(((2 * k + 1) * v * powers[k] - k * powers[k - 1]) / (k + 1))
     return products_of(exponents, powers)
-
-
-def squared_distances(unit: ca.MX, X: Array, lengths: Array) -> tuple[ca.MX, ca.MX]:
-    """Return z (d, n) = (x̂ - X_i) / lengths and s (n, 1) = ‖z‖² at the symbol x̂ (d)."""
-    # Columns are samples: CasADi stores by column, and this repeats x contiguously.
-    z = ca.repmat(unit / lengths, 1, len(X)) - ca.DM((X / lengths).T)
-    return z, ca.sum1(z * z).T
 
 
 def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:

@@ -49,10 +49,12 @@ def extrapolation(surrogate: Surrogate, X: ArrayLike, x: ArrayLike) -> Extrapola
     Raises:
         ValueError: the point or the samples do not have the surrogate's inputs.
     """
+    from scipy.spatial import cKDTree
+
     low, span = surrogate.lower, surrogate.upper - surrogate.lower
     samples = (points_in(surrogate, X) - low) / span
     point = ((points_in(surrogate, x) - low) / span)[0]
-    near = _neighbours(samples)
+    near = cKDTree(samples).query(samples, k=2)[0][:, 1]  # to the nearest other sample
     spacing = float(np.median(near))
     distances = np.linalg.norm(samples - point, axis=1)
     nearest = float(distances.min())
@@ -100,10 +102,3 @@ def hull_distance(samples: Array, point: Array) -> float:
     A = np.vstack([samples.T, np.full(len(samples), heavy)])
     w, _ = nnls(A, np.append(point, heavy))
     return float(np.linalg.norm(samples.T @ (w / w.sum()) - point))
-
-
-def _neighbours(samples: Array) -> Array:
-    """Distances (n,) to the nearest other sample."""
-    from scipy.spatial import cKDTree
-
-    return np.asarray(cKDTree(samples).query(samples, k=2)[0])[:, 1]

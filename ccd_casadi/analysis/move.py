@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.lti.closed_loop import ClosedLoop
 from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.recurrence import states
@@ -157,12 +159,16 @@ def simulate(
     loop: Loop, profile: Setpoint, *, axis: int, forces: Array | None, window: float,
     bandwidth_hz: float, doublings: int = DOUBLINGS,
 ) -> Move:  # fmt: skip
-    """The move of output `axis`, the others told to stay; `forces` from `mass_feedforward`.
+    """The move of output `axis`, the others told to stay.
+
+    `forces` (m,) of `mass_feedforward`, or (5, m) of `feedforward`, by derivative of the setpoint.
 
     It is watched until it has settled, for a tail of `TAIL` periods of the bandwidth, doubled so
     often at most.
     """
-    ahead = np.zeros(loop.plant.B.shape[1]) if forces is None else forces
+    ahead = np.zeros((5, loop.plant.B.shape[1]))
+    if forces is not None:
+        ahead[2 if forces.ndim == 1 else slice(None)] = forces
     watch = _sampled if loop.sampling is not None else _continuous
     signals = watch(loop, profile, axis, ahead, window, TAIL / bandwidth_hz, doublings)
     return Move(*signals, forces is not None, profile.duration, window)
@@ -171,25 +177,43 @@ def simulate(
 Signals = tuple[Array, Array, Array, Array, Array]
 
 
+def forward_force(
+    profile: Setpoint, forward: Array, time: Array, period: float
+) -> tuple[Array, Array]:
+    """Setpoint (N,) and Σ_i F_i r^(i) (N, m) at `time`, F (5, m) of `feedforward`.
+
+    Of each derivative the mean over a period about the instant, as it is held that long: a snap
+    that jumps between two instants is felt in its share.
+    """
+    r, half = profile.at(time), 0.5 * period
+    r[1:] = (profile.at(time + half)[:4] - profile.at(time - half)[:4]) / period
+    return r[0], r.T @ forward
+
+
+def driven_states(
+    closed: ClosedLoop, G: StateSpace, r: Array, force: Array, axis: int = 0
+) -> Array:
+    """States (N, n) of a sampled loop by the setpoint of an output and a force ahead (N, m)."""
+    driven = np.outer(r, closed.B_r[:, axis])
+    driven[:, : len(G.A)] += force @ G.B.T
+    return states(closed.A, driven)
+
+
 def _sampled(
     loop: Loop, profile: Setpoint, axis: int, ahead: Array, window: float, tail: float, more: int
 ) -> Signals:
     """Hold and delay exact, at the instants; between them nothing is said."""
     closed, G = loop.closed, loop.as_run[0]
-    n = len(G.A)
     for _ in range(more):
         time = np.arange(np.ceil((profile.duration + tail) / closed.period) + 1) * closed.period
-        position, _, acceleration = (row for row in profile.at(time)[:3])
-        forward = np.outer(acceleration, ahead)
-        driven = np.outer(position, closed.B_r[:, axis])
-        driven[:, :n] += forward @ G.B.T
-        x = states(closed.A, driven)
+        position, forward = forward_force(profile, ahead, time, closed.period)
+        x = driven_states(closed, G, position, forward, axis)
         error = position - x @ closed.C_y[axis]
-        if np.abs(error[-SEGMENT:]).max() <= 0.5 * window:
+        if np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window:  # longer than a slow beat
             break
         tail *= 2.0
     force = x @ closed.C_u.T + np.outer(position, closed.D_u[:, axis]) + forward
-    return time, position, acceleration, error, force
+    return time, position, profile.at(time)[2], error, force
 
 
 def _continuous(
@@ -199,7 +223,8 @@ def _continuous(
     n, step = len(closed.A), tail / TAIL / STEPS
     # states: the loop, then r, ṙ, r̈, r⃛
     A = np.zeros((n + 4, n + 4))
-    A[:n, :n], A[:n, n], A[:n, n + 2] = closed.A, closed.B_r[:, axis], closed.B_d @ ahead
+    A[:n, :n], A[:n, n:] = closed.A, closed.B_d @ ahead[:4].T
+    A[:n, n] += closed.B_r[:, axis]
     A[n : n + 3, n + 1 :] = np.eye(3)
     x = np.zeros(n + 4)
     times, found = [0.0], [x]
@@ -209,6 +234,7 @@ def _continuous(
         count = max(SEGMENT, int(np.ceil(span / step)))
         extended = np.zeros((n + 5, n + 5))
         extended[: n + 4, : n + 4], extended[n + 3, n + 4] = A, 1.0
+        extended[:n, n + 4] = closed.B_d @ ahead[4]
         whole = expm(extended * (span / count))
         Phi, Gamma = whole[: n + 4, : n + 4], whole[: n + 4, n + 4] * snap
         start = times[-1]
@@ -232,5 +258,6 @@ def _continuous(
         tail *= 2.0
     X = np.array(found)
     force = X[:, :n] @ closed.C_u.T + np.outer(X[:, n], closed.D_u[:, axis])
-    force = force + np.outer(X[:, n + 2], ahead)
+    snaps = profile.at(np.array(times))[4:].T
+    force = force + np.hstack([X[:, n:], snaps]) @ ahead
     return np.array(times), X[:, n], X[:, n + 2], error_of(X), force

@@ -10,11 +10,10 @@ Each time is the longest that no later bound forbids, from the innermost outward
 Boerlage and Steinbuch 2005.)
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.support.arrays import Array
@@ -33,17 +32,30 @@ class Setpoint:
     @property
     def duration(self) -> float:
         """Of the move in s."""
-        return float(self.durations.sum())
+        return float(self.durations.real.sum())
+
+    @property
+    def squared_acceleration(self) -> Any:
+        """∫ r̈² dt over the move, m²/s³; exact."""
+        t, start = self.durations, self._starts()
+        a, j, s = start[:-1, 2], start[:-1, 3], self.snaps
+        inner = a * a + t * (a * j + t * ((j * j + a * s) / 3 + t * (j * s / 4 + t * s * s / 20)))
+        return (t * inner).sum()
+
+    def _starts(self) -> Array:
+        """r and three derivatives (16, 4) where each interval begins, and at the end."""
+        start = np.zeros((len(self.durations) + 1, 4), self.durations.dtype)
+        for i, (span, snap) in enumerate(zip(self.durations, self.snaps, strict=True)):
+            start[i + 1] = _advanced(start[i], snap, np.array([span]))[:4, 0]
+        start[-1, 1:] = 0.0  # what rounding left
+        return start
 
     def at(self, times: Array) -> Array:
         """r, ṙ, r̈, r⃛ and r⁗ (5, k) at times in s, at rest before the start and after the end."""
         ends = np.concatenate([[0.0], np.cumsum(self.durations)])
-        start = np.zeros((len(ends), 4))  # of each interval: r and three derivatives
-        for i, (span, snap) in enumerate(zip(self.durations, self.snaps, strict=True)):
-            start[i + 1] = _advanced(start[i], snap, np.array([span]))[:4, 0]
-        start[-1, 1:] = 0.0  # what rounding left
+        start = self._starts()
         t = np.asarray(times, float)
-        place = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, len(self.snaps))
+        place = np.clip(np.searchsorted(ends.real, t, side="right") - 1, 0, len(self.snaps))
         snaps = np.append(self.snaps, 0.0)
         snaps = np.where(t < 0.0, 0.0, snaps[place])
         return _advanced(start[place].T, snaps, np.maximum(t - ends[place], 0.0))
@@ -63,38 +75,37 @@ def _advanced(state: Array, snap: float | Array, t: Array) -> Array:
 
 
 def setpoint(limits: Limits) -> Setpoint:
-    """The shortest symmetric fourth-order move; all limits positive."""
-    s, stroke = limits.snap, limits.stroke
+    """The shortest symmetric fourth-order move; all limits positive.
 
-    def reached(t4: float, t3: float, t2: float, t1: float) -> tuple[float, float, float, float]:
-        jerk = s * t4
-        acceleration = jerk * (t4 + t3)
-        velocity = acceleration * (2 * t4 + t3 + t2)
-        return jerk, acceleration, velocity, velocity * (4 * t4 + 2 * t3 + t2 + t1)
-
-    bounds = (limits.jerk, limits.acceleration, limits.velocity, stroke)
-
-    def longest(first: int, times: Callable[[float], tuple[float, float, float, float]]) -> float:
-        """The largest t that keeps the bounds from the `first` on, which grow with t."""
-
-        def over(t: float) -> float:
-            values = reached(*times(t))
-            return max(values[i] / bounds[i] for i in range(first, 4)) - 1.0
-
-        high = 1.0
-        while over(high) < 0.0:
-            high *= 2.0
-        return 0.0 if over(0.0) >= 0.0 else brentq(over, 0.0, high, xtol=1e-15, rtol=1e-14)
-
-    t4 = longest(0, lambda t: (t, 0.0, 0.0, 0.0))
-    t3 = longest(1, lambda t: (t4, t, 0.0, 0.0))
-    t2 = longest(2, lambda t: (t4, t3, t, 0.0))
-    # the stroke is not bounded but met
-    jerk, acceleration, velocity, _ = reached(t4, t3, t2, 0.0)
-    t1 = max(0.0, stroke / velocity - (4 * t4 + 2 * t3 + t2))
+    Analytic in the limits, which may be complex: a step along the imaginary axis gives derivatives.
+    """
+    stroke, v, a, j, s = (getattr(limits, item.name) for item in fields(limits))
+    t4 = _least(j / s, (a / s) ** 0.5, (v / (2 * s)) ** (1 / 3), (stroke / (8 * s)) ** 0.25)
+    jerk = s * t4
+    # what t3 does to the stroke, x² (x - t4) = stroke/(2 jerk) with x = 2 t4 + t3, by Cardano
+    half, fourth = (t4 / 3) ** 3 + stroke / (4 * jerk), stroke / (4 * jerk)
+    root = (fourth * (2 * (t4 / 3) ** 3 + fourth)) ** 0.5
+    x = t4 / 3 + (half + root) ** (1 / 3) + (t4 / 3) ** 2 / (half + root) ** (1 / 3)
+    t3 = _least(a / jerk - t4, 0.5 * ((t4 * t4 + 4 * v / jerk) ** 0.5 - 3 * t4), x - 2 * t4)
+    t3 = _at_least_zero(t3)
+    acceleration, rise = jerk * (t4 + t3), 2 * t4 + t3
+    t2 = _least(v / acceleration - rise,
+                0.5 * ((rise * rise + 4 * stroke / acceleration) ** 0.5 - 3 * rise))  # fmt: skip
+    t2 = _at_least_zero(t2)
+    velocity = acceleration * (rise + t2)
+    t1 = _at_least_zero(stroke / velocity - (2 * rise + t2))
     ramp = [t4, t3, t4]
     up = np.array([*ramp, t2, *ramp])
     durations = np.concatenate([up, [t1], up])
-    pulse = np.array([s, 0.0, -s])
-    rise = np.concatenate([pulse, [0.0], -pulse])
-    return Setpoint(durations, np.concatenate([rise, [0.0], -rise]), velocity, acceleration, jerk)
+    pulse = np.array([s, 0.0 * s, -s])
+    rising = np.concatenate([pulse, [0.0], -pulse])
+    return Setpoint(durations, np.concatenate([rising, [0.0], -rising]), velocity, acceleration,
+                    jerk)  # fmt: skip
+
+
+def _least(*times: Any) -> Any:
+    return min(times, key=np.real)
+
+
+def _at_least_zero(time: Any) -> Any:
+    return time if np.real(time) > 0.0 else 0.0 * time

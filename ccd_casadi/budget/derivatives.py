@@ -5,6 +5,11 @@ gives dA, dQ, dC exactly (no difference is taken, so h = 1e-30), and one adjoint
 dσ². Of a table it is the derivative of the quadrature's sum, at its nodes:
 
     dS = -S (dG K + G dK) S,   d‖H‖² = 2 Re tr(H* dH)
+
+    continuous   A P + P A' + Q = 0               A' X + X A + W = 0
+    sampled      (1 + A) P (1 + A)' - P + Q = 0   and alike, with A_c = (2 + A)⁻¹A continuous
+
+    d tr(W P) = 2 tr(X dA P) + tr(X dQ)           sampled 2 tr(X dA P (1 + A)') + …
 """
 
 from collections.abc import Sequence
@@ -12,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
 
 from ccd_casadi.budget.frequency import integrated, responses
 from ccd_casadi.budget.loops import FORCES, Disturbed, Process, closed, disturbed
-from ccd_casadi.budget.lyapunov import covariance, weighted_slopes
 from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
 from ccd_casadi.lti.hold import sampled, tustin
@@ -184,3 +189,21 @@ class _ResponseChanges:
             self.known[name] = (R @ B, C @ R)
         X, Y = self.known[name]
         return np.asarray((Y @ dA + dC) @ X + Y @ dB + dD)
+
+
+def covariance(A: Array, Q: Array, *, sampled: bool) -> Array:
+    """P of a stable process with Q symmetric; a sampled one's A is the change over a period."""
+    if sampled:
+        inverse = np.linalg.inv(2.0 * np.eye(len(A)) + A)
+        A, Q = inverse @ A, 2.0 * inverse @ Q @ inverse.T
+    P = solve_continuous_lyapunov(A, -Q)
+    return np.asarray(0.5 * (P + P.T))
+
+
+def weighted_slopes(
+    A: Array, P: Array, weight: Array, changes: list[tuple[Array, Array]], *, sampled: bool
+) -> Array:
+    """d tr(W P) for changes (dA, dQ) at a fixed symmetric W (n, n)."""
+    X = covariance(A.T, weight, sampled=sampled)
+    after = P @ (A.T + np.eye(len(A))) if sampled else P
+    return np.array([2.0 * np.sum(X * (dA @ after).T) + np.sum(X * dQ) for dA, dQ in changes])

@@ -13,11 +13,120 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
 
-from ccd_casadi.budget.spectra import ShapedSpectrum, TabulatedSpectrum
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
+
+Corner = tuple[float, ...]  # (Hz,) of a real root, (Hz, damping ratio) of a pair
+
+
+@dataclass(frozen=True)
+class TabulatedSpectrum:
+    """S at rising frequencies in Hz; S ~ f^β between two of them, 0 outside.
+
+    Raises ValueError for fewer than two points, frequencies that do not rise, or values of S
+    that are not above 0.
+    """
+
+    hz: tuple[float, ...]
+    density: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.hz) != len(self.density) or len(self.hz) < 2:
+            raise ValueError("a table of a spectrum needs two points or more")
+        if not (np.isfinite(self.hz).all() and np.isfinite(self.density).all()):
+            raise ValueError("a table of a spectrum holds finite numbers only")
+        if self.hz[0] <= 0.0 or (np.diff(self.hz) <= 0.0).any():
+            raise ValueError("the frequencies of a table have to rise, from above 0 Hz")
+        if min(self.density) <= 0.0:
+            raise ValueError("the densities of a table have to be above 0; leave out what is not")
+
+    def at(self, hz: Array) -> Array:
+        """S at frequencies in Hz."""
+        x = np.log(np.maximum(hz, 1e-300))
+        inside = (hz >= self.hz[0]) & (hz <= self.hz[-1])
+        return np.where(inside, np.exp(np.interp(x, np.log(self.hz), np.log(self.density))), 0.0)
+
+    def rms(self) -> float:
+        """The root of ∫ S df, each straight line between two points in closed form."""
+        f, S = np.array(self.hz), np.array(self.density)
+        beta = np.diff(np.log(S)) / np.diff(np.log(f)) + 1.0
+        x = beta * np.diff(np.log(f))
+        grown = np.where(np.abs(x) < 1e-8, 1.0 + 0.5 * x, np.expm1(x) / np.where(x == 0.0, 1.0, x))
+        return float(np.sqrt((S[:-1] * f[:-1] * np.diff(np.log(f)) * grown).sum()))
+
+
+@dataclass(frozen=True)
+class ShapedSpectrum:
+    """S = level |Π_z (1 + s/z) / Π_p (1 + s/p)|² at s = 2πjf, pairs as 1 + 2ζ s/ω + s²/ω².
+
+    Zeros and poles are (Hz,) or (Hz, damping ratio); without any the spectrum is white. Raises
+    ValueError for a level or a root that is not positive.
+    """
+
+    level: float
+    zeros: tuple[Corner, ...] = ()
+    poles: tuple[Corner, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (self.level > 0.0 and np.isfinite(self.level)):
+            raise ValueError(f"the level of a spectrum is {self.level}; give a number above 0")
+        for corner in (*self.zeros, *self.poles):
+            if len(corner) not in (1, 2) or not all(value > 0.0 for value in corner):
+                raise ValueError(f"{corner} is not a corner; give (Hz,) or (Hz, damping), above 0")
+
+    @property
+    def relative_degree(self) -> int:
+        """How many more poles than zeros."""
+        return sum(map(len, self.poles)) - sum(map(len, self.zeros))
+
+    def at(self, hz: Array) -> Array:
+        """S at frequencies in Hz."""
+        s = 2j * np.pi * np.asarray(hz, float)
+        top, bottom = _polynomial(self.zeros, 1.0), _polynomial(self.poles, 1.0)
+        return np.asarray(self.level * np.abs(np.polyval(top, s) / np.polyval(bottom, s)) ** 2)
+
+    def rms(self) -> float | None:
+        """The root of ∫ S df; None where it is infinite."""
+        if self.relative_degree < 1:
+            return None
+        f = self.filter()
+        P = solve_continuous_lyapunov(f.A, -0.5 * f.B @ f.B.T)
+        return float(np.sqrt((f.C @ P @ f.C.T)[0, 0]))
+
+    def filter(self, path: tuple[float, ...] = (1.0,)) -> StateSpace:
+        """The shaping filter times a polynomial in s, highest power first; time in s.
+
+        Raises ValueError where the product is not proper.
+        """
+        corners = [corner[0] for corner in self.poles]
+        unit = HZ * float(np.exp(np.mean(np.log(corners)))) if corners else 1.0
+        top = np.polymul(
+            _polynomial(self.zeros, unit),
+            np.array(path) * unit ** np.arange(len(path) - 1, -1, -1.0),
+        )
+        bottom = _polynomial(self.poles, unit)
+        top = np.trim_zeros(np.atleast_1d(top), "f") * np.sqrt(self.level)
+        if len(top) > len(bottom):
+            raise ValueError("a shaping filter needs as many poles as zeros; give more poles")
+        from scipy.signal import tf2ss  # slow to import, and every command imports this module
+
+        A, B, C, D = tf2ss(top, bottom)
+        if len(bottom) == 1:
+            A, B, C = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+        return StateSpace(unit * A, unit * B, C, D)
+
+
+def _polynomial(corners: tuple[Corner, ...], unit: float) -> Array:
+    """Π (1 + s/ω) in s over `unit` (rad/s), highest power first."""
+    out: Array = np.ones(1)
+    for corner in corners:
+        x = unit / (HZ * corner[0])
+        factor = [x, 1.0] if len(corner) == 1 else [x * x, 2.0 * corner[1] * x, 1.0]
+        out = np.asarray(np.polymul(out, factor), float)
+    return out
 
 
 class Kind(StrEnum):

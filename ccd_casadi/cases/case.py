@@ -13,6 +13,7 @@ from ccd_casadi.cases.budget import checked_budget
 from ccd_casadi.cases.checks import closest, shown
 from ccd_casadi.cases.controller_sections import ChannelSection
 from ccd_casadi.cases.kinds import check_kind, read_options
+from ccd_casadi.cases.motion import check_motion
 from ccd_casadi.cases.places import checked_places, place_names
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.sections import SECTIONS, Case
@@ -137,11 +138,13 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     for file, place in zip(files, absolute, strict=True):
         plant_table(dict(data["plant"]) | options_in(file, place, fail), path, fail)
     sections["robust"] = replace(sections["robust"], plants=absolute)
-    theta, fixed = theta_tables(data["theta"], plant.model, place_names(sections["places"]), fail)
+    of_case = (*place_names(sections["places"]), *filter(None, [sections["motor"].size]))
+    theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":
             words = 'needs controller.structure = "sections"; choose that, or drop it'
             raise fail(f"theta.{parameter.name}.varies", words)
+    check_motion(sections, {p.name: (p.lower, p.upper) for p in (*theta, *fixed)}, fail)
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **sections)
 
 

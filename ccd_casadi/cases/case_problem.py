@@ -7,9 +7,11 @@ from ccd_casadi.cases.case import CaseError, options_in
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import disturbance_of, sections_problem, weights_of
+from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.sections import Case, RobustSection
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
+from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import with_options
@@ -47,6 +49,7 @@ def problem_of(case: Case) -> CoDesignProblem:
             options,
             case.limits.plant_seconds,
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
+            motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
             places=places_of(case.places),
         ).pinned(),
         names=tuple(p.name for p in case.theta),
@@ -89,6 +92,8 @@ def problem_of(case: Case) -> CoDesignProblem:
         others = problem.controller.plant_options
         plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
         problem.controller.require_plants(plants)
+        if problem.source.motion is not None:
+            require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:

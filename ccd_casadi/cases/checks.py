@@ -106,6 +106,21 @@ def interval(value: Any) -> str | None:
     return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
 
 
+@_with(
+    {
+        "anyOf": [
+            {"type": "number", "exclusiveMinimum": 0.0},
+            _list({"type": "number", "exclusiveMinimum": 0.0}, 1),
+        ]
+    }
+)
+def one_or_more(value: Any) -> str | None:
+    several = value if isinstance(value, list | tuple) else [value]
+    if several and all(POSITIVE(item) is None for item in several):
+        return None
+    return f"is {shown(value)}; give a number above 0, or a list of them"
+
+
 @_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
 def text_or_rows(value: Any) -> str | None:
     first = value[0] if isinstance(value, list | tuple) and value else None
@@ -165,7 +180,7 @@ factors = every(POSITIVE, "give a list of numbers above 0")
 numbers = every(ANY, "give a list of numbers", 1)
 listed = Check(numbers.test, _list(ANY.schema, 2))
 named = Check(
-    lambda value: None if value and isinstance(value, str) else "is no text",
+    lambda value: None if value and isinstance(value, str) else "is not text",
     {"type": "string", "minLength": 1},
 )
 files = every(named, "give a list of file names in quotes")

@@ -26,7 +26,7 @@ DECIBEL = 3.0  # from here on a peak of S is more likely one in dB
 MASS = {"t": 1e3, "kg": 1.0, "g": 1e-3, "mg": 1e-6}
 STIFFNESS = {"MN/m": 1e6, "kN/mm": 1e6, "N/um": 1e6, "N/µm": 1e6, "kN/m": 1e3, "N/mm": 1e3,
              "N/m": 1.0}  # fmt: skip
-SI = "all values are taken in SI (kg, N/m, m; 1 N/um is 1e6 N/m, 1 N/mm is 1e3 N/m)"
+SI = "all values are in SI (kg, N/m, m; 1 N/um is 1e6 N/m, 1 N/mm is 1e3 N/m)"
 
 
 class Severity(StrEnum):

@@ -10,6 +10,7 @@ from ccd_casadi.budget import Kind
 from ccd_casadi.cases.controller_sections import ChannelSection, ControllerSection, LoopSection
 from ccd_casadi.cases.sections import Case, InnerSection, RobustSection, WeightsSection
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem, Uncertainty
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.weights import Weights
@@ -46,11 +47,12 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
     if controller.structure != WITH_DISTURBANCE and sections["weights"].disturbance is not None:
         words = f'has an effect with controller.structure = "{WITH_DISTURBANCE}" only; drop it, '
         raise fail("weights.disturbance", words + "or choose that structure")
-    w2, of_error = sections["objective"].w2, sections["inner"].minimise == "rms_error"
+    w2, v = sections["objective"].w2, FIGURES[sections["inner"].minimise]
+    of_error = v is not BANDWIDTH
     if w2 == 0.0 or (w2 > 0.0 and not (structured and of_error)):
         remedy_of_w2 = "give a negative number: J must reward bandwidth"
         if structured and of_error:
-            remedy_of_w2 = "give a positive number: J counts the RMS error in m"
+            remedy_of_w2 = f"give a positive number: J counts the {v.words} in {v.si_unit}"
         raise fail("objective.w2", f"is {w2!r}; {remedy_of_w2}")
     for name, keys in other.items():
         table = sections[name]
@@ -60,11 +62,11 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
     if not structured:
         return
     inner, budget = sections["inner"], sections["budget"]
-    if of_error and not any(getattr(budget, kind.value) for kind in Kind):
+    if v is RMS_ERROR and not any(getattr(budget, kind.value) for kind in Kind):
         words = 'is "rms_error", and no spectrum says what moves the stage; add [budget.force]'
         raise fail("inner.minimise", f"{words} or another")
     if inner.bandwidth_least_hz is not None and not of_error:
-        words = 'has an effect with inner.minimise = "rms_error" only; drop it'
+        words = 'has no effect with inner.minimise = "bandwidth"; drop it'
         raise fail("inner.bandwidth_least_hz", words)
     if loop.delay_us and loop.rate_hz is None:
         words = "a delay needs a sampled loop, whose poles decide its stability; give loop.rate_hz"

@@ -118,22 +118,22 @@ def _option(value: Any) -> str | None:
 def theta_tables(
     table: Mapping[str, Any],
     model: str | None,
-    of_places: tuple[str, ...],
+    of_case: tuple[str, ...],
     fail: Callable[[str, str], Exception],
 ) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
     """[theta.NAME] of every parameter, searched ones and fixed ones.
 
-    Those that a model of the package needs, those that [places] names, and no other.
+    Those that a model of the package needs, those that [places] and [motor] name, and no other.
     """
     searched, fixed = parameters_of(table, fail)
     known = model_named(model)
     needed = None if known is None else known.theta
-    for name in of_places:
+    for name in of_case:
         if name not in table:
-            words = f"is missing; add a table [theta.{name}], which [places] names"
+            words = f"is missing; add a table [theta.{name}], which [places] or [motor] names"
             raise fail(f"theta.{name}", words)
     if needed is not None:
-        needed = (*needed, *of_places)
+        needed = (*needed, *of_case)
         for name in table:
             if name not in needed:
                 raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")

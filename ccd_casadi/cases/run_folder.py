@@ -183,7 +183,7 @@ def with_function(
 def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
     """κ in SI of the controller.json of a folder. Raises UserError where it is of another kind."""
     path = folder / "controller.json"
-    words = f"is no list of the {len(structure.names)} parameters of the case's structure"
+    words = f"is not a list of the {len(structure.names)} parameters of the case's structure"
     try:
         kappa = np.array(read_json(path)["sections"]["kappa"], dtype=np.float64)
         good = kappa.shape == (len(structure.names),) and bool((np.abs(kappa) < 200.0).all())

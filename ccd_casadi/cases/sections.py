@@ -38,6 +38,7 @@ from ccd_casadi.cases.controller_sections import (
     OuterSection,
     SamplingSection,
 )
+from ccd_casadi.cases.motion import MotorSection, MoveSection
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import Shown
 
@@ -85,7 +86,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ObjectiveSection:
-    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s; of `minimise = "rms_error"` w2 e, m."""
+    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s; else w2 e, e in m, or w2 t, t in s."""
 
     w1: float = key(
         number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
@@ -93,7 +94,8 @@ class ObjectiveSection:
     )
     w2: float = key(
         signed("give a negative number: J must reward bandwidth"),
-        says="weight of the bandwidth in J, negative, 1/(rad/s); of an RMS error positive, 1/m",
+        says="weight of the bandwidth in J, negative, 1/(rad/s); of an RMS error or a move's time "
+        "positive, 1/m or 1/s",
     )
     cost_unit: str = key(text, "", says="unit of the hardware cost f(θ), for tables and pages")
 
@@ -137,8 +139,8 @@ class WeightsSection:
 class InnerSection:
     """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched.
 
-    With sections: `minimise` what, "bandwidth" (its negative) or the "rms_error" of [budget], that
-    at a bandwidth of `bandwidth_least_hz` or more.
+    With sections: `minimise` what, "bandwidth" (its negative), the "rms_error" of [budget] or the
+    "move_time" of [move], these at a bandwidth of `bandwidth_least_hz` or more.
     """
 
     S_max: float = key(
@@ -186,12 +188,16 @@ class InnerSection:
         unit="m/N",
     )
     minimise: str = key(
-        choice("bandwidth", "rms_error"),
+        choice("bandwidth", "rms_error", "move_time"),
         "bandwidth",
-        says="sections: minimise the negative bandwidth, or the RMS error of [budget]",
+        says="with sections: the negative bandwidth, the RMS error of [budget], or the time of "
+        "[move] until it has settled",
     )
     bandwidth_least_hz: float | None = key(
-        POSITIVE, None, says='minimise = "rms_error": the least bandwidth', unit="Hz"
+        POSITIVE,
+        None,
+        says='with another minimise than "bandwidth": the bandwidth that is kept at least',
+        unit="Hz",
     )
 
 
@@ -329,6 +335,8 @@ class Case(Shown):
     outer: OuterSection
     baseline: BaselineSection
     limits: LimitsSection
+    motor: MotorSection
+    move: MoveSection
     places: PlacesSection = field(default_factory=PlacesSection)
     fixed: tuple[Parameter, ...] = ()
 
@@ -347,4 +355,6 @@ SECTIONS: dict[str, type] = {
     "outer": OuterSection,
     "baseline": BaselineSection,
     "limits": LimitsSection,
+    "motor": MotorSection,
+    "move": MoveSection,
 }

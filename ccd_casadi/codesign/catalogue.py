@@ -23,6 +23,7 @@ import numpy as np
 
 from ccd_casadi.codesign.design_plants import order
 from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import spent_entry, was_moved
@@ -259,9 +260,9 @@ def _made_of(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     """What J is made of: the bandwidth or the error, at the hardware cost."""
     if "hardware_cost" not in result:
         return ""
-    value = f"{result['bandwidth_hz']:.4g} Hz"
-    if result.get("error_rms_of_set") is not None:
-        value = f"{1e9 * result['error_rms_of_set']:.4g} nm RMS"
+    v, value = problem.figure, f"{result['bandwidth_hz']:.4g} Hz"
+    if result.get(f"{v.entry}_of_set") is not None and v is not BANDWIDTH:
+        value = f"{v.words} {v.shown(result[f'{v.entry}_of_set'])}"
     return f"{value} at {result['hardware_cost']:.4g} {problem.cost_unit}".strip()
 
 

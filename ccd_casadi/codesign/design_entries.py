@@ -1,12 +1,14 @@
 """A synthesis, its controller and its error budget as values of result.json and controller.json."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ
@@ -77,6 +79,53 @@ def budget_entry(
     """`budget` as the one key of a mapping; nothing where the problem has none."""
     found = loop_budget(problem, theta, controller)
     return {} if found is None else {"budget": budget_dict(found)}
+
+
+def move_entry(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> dict[str, Any]:
+    """`move` as the one key of a mapping, SI; nothing where the problem has none."""
+    if problem.source.motion is None:
+        return {}
+    motion, free = motion_of(problem, theta), replace(problem, suspension=FREE)
+    times = exact_times(problem, motion, kind_of(free).plants(theta), controller)
+    cycle, own = motion.cycle, problem.source.motion
+    shown: tuple[str, ...] = ("peak_force", "rms_force")
+    if own.motor is not None:
+        shown += ("power", "peak_share", "heat_share")
+    return {"move": {
+        "duration": cycle.profile.duration,
+        "settled": float(times[0]),
+        "settled_latest": float(times.max()),
+        "plants": len(times),
+        "window": own.window,
+        "dwell": own.dwell,
+        "reached": {key: float(getattr(cycle.profile, key))
+                    for key in ("velocity", "acceleration", "jerk")},
+        "limits": list(cycle.limits),
+        **{key: float(getattr(cycle, key)) for key in shown},
+        **({} if own.motor is None else {
+            "peak_current": cycle.peak_force / own.motor.at(motion.mass)[0]}),
+        "feedforward": motion.forward.tolist(),
+    }}  # fmt: skip
+
+
+def move_lines(result: Mapping[str, Any]) -> list[str]:
+    """The move in a line for a terminal; none for a result without one."""
+    move = result.get("move")
+    if not move:
+        return []
+    latest = move["settled_latest"]
+    settled = "not settled" if latest is None else f"{1e3 * latest:.5g} ms with settling"
+    words = f"{1e3 * move['duration']:.5g} ms by {', '.join(move['limits'])}; {settled} on the set"
+    if "power" in move:
+        words += f"; {move['peak_force']:.4g} N, {move['peak_current']:.3g} A at most, "
+        words += f"{move['power']:.4g} W"
+    drawn = result.get("move_time_fresh")
+    if drawn:
+        told = 1e3 * result["move_time"]
+        words += f"; {drawn['survived']} of {drawn['draws']} fresh plants within {told:.5g} ms"
+    return [f"move          {words}"]
 
 
 def budget_dict(found: LoopBudget) -> dict[str, Any]:

@@ -9,7 +9,7 @@ the plant alone the set is widened step by step, each design polished on the pro
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from ccd_casadi.synthesis.synthesis import DesignFigures
 
 FIRST = 0.25  # share of the range of the first step of a continuation
 POLISHES = 5  # at most in a continuation
+TOLD = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
 LEAST = 1.0 / 16.0  # share of the range under which a step is given up
 
 
@@ -95,7 +96,8 @@ def best_over_design_plants(
     }
     if problem.robust is not None:
         names = [_at(choice) for choice in choices]
-        tried = {name: _tried(item.result) for name, item in zip(names, found, strict=True)}
+        told = [{key: item.result[key] for key in TOLD if key in item.result} for item in found]
+        tried = dict(zip(names, told, strict=True))
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     sampler.nearest = samplers[best].nearest
     result["reason"] = explain(sampler, found[best], share)
@@ -110,10 +112,6 @@ def _holds(item: Solution) -> bool:
     )
 
 
-def _verified(item: Solution) -> bool:
-    return bool(item.result["status"] == "verified")
-
-
 def order(item: Solution) -> tuple[int, int, float]:
     """Verified first, then what fails the fewest checks, then the least J."""
     result = item.result
@@ -122,15 +120,10 @@ def order(item: Solution) -> tuple[int, int, float]:
     return status, failed, result.get("objective", np.inf)
 
 
-def _tried(result: dict[str, Any]) -> dict[str, Any]:
-    keys = ("status", "objective", "reason", "theta", "bandwidth_hz")
-    return {key: result[key] for key in keys if key in result}
-
-
 def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     """Why a search failed: where it looked, how near it came, what may be tried."""
     problem, words = sampler.problem, str(best.result["reason"])
-    if _verified(best):
+    if best.result["status"] == "verified":
         return words
     if best.verified is not None:
         missed = missed_words(problem, cast(VerifiedDesign, best.verified).design.figures)

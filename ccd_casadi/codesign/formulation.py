@@ -1,6 +1,7 @@
 """What a formulation leaves behind: its iterates, its surrogate, and the design it ends with."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.support.arrays import Array
@@ -67,3 +68,10 @@ class BoxLook:
     def moved(self) -> bool:
         """Whether something better was found."""
         return self.x is not None
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Of result.json."""
+        return {key: value for key, value in vars(self).items() if key != "x"} | {
+            "moved": self.moved
+        }

@@ -19,6 +19,7 @@ from ccd_casadi.codesign.design_entries import (
     controller_dict,
     figures_dict,
     loop_of_design,
+    move_entry,
 )
 from ccd_casadi.codesign.sections_entries import (
     active_of,
@@ -28,7 +29,7 @@ from ccd_casadi.codesign.sections_entries import (
 )
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import controller_response
-from ccd_casadi.inner_problem.figure import RMS_ERROR
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -41,7 +42,7 @@ from ccd_casadi.inner_problem.problem import (
 from ccd_casadi.inner_problem.sections_bandwidth import too_slow
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
-from ccd_casadi.inner_problem.sections_search import least_error_at, prepared, with_range
+from ccd_casadi.inner_problem.sections_search import least_value_at, prepared, with_range
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
@@ -157,6 +158,8 @@ def _design(
         ],
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
         **budget_entry(problem, theta, made.controller),
+        **move_entry(problem, theta, made.controller),
+        **move_entry(problem, theta, made.controller),
     }
     return figures.certified, answer, controller_dict(made.controller)
 
@@ -220,7 +223,7 @@ def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
 def sections_answer(
     problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
 ) -> InnerAnswer:
-    """The largest bandwidth (or least error) of the structure at θ, judged over its box.
+    """The largest bandwidth (or least of another figure) at θ, judged over its box.
 
     From the controller of the folder `options.begin_at` alone, where there is one.
     """
@@ -238,17 +241,18 @@ def sections_answer(
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
-    if problem.figure is RMS_ERROR:
+    if problem.figure is not BANDWIDTH:
         slow = too_slow(asked, made)
         if not slow.certified:
             return InnerAnswer("infeasible", head | {"reason": slow.words, "syntheses": 1})
         fastest = made.bandwidth
-        asked, least = least_error_at(asked, theta, made, progress)
+        asked, least = least_value_at(asked, theta, made, progress)
         made = least.design
-        value = least.error if problem.w2 > 0.0 else made.bandwidth
-        head["least_error"] = {
-            "error_rms_of_set": least.error,
-            "error_rms_at_largest_bandwidth": least.first_error,
+        value = least.value if problem.w2 > 0.0 else made.bandwidth
+        entry = problem.figure.entry
+        head["least_error" if entry == "error_rms" else f"least_{entry}"] = {
+            f"{entry}_of_set": least.value,
+            f"{entry}_at_largest_bandwidth": least.first_value,
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
@@ -272,6 +276,7 @@ def sections_answer(
         "proof": proof_dict(proof),
         "syntheses": 1,
         **budget_entry(asked, theta, made.controller),
+        **move_entry(asked, theta, made.controller),
     }
     status = "verified" if passed else "not_verified"
     return InnerAnswer(status, figures, sections_controller(asked, made))

@@ -211,13 +211,6 @@ def _iterate(
     step = np.inf
     if incumbent is not None:
         step = float(np.abs((np.array(sample.x) - incumbent.x) / (upper - lower)).max())
-    return Iterate(
-        theta=theta,
-        predicted=float(predicted[0]),
-        truth=float(sample.values[0]),
-        predicted_objective=objective(problem, theta, predicted[0]),
-        objective=_objective(problem, sample),
-        error=error,
-        step=step,
-        radius=1.0,
-    )
+    promised, truth = float(predicted[0]), float(sample.values[0])
+    objectives = objective(problem, theta, promised), objective(problem, theta, truth)
+    return Iterate(theta, promised, truth, *objectives, error, step, 1.0)

@@ -222,15 +222,9 @@ def _iterate(
     radius: float,
 ) -> Iterate:
     lower, upper = box(problem)
-    error = abs(predicted / sample.value - 1.0) if sample.feasible else np.inf
-    step = np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max()
-    return Iterate(
-        theta=sample.theta,
-        predicted=predicted,
-        truth=sample.value,
-        predicted_objective=objective(problem, sample.theta, predicted),
-        objective=objective(problem, sample.theta, sample.value) if sample.feasible else np.inf,
-        error=float(error),
-        step=float(step),
-        radius=radius,
-    )
+    promised, J, error = objective(problem, sample.theta, predicted), np.inf, np.inf
+    if sample.feasible:
+        J = objective(problem, sample.theta, sample.value)
+        error = float(abs(predicted / sample.value - 1.0))
+    step = float(np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max())
+    return Iterate(sample.theta, predicted, sample.value, promised, J, error, step, radius)

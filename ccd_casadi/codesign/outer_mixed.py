@@ -31,7 +31,7 @@ from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
+from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost
@@ -114,7 +114,10 @@ class MixedOuter(Outer):
                 x, made = polish(sampler, x)
                 progress.advance()
             sampler.report(before)
-            at_bounds = _snapped(problem, x)
+            lower, upper = lifted_bounds(problem)
+            width = 1e-9 * (upper - lower)  # within rounding of a bound: onto it
+            at_bounds = np.where(x - lower <= width, lower, x)
+            at_bounds = np.where(upper - x <= width, upper, at_bounds)
             if acceptable(problem, at_bounds, truth.at(at_bounds)):
                 x, made = at_bounds, truth.at(at_bounds)
             with sampler.spent.on("checks"):
@@ -246,11 +249,3 @@ class MixedOuter(Outer):
 
     def responses(self, x: Array) -> PostOptimal:
         return post_optimal(self.problem, x, self.sampler.quiet)
-
-
-def _snapped(problem: CoDesignProblem, x: Array) -> Array:
-    """Put variables that IPOPT left within rounding of a bound onto it."""
-    lower, upper = lifted_bounds(problem)
-    width = upper - lower
-    x = np.where(np.abs(x - lower) <= 1e-9 * width, lower, x)
-    return np.where(np.abs(x - upper) <= 1e-9 * width, upper, x)

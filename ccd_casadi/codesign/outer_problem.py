@@ -7,7 +7,7 @@
 surrogates; `direct` is the lifted problem on the true quantities.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -16,11 +16,22 @@ import numpy as np
 from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
-from ccd_casadi.optim.ipopt import EndPoint, end_points
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.interrupts import interrupts_kept, raise_dropped
 from surrogates import design
 
+OPTIONS: dict[str, Any] = {
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.constr_viol_tol": 1e-9,
+    "ipopt.acceptable_tol": 1e-7,
+    "ipopt.max_iter": 300,
+    "ipopt.bound_relax_factor": 0.0,
+    "ipopt.honor_original_bounds": "yes",
+    "show_eval_warnings": False,
+}
 APART = 1e-4  # of the box: ends closer than this are one optimum
 
 
@@ -133,7 +144,7 @@ def solve_program(
     z = ca.MX.sym("z", program.x.shape[0])
     inside = program.lower + width * z
     f, g = ca.substitute([program.f, program.g], [program.x], [inside])
-    options: dict[str, Any] = {"ipopt.tol": tolerance}
+    options = OPTIONS | {"ipopt.tol": tolerance}
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
         # The true quantities carry rounding: there is no use in chasing the last digits.
@@ -146,28 +157,31 @@ def solve_program(
             "ipopt.acceptable_constr_viol_tol": 1e-9,
             "ipopt.acceptable_obj_change_tol": settled,
         }
-    found = end_points(
-        {"x": z, "f": f, "g": g},
-        (np.atleast_2d(starts) - program.lower) / width,
-        options,
-        -np.inf if program.g_lower is None else program.g_lower,
-    )
-    kept: list[EndPoint] = []
-    counts: list[int] = []
-    for end in sorted((end for end in found if end.converged), key=lambda end: end.objective):
-        near = [i for i, other in enumerate(kept) if np.abs(end.z - other.z).max() < APART]
+    solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)
+    low = -np.inf if program.g_lower is None else program.g_lower
+    begun = np.clip((np.atleast_2d(starts) - program.lower) / width, 0.0, 1.0)
+    ends, verdicts = [], []
+    for start in begun:
+        raise_dropped()
+        with interrupts_kept():  # Ctrl-C ends it after the start that is under way
+            result = solver(x0=start, lbx=0.0, ubx=1.0, lbg=low, ubg=0.0)
+        stats = solver.stats()
+        verdicts.append(str(stats["return_status"]))
+        if stats["success"]:
+            ends.append((float(result["f"]), np.clip(np.array(result["x"]).ravel(), 0.0, 1.0)))
+    if not ends:
+        raise OuterFailure(f"IPOPT converged from none of {len(begun)} starts: {verdicts[0]}")
+    kept: list[Array] = []
+    optima: list[LocalOptimum] = []
+    for objective, end in sorted(ends, key=lambda item: item[0]):
+        near = [i for i, other in enumerate(kept) if np.abs(end - other).max() < APART]
         if near:
-            counts[near[0]] += 1
+            same = optima[near[0]]
+            optima[near[0]] = replace(same, starts=same.starts + 1)
         else:
             kept.append(end)
-            counts.append(1)
-    if not kept:
-        raise OuterFailure(f"IPOPT converged from none of {len(found)} starts: {found[0].status}")
-    optima = (
-        LocalOptimum(program.lower + width * end.z, end.objective, count)
-        for end, count in zip(kept, counts, strict=True)
-    )
-    return OuterSolution(tuple(optima), len(found))
+            optima.append(LocalOptimum(program.lower + width * end, objective))
+    return OuterSolution(tuple(optima), len(begun))
 
 
 def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:

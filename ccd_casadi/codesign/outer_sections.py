@@ -4,10 +4,13 @@ A formulation works on v(θ) of the problem's anchors and plant set, with envelo
 end a multi-start search and a search for worse plants ask whether these were good enough at that
 θ; if not, what they find joins, and the outer problem is solved again.
 
-The polish works on the true value: it passes kinks, and keeps its controller.
+The polish works on the true value: it passes kinks, and keeps its controller. Multi-start searches
+are kept in the store of samples: a run that goes on from its store repeats none.
 """
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,28 +19,27 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
-from ccd_casadi.codesign.costs import Costs, costs_of
-from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
-from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_joint import together
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
-from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
+from ccd_casadi.inner_problem.move_figures import told_time
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value, valued
+from ccd_casadi.inner_problem.sections_plant_set import (
+    plants_of,
+    sections_of_problem,
+    uncertain_plant,
+)
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import (
     fresh_yield,
@@ -45,14 +47,103 @@ from ccd_casadi.inner_problem.sections_robustness import (
     proof_of,
     worst_members,
 )
-from ccd_casadi.inner_problem.sections_search import ROUNDS, joined
+from ccd_casadi.inner_problem.sections_search import (
+    ROUNDS,
+    joined,
+    least_from,
+    prepared,
+    race,
+    with_range,
+)
 from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import say
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Anchors (κ in SI, rad/s) and members that the search at the start found; `words` why none."""
+
+    anchors: tuple[tuple[float, ...], ...]
+    members: tuple[Member, ...]
+    error_anchors: tuple[tuple[float, ...], ...]
+    words: str
+
+
+def seeded_and_prepared(
+    store: SampleStore,
+    problem: CoDesignProblem,
+    seed: int,
+    quiet: bool,
+    workers: Pool | None = None,
+) -> tuple[CoDesignProblem, str]:
+    """Anchors and members, from the store where an earlier run has found them.
+
+    Second, in words, why there are no anchors; empty where there are.
+    """
+    own = replace(sections_of_problem(problem), seed=seed)
+    problem = with_range(replace(problem, controller=own))
+    owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
+
+    def found() -> Seeds:
+        tell = teller("search at the start", quiet)
+        anchored, made = prepared(problem, tell, workers)
+        anchored, made = least_from(anchored, problem.start, made, tell)
+        own, start = sections_of_problem(anchored), problem.start
+        words = "" if made.certified else made.words
+        alone = len(own.members) == len(uncertain_plant(problem, start).corners())
+        if made.certified and alone and problem.figure is BANDWIDTH:
+            # No plant was found worse: this is the search that an end at the start would ask for.
+            value = valued(anchored, start, plants_of(anchored, start), made, 1)
+            Sampler(anchored, store, Workers(1)).kept("race", start, SectionsValue, lambda: value)
+        return Seeds(own.anchors, own.members, own.error_anchors, words)
+
+    key = sample_key(owner, problem.start, 0.0, 0.0)
+    seeds = store.kept(key, owner, problem.start, Seeds, found)
+    sections = replace(
+        sections_of_problem(problem), anchors=seeds.anchors, members=seeds.members,
+        error_anchors=seeds.error_anchors,
+    )  # fmt: skip
+    return replace(problem, controller=sections), seeds.words
+
+
+def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
+    """A multi-start search at θ with all its optima, counted; from the store if it is there."""
+    problem = sampler.problem
+
+    def raced() -> SectionsValue:
+        made = race(problem, theta, teller("search at the end", sampler.quiet), sampler.workers)
+        found = valued(problem, theta, plants_of(problem, theta), made, 1)
+        return replace(found, design=replace(found.design, local_optima=made.local_optima))
+
+    sampler.raced(sample_key(sampler.hash, theta, 0.0, 0.0))
+    return sampler.kept("race", theta, SectionsValue, raced)
+
+
+def value_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
+    """The value at θ with its design and envelope, from the store where it was made before."""
+    make = partial(sections_value, sampler.problem, theta)
+    return sampler.kept("value", theta, SectionsValue, make)
+
+
+def teller(label: str, quiet: bool) -> Callable[[str], None]:
+    """Lines of progress on stderr."""
+
+    def tell(words: str) -> None:
+        if not quiet:
+            with suppress(OSError, ValueError):  # a stream that fails ends the printing
+                say(f"{label}: {words}", sys.stderr)
+
+    return tell
+
 
 BETTER = 1e-3  # relative: what the search at the end has to gain to be worth another round
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
@@ -82,16 +173,6 @@ class SectionsOuter(ThetaOuter):
     def __init__(self, sampler: Sampler, words: str = "") -> None:
         super().__init__(sampler)
         self.words = words
-
-    def formulated(
-        self, formulation: Formulation, seed: int, given: Surrogates | None = None
-    ) -> FormulationResult:
-        """Direct from the case's start alone is the polish."""
-        if isinstance(formulation, Direct) and formulation.starts == 1:
-            best = self.sampler.bandwidths(np.array(self.problem.start), "direct")[0]
-            x = np.array(best.theta) if best.feasible else None
-            return FormulationResult(x, None, (), (), None, best.feasible, best.shortfall)
-        return super().formulated(formulation, seed, given)
 
     def prepared(self, seed: int) -> "SectionsOuter":
         """Searched at the start for anchors and the plant set, where there are none."""
@@ -147,11 +228,15 @@ class SectionsOuter(ThetaOuter):
         kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
-        drawn = None if proof.proven else fresh_yield(problem, best.theta, made, asked.workers)
+        whole = proof.proven and not proof.of_S
+        drawn = None if whole else fresh_yield(problem, best.theta, made, asked.workers)
         with Progress(1, "what limits it", quiet=asked.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = asked.kept("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
+            told = None
+            if problem.figure is MOVE_TIME:
+                told = told_time(problem, best.theta, made.controller, best.value)
             bar.advance()
         return VerifiedSections(
             problem=problem,
@@ -174,6 +259,7 @@ class SectionsOuter(ThetaOuter):
             rounds=rounds,
             costs=costs,
             gap=gap,
+            told=told,
         )
 
     def responses(self, x: Array) -> PostOptimal:
@@ -194,16 +280,17 @@ def with_members(sampler: Sampler, kappa: Array, members: Sequence[Member]) -> S
 
 
 def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
-    """`together` again with the worst plants of its end, until there are none that are worse."""
+    """`together` again with the worst plants of its end, until it settles and none is worse."""
     for turn in range(ROUNDS):
-        sampler, best = together(sampler, theta)
+        sampler, best, settled = together(sampler, theta)
         if not best.feasible:
             break
         design, tell = value_at(sampler, best.theta).design, teller("on the way", sampler.quiet)
         members = worst_members(sampler.problem, best.theta, design, turn, tell)[1]
-        if not members:
+        if settled and not members:
             break
-        sampler, theta = with_members(sampler, design.kappa, members), np.array(best.theta)
+        theta = np.array(best.theta)
+        sampler = with_members(sampler, design.kappa, members) if members else sampler
     return sampler, best
 
 
@@ -243,13 +330,23 @@ def by_pieces(
     """From a sample, and what was asked for near it, to where the pieces of J promise no more.
 
     Where ω_b* jumps beside the best θ the climbs from the anchors have lost its controller: that
-    one becomes an anchor, and the search goes on.
+    one becomes an anchor, and the search goes on. So does one that a search at its θ has found:
+    another search at each θ near by would be dear, and ω_b* none of one controller.
     """
     for _ in range(FOLLOWED):
+        if best.anew and truth.sampler.problem.figure is BANDWIDTH:
+            truth, best = _with_anchor(truth, best)
         best, jumped = pieces_from(truth, best, settled, first)
         if not jumped:
             break
-        problem = joined(truth.sampler.problem, np.array(best.kappa), ())
-        truth = TrueBandwidth(truth.sampler.of(problem), truth.label)
-        best = truth.at(np.array(best.theta))
+        truth, best = _with_anchor(truth, best)
     return truth, best
+
+
+def _with_anchor(
+    truth: TrueBandwidth, best: BandwidthSample
+) -> tuple[TrueBandwidth, BandwidthSample]:
+    """With the controller of a sample as one more anchor, and the sample of that problem."""
+    problem = joined(truth.sampler.problem, np.array(best.kappa), ())
+    truth = TrueBandwidth(truth.sampler.of(problem), truth.label)
+    return truth, truth.at(np.array(best.theta))

@@ -18,9 +18,16 @@ from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.theta_direct import SETTLED, TrueBandwidth, pieces_from, solve_direct_value
+from ccd_casadi.codesign.theta_direct import (
+    FAR,
+    SETTLED,
+    TrueBandwidth,
+    pieces_from,
+    solve_direct_value,
+)
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -83,7 +90,8 @@ class ThetaOuter(Outer, ABC):
     ) -> Place | None:
         problem = self.problem
         truth = TrueBandwidth(self.sampler, "local solve")
-        best, _ = pieces_from(truth, sample, SETTLED if settled is None else settled)
+        first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)
+        best, _ = pieces_from(truth, sample, least, first)
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None
@@ -94,4 +102,4 @@ class ThetaOuter(Outer, ABC):
         return NestedLearner(self.sampler, seed=seed)
 
     def responses(self, x: Array) -> PostOptimal:
-        raise UserError("insight knows no responses of an optimum of this kind of controller")
+        raise UserError("insight has no derivatives of an optimum of this kind of controller")

@@ -100,12 +100,41 @@ def pareto_front(
         through = int(np.argmin(np.abs(costs - f_own)))
         costs[through], x[through] = f_own, own
     result: dict[int, FrontPoint] = {}
+
+    def move_ends(free: list[int]) -> None:
+        """Put the ends that are not verified where the surrogates see them by now."""
+        if not {0, points - 1} & set(free):
+            return
+        try:
+            ends, _ = ends_of(learner.program(), problem, starts)
+        except UserError:
+            return
+        for k, end in ((0, ends[0]), (points - 1, ends[1])):
+            if k in free:
+                x[k], costs[k] = end, hardware_cost(plant_of(problem), end[:count])
+
+    def solve_again(k: int, faster: FrontPoint) -> None:
+        """Point k from a lighter and faster one: kept where the truth is faster than before.
+
+        A design that was not predicted takes no verified one's place for less than the `tolerance`.
+        """
+        begin = learner.point(sampler.bandwidths(np.array(faster.theta))[0])
+        try:
+            at = solve_program(_at_cost(learner.program(), problem, costs[k]), begin).best.x
+        except OuterFailure:
+            return
+        sample = sampler.bandwidths(at[:count], "from a lighter point")[0]
+        if sample.feasible and not result[k].bandwidth >= sample.bandwidth:
+            new, old = front_point(problem, sample, learner.predicted(at), tolerance), result[k]
+            gained = not new.bandwidth <= (1.0 + tolerance) * old.bandwidth
+            if new.verified or gained or not old.verified:
+                result[k] = new
+
     rounds = 0
     while todo and rounds < max_rounds:
         rounds += 1
         if rounds > 1:
-            free = [k for k in todo if k != through]
-            _move_ends(learner.program(), problem, starts, free, costs, x)
+            move_ends([k for k in todo if k != through])
         x = walk(learner.program(), problem, costs, todo, starts, x)
         inner = sampler.bandwidths(x[todo, :count], f"verifying round {rounds}")
         for k, sample in zip(todo, inner, strict=True):
@@ -122,59 +151,11 @@ def pareto_front(
     for k in range(1, points):
         lighter = [result[i] for i in range(k) if result[i].bandwidth > result[k].bandwidth]
         if lighter:
-            faster = max(lighter, key=lambda point: point.bandwidth)
-            _solve_again(learner, costs[k], faster, k, result, tolerance)
+            solve_again(k, max(lighter, key=lambda point: point.bandwidth))
     kept = sorted(result.values(), key=lambda point: point.hardware_cost)
     while trades and len(kept) > 1 and not kept[-1].bandwidth >= kept[-2].bandwidth:
         kept.pop()  # the fastest design is not there
     return Front(efficient(kept), rounds, sampler.syntheses)
-
-
-def _move_ends(
-    program: NonlinearProgram,
-    problem: CoDesignProblem,
-    starts: Array,
-    todo: Sequence[int],
-    costs: Array,
-    x: Array,
-) -> None:
-    """Put the ends that are not verified where the surrogates see them by now."""
-    last = len(costs) - 1
-    if not {0, last} & set(todo):
-        return
-    try:
-        ends, _ = ends_of(program, problem, starts)
-    except UserError:
-        return
-    for k, end in ((0, ends[0]), (last, ends[1])):
-        if k in todo:
-            x[k], costs[k] = end, hardware_cost(plant_of(problem), end[: len(problem.names)])
-
-
-def _solve_again(
-    learner: Learner,
-    cost: float,
-    faster: FrontPoint,
-    k: int,
-    result: dict[int, FrontPoint],
-    tolerance: float,
-) -> None:
-    """Point k from a lighter and faster one: kept where the truth is faster than before.
-
-    A design that was not predicted takes no verified one's place for less than the `tolerance`.
-    """
-    sampler, problem = learner.sampler, learner.sampler.problem
-    sample = sampler.bandwidths(np.array(faster.theta))[0]
-    try:
-        x = solve_program(_at_cost(learner.program(), problem, cost), learner.point(sample)).best.x
-    except OuterFailure:
-        return
-    sample = sampler.bandwidths(x[: len(problem.names)], "from a lighter point")[0]
-    if sample.feasible and not result[k].bandwidth >= sample.bandwidth:
-        new, old = front_point(problem, sample, learner.predicted(x), tolerance), result[k]
-        gained = not new.bandwidth <= (1.0 + tolerance) * old.bandwidth
-        if new.verified or gained or not old.verified:
-            result[k] = new
 
 
 def walk(

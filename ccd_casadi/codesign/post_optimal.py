@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import null_space
 
-from ccd_casadi.codesign.kkt import kkt_certificate, lagrangian_hessian, lagrangian_parts
+from ccd_casadi.codesign.kkt import active_at, kkt_certificate, lagrangian_hessian
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.codesign.theta_kkt import theta_kkt
@@ -89,14 +89,14 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
     design = quantities.at(x)
     n = x.size
     kkt = kkt_certificate(problem, x, design)
-    _, _, jacobian, names = lagrangian_parts(problem, x, design)
     size = float(np.abs(kkt.objective_gradient).max())
     strong = [name for name in kkt.active if kkt.multipliers[name] > WEAK * size]
-    rows = dict(zip(names, jacobian, strict=True)) | _bound_rows(problem)
-    kinked = any(name not in rows for name in strong)
+    here = active_at(problem, x, design)
+    kinked = not set(strong) <= set(here.labels)
     if kinked:  # where local peaks are equal, each is a constraint
-        rows |= {peak.name: peak.row for peak in other_peaks(problem, x, design, ACTIVE)}
-    A = np.array([rows[name] for name in strong]).reshape(-1, n)
+        here = active_at(problem, x, design, other_peaks(problem, x, design, ACTIVE))
+    held = [here.labels.index(name) for name in strong]
+    A = here.rows[held] * here.sizes[held, None]
     Z = null_space(A) if len(A) else np.eye(n)
     determined = Z.shape[1] == n - len(A)
     H = np.zeros((n, n))
@@ -166,15 +166,6 @@ def _parameters(
             unit = value if i >= x.size - 2 else 1.0  # d ln ω = dω/ω
             slope = sign / (unit * (upper[i] - lower[i]))
             yield _Parameter(f"{name} {end}", value, none, {f"{name} {end}": slope})
-
-
-def _bound_rows(problem: CoDesignProblem) -> dict[str, Array]:
-    """∇g of the bounds in unit-box variables."""
-    names = (*problem.names, "omega_S", "omega_T")
-    unit = np.eye(len(names))
-    return {f"{n} lower": -unit[i] for i, n in enumerate(names)} | {
-        f"{n} upper": unit[i] for i, n in enumerate(names)
-    }
 
 
 def sections_responses(

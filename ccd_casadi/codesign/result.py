@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.codesign.design_entries import budget_entry
+from ccd_casadi.codesign.design_entries import budget_entry, move_entry
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
@@ -86,13 +86,14 @@ def result_dict(
         "inner_gap": verified.inner_gap,
         "kkt": kkt_dict(verified.kkt),
         "globality": globality_dict(outcome.outer),
-        "box_look": _box_look(look),
+        "box_look": {} if look is None else look.entry,
         "notes": list(plant.notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         **run_entry(spent, seconds, seed, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
         **verified.evidence(promised),
         **budget_entry(problem, verified.theta, verified.controller),
+        **move_entry(problem, verified.theta, verified.controller),
     }
     return clean(result)
 
@@ -206,14 +207,6 @@ def globality_dict(solution: OuterSolution | None) -> dict[str, Any]:
             for item in solution.optima
         ],
     }
-
-
-def _box_look(look: BoxLook | None) -> dict[str, Any]:
-    """What was looked at besides the formulation's own way; nothing where there was no look."""
-    if look is None:
-        return {}
-    found = {key: value for key, value in vars(look).items() if key != "x"}
-    return found | {"moved": look.moved}
 
 
 def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:

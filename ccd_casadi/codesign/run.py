@@ -84,14 +84,14 @@ def co_design(
     """
     if sampler.problem.listed:
         if given is not None:
-            raise UserError("--surrogate: starts no solve with lists of values; leave it out")
+            raise UserError("--surrogate: cannot start a solve with lists of values; leave it out")
         return _of_lists(sampler, formulation, seed)
     began = perf_counter()
     name, tolerance = type(formulation).__name__.lower(), formulation.tolerance
     outer = outer_of(sampler)
     require_solvable(sampler.problem)
     if given is not None and not outer.learns_from_others:
-        raise UserError("--surrogate: starts no solve of this kind; solve the case without it")
+        raise UserError("--surrogate: cannot start a solve of this kind; solve the case without it")
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
         return concluded(nothing_found(outer, forbidden), name, tolerance, seed, began)
@@ -122,7 +122,7 @@ OUTERS: dict[type[ControllerProblem], type[Outer]] = {
 
 
 def verify(sampler: Sampler, x: Array) -> Verified:
-    """The design at x polished on the truth, held against the whole inner problem, and judged.
+    """Polish the design at x on the truth, compare it with the whole inner problem, judge it.
 
     x is θ, followed by ln ω_S and ln ω_T for mixed sensitivity.
     """
@@ -135,7 +135,9 @@ def verify(sampler: Sampler, x: Array) -> Verified:
 def require_solvable(problem: CoDesignProblem) -> None:
     """Raise UserError where J rewards what it should not."""
     if not problem.figure.larger_is_better and not problem.w2 > 0.0:
-        words = 'with inner.minimise = "rms_error" J = w1 f + w2 e counts the error e in m'
+        v = problem.figure
+        words = f'with inner.minimise = "{v.key}" J = w1 f + w2 {v.symbol} counts the {v.words} '
+        words += f"{v.symbol} in {v.si_unit}"
         raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
 
 

@@ -22,7 +22,7 @@ from ccd_casadi.codesign.outer_problem import (
     unmet_constraint,
 )
 from ccd_casadi.codesign.outer_sections import SectionsOuter, by_pieces
-from ccd_casadi.codesign.theta_direct import TrueBandwidth
+from ccd_casadi.codesign.theta_direct import FAR, TrueBandwidth
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.inner_problem.objective import objective_of
@@ -46,7 +46,6 @@ from surrogates import design
 
 SETTLED = 1e-7  # of J: what local steps promise less than that is not looked for
 INSIDE = 1e-7  # of λ
-FIRST = 0.1  # of the box: how far the optimum of a part may be from the one that is known near by
 
 
 @dataclass
@@ -106,7 +105,7 @@ class ListedSections:
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by."""
     truth = TrueBandwidth(sampler, "near by")
-    truth, best = by_pieces(truth, truth.at(theta), SETTLED, FIRST)
+    truth, best = by_pieces(truth, truth.at(theta), SETTLED, FAR)
     return _found(truth.sampler.problem, best)
 
 
@@ -151,7 +150,7 @@ def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
         "theta": dict(zip(problem.names, best.theta, strict=True)),
         "hardware_cost": hardware_cost(plant_of(problem), best.theta),
         "bandwidth_hz": best.bandwidth / HZ,
-        "error_rms_of_set": best.error,
+        f"{problem.figure.entry}_of_set": best.value,
     }
     outcome = FormulationResult(np.array(best.theta), agreed=True)
     return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))

@@ -1,33 +1,27 @@
-"""The true v(θ) and local solves on it: IPOPT, and steps that pass its kinks (`optim.pieces`)."""
-
-from dataclasses import replace
+"""The true v(θ) and local solves on it, by steps that pass its kinks (`optim.pieces`)."""
 
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.optim.pieces import FIRST, Local, descend, jumps
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.casadi_callback import VectorCallback
 from surrogates import design
 
-PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
-SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
+SETTLED = 1e-7  # of J: what steps promise less than that is not looked for
+FAR = 0.1  # of the box: the first radius where the optimum is not known to be near by
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 
-class TrueBandwidth(VectorCallback):
-    """θ -> ω_b*(θ) in rad/s with its envelope gradient; NaN where no design is certified."""
+class TrueBandwidth:
+    """θ -> ω_b*(θ) in rad/s with its envelope gradient, from a sampler."""
 
     def __init__(self, sampler: Sampler, label: str) -> None:
         self.sampler, self.label = sampler, label
         self.known: dict[bytes, BandwidthSample] = {}
-        count = len(sampler.problem.names)
-        super().__init__("true_bandwidth", count, 1, self._value, self._slope)
 
     def at(self, theta: Array) -> BandwidthSample:
         """The sample at θ; repeated points cost nothing."""
@@ -42,38 +36,26 @@ class TrueBandwidth(VectorCallback):
             self.known |= {keys[i]: sample for i, sample in zip(new, samples, strict=True)}
         return [self.known[key] for key in keys]
 
-    def _value(self, theta: Array) -> Array:
-        sample = self.at(theta)
-        stationary = np.isfinite(sample.gradient).all()
-        return np.array([sample.value if stationary else np.nan])
-
-    def _slope(self, theta: Array) -> Array:
-        return np.array(self.at(theta).gradient)[None, :]
-
 
 def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:
-    """IPOPT on the true ω_b*(θ) from the case's start and a Sobol set of starts."""
+    """From the case's start, and by long steps from each of a Sobol set beside it (`pieces_from`).
+
+    From one start alone it is the polish that follows.
+    """
     problem = sampler.problem
-    lower, upper = box(problem)
     points = np.array(problem.start)[None, :]
     if starts > 1:
-        points = np.vstack([points, design("sobol", lower, upper, starts - 1, seed)])
+        points = np.vstack([points, design("sobol", *box(problem), starts - 1, seed)])
     truth = TrueBandwidth(sampler, "direct")
-    good = [p for p in points if truth.at(p).feasible and np.isfinite(truth.at(p).gradient).all()]
+    good = [one for one in truth.all_at(points) if np.isfinite(one.gradient).all()]
+    good = [one for one in good if np.isfinite(objective_of(problem, one))]
     if not good:
         message = f"none of {len(points)} starting designs is certified"
         return FormulationResult(message=message)
-    program = nested_program(problem, truth)
-    program = replace(program, exact_hessian=False)
-    try:
-        solution = solve_program(program, np.array(good), tolerance=PRECISE, settled=SETTLED)
-    except OuterFailure as error:
-        best = min((truth.at(p) for p in good), key=lambda s: objective_of(problem, s))
-        if not np.isfinite(objective_of(problem, best)):
-            return FormulationResult(message=str(error))
-        return FormulationResult(np.array(best.theta), None, (), (), None, False, str(error))
-    best = min(truth.known.values(), key=lambda s: objective_of(problem, s))
-    return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")
+    if starts > 1:
+        good = [pieces_from(truth, one, SETTLED, FAR)[0] for one in good]
+    best = min(good, key=lambda one: objective_of(problem, one))
+    return FormulationResult(np.array(best.theta), None, (), (), None, True, "")
 
 
 def pieces_from(
@@ -105,4 +87,5 @@ def pieces_from(
     end = descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
     met = (found for found in map(local, truth.known.values()) if found is not None)
     jumped = any(found.value > end.value and jumps(end, found) for found in met)
-    return min(truth.known.values(), key=lambda sample: objective_of(problem, sample)), jumped
+    found = (best, *truth.known.values())  # where nothing is promised nothing was asked for
+    return min(found, key=lambda sample: objective_of(problem, sample)), jumped

@@ -39,8 +39,8 @@ from ccd_casadi.support.arrays import Array
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
-CYCLES = 20  # sets of plants at most
-STEPS = 60  # of a search
+CYCLES = 6  # times at most that the plants are made anew before worse ones are looked for
+STEPS = 40  # of a search
 FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-6  # of w2 ω_b
 SETTLED = 1e-5  # of J: less is not worth another set of plants
@@ -57,18 +57,18 @@ class Proposal:
     gain: float
 
 
-def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
-    """From θ to where the joint search promises no more: the sampler of the problem whose anchor
-    is the controller there, and its true sample."""
+def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample, bool]:
+    """From θ towards where the joint search promises no more: the sampler of the problem whose
+    anchor is the controller there, its true sample, and whether no more is promised."""
     best = sampler.bandwidths(theta, "polishing")[0]
     J, reach = objective_of(sampler.problem, best), REACH
     for _ in range(CYCLES):
         if not np.isfinite(J) or reach < LEAST:
-            break
+            return sampler, best, True
         make = partial(proposed, sampler.problem, best, reach)
         found = sampler.kept("together", (*best.theta, reach), Proposal, make)
         if found.gain <= SETTLED * abs(J):
-            break
+            return sampler, best, True
         other = sampler.of(with_sections(sampler.problem, anchors=(found.kappa,)))
         sample = other.bandwidths(np.array(found.theta), "polishing")[0]
         gained = J - objective_of(other.problem, sample)
@@ -78,7 +78,7 @@ def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    return sampler, best
+    return sampler, best, False
 
 
 def proposed(problem: CoDesignProblem, sample: BandwidthSample, reach: float) -> Proposal:
@@ -93,22 +93,15 @@ def proposed(problem: CoDesignProblem, sample: BandwidthSample, reach: float) ->
     ).best
     gain = model.unit * (start.value - end.value - PENALTY * end.violation)
     z, kappa, _ = model.parts(end.x)
-    P = end.data.problem.plants
-    found = end.data.problem.structure.in_units(kappa, P.omega_0, P.force)
+    loops = end.data[0]
+    found = loops.structure.in_units(kappa, loops.plants.omega_0, loops.plants.force)
     theta = np.clip(model.theta(z), *box(problem))
     return Proposal(tuple(map(float, theta)), tuple(map(float, found)), float(gain))
 
 
-@dataclass(frozen=True)
-class Joint:
-    """The loops at a point x = (z, κ, τ)."""
-
-    problem: LoopProblem
-    assessment: Assessment
-
-
-class JointModel(Model[Joint]):
-    """J over its `unit`, w2 ω_b in the middle, on the plants to first order around a sample."""
+class JointModel(Model[tuple[LoopProblem, Assessment]]):
+    """J over its `unit`, w2 ω_b in the middle, on the plants to first order around a sample; over
+    x = (z, κ, τ), with the loops at x."""
 
     corrected = True
 
@@ -154,7 +147,7 @@ class JointModel(Model[Joint]):
             bounds_of(self.problem), sections.sampling, sections.frequencies,
         )  # fmt: skip
 
-    def at(self, x: Array) -> Iterate[Joint] | None:
+    def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
         """With every loop stable."""
         x = np.clip(x, self.low, self.high)
         z, kappa, tau = self.parts(x)
@@ -166,14 +159,14 @@ class JointModel(Model[Joint]):
         cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.theta(z))
         slope = np.concatenate([own.cost_gradient / self.unit, np.zeros(len(kappa)), [-worth]])
         violation = max(found.violation, float((own.constraints + INSIDE).max(initial=0.0)))
-        return Iterate(x, cost / self.unit - worth, slope, violation, Joint(problem, found))
+        return Iterate(x, cost / self.unit - worth, slope, violation, (problem, found))
 
-    def rows(self, here: Iterate[Joint], radius: float) -> Rows:
+    def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""
         z, kappa, tau = self.parts(here.x)
-        problem, found = here.data.problem, all_rows(here.data.assessment)
-        assert here.data.assessment.peaks is not None
-        count, peaks = len(z), len(here.data.assessment.peaks.v)
+        problem, assessment = here.data
+        assert assessment.peaks is not None
+        found, count, peaks = all_rows(assessment), len(z), len(assessment.peaks.v)
         steep = np.abs(found.to_kappa).sum(1) + np.abs(found.to_tau)
         kept = np.flatnonzero(found.value + FAR * radius * np.maximum(steep, 1.0) > 0.0)
         found = found.only(kept)

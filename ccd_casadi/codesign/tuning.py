@@ -44,7 +44,7 @@ AT_REST = 1e-7  # of the largest root: below, it lies at 0
 
 @dataclass(frozen=True)
 class Tuned:
-    """`design` on the lines of `case`; `models`: the plants in discrete time, None where measured.
+    """A tuned controller: `design` on the lines of `case`; `models`: plants in discrete time.
 
     `norms`: ‖S‖∞ of each model's closed loop, infinite where its poles are not all stable.
     """
@@ -139,7 +139,8 @@ def _plant(
         kept = item.hz < (np.inf if rate_hz is None else 0.5 * rate_hz)
         lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
         G = (item.matrix * lag).reshape(item.G.shape)
-        return replace(item, hz=item.hz[kept], G=G[kept]), None
+        spread = item.spread if item.spread is None else item.spread[kept]
+        return replace(item, hz=item.hz[kept], G=G[kept], spread=spread), None
     if isinstance(item, interchange.NamedSystem):
         system, own = item.system, item.period
     else:
@@ -164,7 +165,7 @@ def _plant(
     rest = np.abs(rates) <= AT_REST * np.abs(rates).max(initial=0.0)
     zeros = system.rates_of(system.zeros(1.0 if own else top))
     if (np.abs(zeros) <= AT_REST * top).any():
-        raise UserError("the plant has a zero at 0: no controller holds its output in the end")
+        raise UserError("the plant has a zero at 0: no controller holds its output at rest")
     roots = np.concatenate([rates[~rest], zeros, [top]])
     low = BELOW * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
     omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),

@@ -19,7 +19,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import counted, metres
+from ccd_casadi.support.units import counted, metres, shown
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -88,7 +88,7 @@ def optimal(
     if not gap <= tolerance:
         return Line(State.FAILED, f"not optimal: {better}; {known}", figures)
     if unknown and not math.isfinite(residual):
-        return Line(State.WARNED, f"{unknown}: a limit of ours; {known}", figures)
+        return Line(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
     if not residual <= level:
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
         return Line(State.FAILED, words, figures)
@@ -274,7 +274,9 @@ def survives(
 
 def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line:
     """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
-    figures = margin_figures(found)
+    figures: dict[str, float] = {}
+    if found is not None:
+        figures = {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
     if sampling is not None:
         words = (
             f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "
@@ -286,17 +288,10 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
         return Line(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
-        f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, so that hold "
-        f"and one period of delay alone use it up below {float(f'{rate:.3g}'):g} Hz"
-    )
+        f"run deploy; the loops' least delay margin is {shown(found.delay, 's')}, and below "
+        f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
+    ).replace("µ", "u")
     return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
-
-
-def margin_figures(found: Survival | None) -> dict[str, float]:
-    """The margins that a computer's delay takes from."""
-    if found is None:
-        return {}
-    return {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
 
 
 def verdict_dict(verdict: Verdict) -> dict[str, Any]:

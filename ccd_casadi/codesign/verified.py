@@ -121,7 +121,7 @@ class Verified(ABC):
 
 @dataclass(frozen=True)
 class Solution(Shown):
-    """Everything a run found: the JSON result, and the objects behind it (None: infeasible).
+    """Result of a run: the JSON result and the objects behind it (None: infeasible).
 
     `problem` is the one solved: of a robust case that leaves its design plant open, the best one's.
     """

@@ -1,14 +1,13 @@
 """A verified design with a controller of fixed structure: its figures, checks and lines."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.codesign.costs import Costs
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.sections_entries import (
     active_of,
@@ -24,13 +23,40 @@ from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, uncertain_plant
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.sections_search import joined
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ, counted
+
+
+@dataclass(frozen=True)
+class Costs:
+    """ω_b in rad/s (NaN: none certified) at the ends of climbs from the design: `on_model` on the
+    model alone, `continuous` on the set without hold and delay. At least that much is reached.
+    """
+
+    on_model: float
+    continuous: float
+
+
+def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> Costs:
+    """The climbs from a certified design with parameters κ (SI)."""
+    sections = replace(sections_of_problem(problem), minimise="bandwidth")
+    model = tuple(map(float, uncertain_plant(problem, theta).nominal))
+
+    def climbed(easier: SectionsProblem) -> float:
+        value = sections_value(joined(replace(problem, controller=easier), kappa, ()), theta)
+        return value.bandwidth if value.feasible else float("nan")
+
+    return Costs(
+        climbed(replace(sections, members=((0, model),))), climbed(replace(sections, sampling=None))
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +66,8 @@ class VerifiedSections(Verified):
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
     the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
     `worst` the worst plant that was found. `raced` is a multi-start search at θ,
-    `costs` what easier problems have there, and `gap`, of ω_b, what no controller reaches.
+    `costs` what easier problems have there, and `gap`, of ω_b, what no controller reaches; `told`
+    the time of its move, where that counts.
     """
 
     design: SectionsDesign
@@ -53,6 +80,7 @@ class VerifiedSections(Verified):
     rounds: int
     costs: Costs
     gap: Gap | None
+    told: tuple[float, Yield | None] | None = None
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
     # and differences of two such say nothing of a small curvature.
@@ -109,12 +137,17 @@ class VerifiedSections(Verified):
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
         if sections.figure is not BANDWIDTH:
+            entry = sections.figure.entry
             found |= {
-                "error_rms_of_set": self.value,
-                "surrogate_error_rms": predicted,
-                "error_rms_raced": self.raced.value,
+                f"{entry}_of_set": self.value,
+                f"surrogate_{entry}": predicted,
+                f"{entry}_raced": self.raced.value,
                 "error_anchors": [list(kappa) for kappa in sections.error_anchors],
             }
+        if self.told is not None:
+            time, drawn = self.told
+            found |= {"move_time": time,
+                      "move_time_fresh": None if drawn is None else drawn.entry}  # fmt: skip
         if sections.weighted_level is None:
             words = "KS and T are not bounded: the case gives no controller.weighted_level"
             found["notes"] = [*plant_of(self.problem).notes(self.theta), words]
@@ -139,7 +172,9 @@ class VerifiedSections(Verified):
         }
 
     def checks(self) -> dict[str, bool]:
-        return {"robust": self.kept}
+        drawn = None if self.told is None else self.told[1]
+        later = {} if drawn is None else {"move_time": drawn.survived == drawn.draws}
+        return {"robust": self.kept, **later}
 
     def controller_entry(self) -> dict[str, Any]:
         return sections_controller(self.problem, self.design)

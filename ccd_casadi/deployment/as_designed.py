@@ -43,11 +43,11 @@ def deploy_as_designed(
     p, m = len(run.plant.C), run.plant.B.shape[1]
     whole = Channel("all", np.eye(p), np.eye(m), run.plant, K)
     family, dense = section_members(run), section_members(run, dense=True)
-    tustin = Conversion(Discretisation.TUSTIN, False, full.sensitivity_peak_frequency)
+    tustin = Conversion(Discretisation.TUSTIN, False)
     trials: tuple[Trial, ...]
     if designed is None:
         target = Target(inner.S_max, SAMPLED_EXCESS, full.bandwidth, SAMPLED_BANDWIDTH)
-        loops, conversions = ChannelLoops([whole], [K], target), conversions_of(timing, tustin.warp)
+        loops, conversions = ChannelLoops([whole], [K], target), conversions_of(timing)
         remedy = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
         trials, best, rate = choose(run, timing, loops, family, conversions, progress,
                                     remedy=remedy)  # fmt: skip

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ccd_casadi.analysis.feedforward import ORDER
 from ccd_casadi.deployment.anti_windup import takeover
-from ccd_casadi.deployment.feedforward import ORDER
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.package_text import filled

@@ -19,51 +19,36 @@ NICE = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.4, 8.0, 10.0)
 
 @dataclass(frozen=True)
 class Conversion:
-    """A method, with or without the lead that makes up for hold and delay; `warp` in rad/s.
+    """A method, with or without the lead that makes up for hold and delay.
 
     The lead is (1 + α) - α z⁻¹, whose phase is that of a time advance of αT at low frequency;
-    α = τ/T + 1/2 (+ 1/2 with the step-invariant method, which holds too). Its price is the gain
-    1 + 2α at half the sampling rate.
+    α = τ/T + 1/2. Its price is the gain 1 + 2α at half the sampling rate.
     """
 
     method: Discretisation
     lead: bool
-    warp: float
 
     @property
     def label(self) -> str:
         """`foh with lead`."""
         return f"{self.method.value}{' with lead' if self.lead else ''}"
 
-    def defined(self, period: float) -> bool:
-        """Whether there is such a K(z): what a prewarped one is exact at lies below Nyquist's."""
-        return self.method is not Discretisation.PREWARPED or self.warp * period < np.pi
-
     def advance(self, period: float, delay: float) -> float:
         """α, in periods; 0 without lead."""
-        held = 1.0 if self.method is Discretisation.STEP else 0.5
-        return delay / period + held if self.lead else 0.0
+        return delay / period + 0.5 if self.lead else 0.0
 
 
 def discretise(
     controller: StateSpace, conversion: Conversion, period: float, delay: float
 ) -> StateSpace:
-    """K(z) for a period and a delay in s, the lead on its input.
-
-    Raises ValueError where the frequency to be exact at lies above half the sampling rate.
-    """
+    """K(z) for a period and a delay in s, the lead on its input."""
     from scipy.signal import cont2discrete  # slow to import
 
-    parts = (controller.A, controller.B, controller.C, controller.D)
-    if conversion.method in (Discretisation.TUSTIN, Discretisation.PREWARPED):
-        step = period
-        if conversion.method is Discretisation.PREWARPED:
-            if not conversion.defined(period):
-                raise ValueError("the peak of S lies above half the sampling rate")
-            step = 2.0 * np.tan(0.5 * conversion.warp * period) / conversion.warp
-        found = tustin(controller, step)
+    if conversion.method is Discretisation.TUSTIN:
+        found = tustin(controller, period)
         A, B, C, D = found.A, found.B, found.C, found.D
     else:
+        parts = (controller.A, controller.B, controller.C, controller.D)
         A, B, C, D, _ = cont2discrete(parts, period, conversion.method.value)
     alpha = conversion.advance(period, delay)
     if not alpha:
@@ -105,9 +90,7 @@ class Target:
 def loop_at(
     plant: StateSpace, controller: StateSpace, conversion: Conversion, period: float, delay: float
 ) -> SampledFigures:
-    """The figures of the sampled loop; an unstable one's where K has no such discretisation."""
-    if not conversion.defined(period):
-        return SampledFigures(False, np.inf, np.nan, np.nan, np.nan)
+    """The figures of the sampled loop."""
     K = discretise(controller, conversion, period, delay)
     return sampled_figures(closed_loop(sampled(plant, period, delay), K).S)
 

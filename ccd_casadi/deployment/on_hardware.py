@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.anti_windup import limited
-from ccd_casadi.deployment.feedforward import feedforward
 from ccd_casadi.deployment.move import Hardware, move
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.lti.state_space import StateSpace

@@ -42,7 +42,7 @@ def deploy(
     saturation: float | None = None,
     progress: Callable[[str], None] = lambda words: None,
 ) -> Deployment:
-    """Reduce, discretise and verify the controller of a run; `progress` is told each step.
+    """Reduce, discretise and verify the controller of a run; `progress` is called at each step.
 
     All of it on the nominal plant and on every plant of the run's [robust] set. Raises UserError
     where no sampling rate is enough, or the given one is no rate for this loop.
@@ -69,7 +69,7 @@ def deploy(
         run.plant, reduced, run.weights, gamma=UNBOUNDED, omega_low=inner.omega_low
     )
     target = Target(inner.S_max, SAMPLED_EXCESS, full.bandwidth, SAMPLED_BANDWIDTH)
-    conversions = conversions_of(timing, full.sensitivity_peak_frequency)
+    conversions = conversions_of(timing)
     loops = ChannelLoops(channels, small, target)
     for attempt in range(1 + ADDED):
         trials, best, rate = choose(run, timing, loops, family, conversions, progress, attempt)

@@ -88,24 +88,16 @@ def choose(
                 f"{run.folder}: {words} and omega_b to 3 %{where} with this delay; {remedy}"
             )
         return tuple(trials), least, nice_rate(least.needed_hz)
-    possible = [t for t in trials if t.conversion.defined(1.0 / timing.rate_hz)]
-    if not possible:
-        peak_hz = run.figures.sensitivity_peak_frequency / HZ
-        raise UserError(
-            f"--rate-hz {timing.rate_hz:g}: --method prewarped is exact at the peak of S, "
-            f"{peak_hz:.4g} Hz, which half the rate has to exceed; sample faster, or choose "
-            "another --method"
-        )
-    enough = [t for t in possible if _needed(t) <= timing.rate_hz]
-    best = min(enough, key=_needed) if enough else min(possible, key=lambda t: _badness(t.there))
+    enough = [t for t in trials if _needed(t) <= timing.rate_hz]
+    best = min(enough, key=_needed) if enough else min(trials, key=lambda t: _badness(t.there))
     return tuple(trials), best, timing.rate_hz
 
 
-def conversions_of(timing: Timing, peak_frequency: float) -> list[Conversion]:
+def conversions_of(timing: Timing) -> list[Conversion]:
     """Every method, with and without a lead, or those that the options name."""
     methods = list(Discretisation) if timing.method is None else [timing.method]
     leads = [False, True] if timing.lead is None else [timing.lead]
-    return [Conversion(method, lead, peak_frequency) for method in methods for lead in leads]
+    return [Conversion(method, lead) for method in methods for lead in leads]
 
 
 def _needed(trial: Trial) -> float:

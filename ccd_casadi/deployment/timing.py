@@ -8,8 +8,6 @@ class Discretisation(StrEnum):
     """How K(s) becomes K(z)."""
 
     TUSTIN = "tustin"
-    PREWARPED = "prewarped"  # Tustin, exact at the frequency of S's peak
-    STEP = "zoh"  # step-invariant
     RAMP = "foh"  # ramp-invariant: exact for an error that is straight between samples
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ccd_casadi.drawing.pictures import ModeShapes
-from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE, require_shapes
 from ccd_casadi.support.arrays import Array
 
 Corner = Literal["best", "lower left", "lower right", "upper left", "upper right", "center left",
@@ -124,9 +124,16 @@ def _cell(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Picture:
-    """An <svg> element that a plant or a machine has drawn of itself."""
+    """An <svg> element that a plant or a machine has drawn of itself.
+
+    Raises ValueError where it holds more than shapes and words: it goes into a page as it is, and a
+    report.json may come from a stranger.
+    """
 
     svg: str
+
+    def __post_init__(self) -> None:
+        require_shapes(self.svg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,28 +197,7 @@ class Landscape:
         return ~(first[:, None] & second[None, :])
 
 
-@dataclass(frozen=True)
-class SweepMap:
-    """The inner problem at one θ: rows (ω_S Hz, ω_T Hz, ω_b Hz, ‖S‖∞, |S(low)|, feasible 1/0).
-
-    `bandwidth_hz`, `peak` = ln(‖S‖∞/S_max) and `low`, the largest ln(figure/bound) of the bounds
-    that `others` names, lie on the grid of
-    `omega_S`, `omega_T` in Hz, (len(omega_S), len(omega_T)), NaN outside what is known; empty
-    where the rows carry no field. `optimum` is (ω_S, ω_T, ω_b) in Hz.
-    """
-
-    rows: Array
-    omega_S: Array
-    omega_T: Array
-    bandwidth_hz: Array
-    peak: Array
-    low: Array
-    optimum: tuple[float, float, float]
-    source: str
-    others: str = "S_low"
-
-
-Drawing = Lines | Landscape | SweepMap | Modes | Picture
+Drawing = Lines | Landscape | Modes | Picture
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
-"""Maps over two variables: the landscape of ω_b*(θ) and the inner problem's (ω_S, ω_T)."""
+"""The map over two parameters: the landscape of ω_b*(θ)."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Landscape, SweepMap
+from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.drawing.svg import (
     BLACK,
     COLOUR_MAP,
@@ -14,7 +14,6 @@ from ccd_casadi.drawing.svg import (
     ORANGE,
     at_both_widths,
     axis_label,
-    log_axis,
     new_figure,
     place,
     style,
@@ -86,41 +85,6 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
         return to_svg(figure, key, title, share=_share(width))
 
 
-def figure_sweep(sweep: SweepMap, key: str) -> str:
-    """ω_b over (ω_S, ω_T) at one θ; what S_max and S_low forbid is hatched."""
-    return at_both_widths(lambda own, inches: _sweep(sweep, own, inches), key, MAP_WIDTH)
-
-
-def _sweep(sweep: SweepMap, key: str, width: float) -> str:
-    with style():
-        figure, axes = _map_axes(width)
-        axes.grid(False)
-        shown = sweep.bandwidth_hz if sweep.bandwidth_hz.size else sweep.rows[:, 2]
-        filled, norm = _contours(axes, sweep.omega_S, sweep.omega_T, sweep.bandwidth_hz, shown)
-        if sweep.bandwidth_hz.size:
-            _shade(axes, sweep.omega_S, sweep.omega_T, np.maximum(sweep.peak, sweep.low))
-            for field, line, label in ((sweep.peak, "-", "S_max"), (sweep.low, "--", sweep.others)):
-                if np.nanmin(field) < 0.0 < np.nanmax(field):
-                    axes.contour(sweep.omega_S, sweep.omega_T, field.T, levels=[0.0],
-                                 colors=BLACK, linewidths=1.1, linestyles=line)  # fmt: skip
-                    axes.plot([], [], color=BLACK, linestyle=line, linewidth=1.1, label=label)
-        inside = sweep.rows[:, 5] > 0.5
-        dots = _dots(axes, sweep.rows[inside], norm, "synthesis, feasible")
-        axes.plot(sweep.rows[~inside, 0], sweep.rows[~inside, 1], "x", color=BLACK, markersize=5,
-                  clip_on=False, linestyle="none", label="synthesis, infeasible")  # fmt: skip
-        axes.plot([sweep.optimum[0]], [sweep.optimum[1]], "*", color=ORANGE, markersize=15,
-                  markeredgecolor=RING, markeredgewidth=0.9, zorder=7, clip_on=False,
-                  linestyle="none", label="verified optimum")  # fmt: skip
-        log_axis(axes.xaxis, *_ends(sweep.omega_S, sweep.rows[:, 0]))
-        log_axis(axes.yaxis, *_ends(sweep.omega_T, sweep.rows[:, 1]))
-        axes.set_xlabel(axis_label("ω_S of the weight on S", "Hz"))
-        axes.set_ylabel(axis_label("ω_T of the weight on T", "Hz"))
-        _colour_bar(figure, filled or dots, "bandwidth ω_b (Hz)")
-        _legend(figure, axes)
-        title = "Bandwidth over the two break frequencies at the optimum"
-        return to_svg(figure, key, title, share=_share(width))
-
-
 def _share(width: float) -> float:
     """Of the column, in %."""
     return 100.0 if width == NARROW else 0.0
@@ -186,9 +150,3 @@ def _legend(figure: "Figure", axes: "Axes") -> None:
     handles, labels = axes.get_legend_handles_labels()
     columns = 2 if figure.get_figwidth() == NARROW else 3 if len(labels) > 4 else 4
     figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
-
-
-def _ends(axis: Array, rows: Array) -> tuple[float, float]:
-    values = axis if axis.size else rows
-    low, high = float(values.min()), float(values.max())
-    return (low / 1.2, high * 1.2) if high <= 1.01 * low else (low, high)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.lines import figure_lines
-from ccd_casadi.drawing.maps import figure_landscape, figure_sweep
+from ccd_casadi.drawing.maps import figure_landscape
 from ccd_casadi.drawing.page import document, escape, table_html, typeset
 from ccd_casadi.drawing.turntable import modes_html
 
@@ -79,8 +79,6 @@ def drawing_html(drawing: c.Drawing, key: str) -> str:
             return figure_lines(drawing, key)
         case c.Landscape():
             return figure_landscape(drawing, key)
-        case c.SweepMap():
-            return figure_sweep(drawing, key)
         case c.Modes():
             return modes_html(drawing)
         case c.Picture(svg):

@@ -36,7 +36,7 @@ def draw(path: Path, stored: Any) -> None:
     try:
         page = restored(Page, stored)
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
-        words = f"pages.{path.name}: is not what a page shows; give the command of it again"
+        words = f"pages.{path.name}: is not what a page shows; repeat the command that wrote it"
         raise UserError(f"{path.with_name(NAME)}: {words}") from None
     write_whole(path, painted(page))
 
@@ -53,9 +53,9 @@ def read_pages(folder: Path) -> dict[str, Any]:
         found = json.loads(path.read_text(encoding="utf-8"))
         pages = dict(found["pages"]) if found["format"] == FORMAT else None
     except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(f"{path}: is no report.json; give the command of the page again") from None
+        raise UserError(f"{path}: is not a report.json; repeat the command") from None
     if pages is not None and any(name != Path(name).name or "." not in name for name in pages):
-        raise UserError(f"{path}: pages: names what is no page of this folder")
+        raise UserError(f"{path}: pages: names a file that is not a page of this folder")
     if pages is None:
         raise UserError(f"{path}: format: is not {FORMAT}; draw it with the version that wrote it")
     return pages

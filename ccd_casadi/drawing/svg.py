@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from html import escape
 from io import StringIO
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 # at least 3.4 : 1 to white paper, which their pink, yellow and sky have not.
 BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
 PURPLE, AMBER, BROWN = "#b8548c", "#a87000", "#8c564b"
-SKY = "#56b4e9"  # on a dark ground alone
 BLACK, GREY = "#1a1a1a", "#767676"
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE, AMBER, BROWN, BLACK)
 # Colours of a figure -> the page's variable (`page.CSS`) that it becomes: (light, dark).
@@ -40,6 +40,7 @@ COLOUR_MAP = "viridis"
 WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
 NARROW = 4.6  # inches of the same figure on a screen of a telephone
 LONGEST_LABEL = 40
+SHAPES = {"svg", "g", "path", "rect", "circle", "line", "polyline", "polygon", "text", "tspan"}
 
 
 @contextmanager
@@ -111,6 +112,20 @@ def to_svg(figure: "Figure", key: str, title: str, data: str = "", share: float 
     head = f'<svg viewBox="{box[1]}" {size} role="img" aria-label="{escape(title)}"{more}>'
     body = text[text.index(">") + 1 :]
     return re.sub(r"\n\s*", "\n", head + body).strip()
+
+
+def require_shapes(svg: str) -> None:
+    """Raise ValueError where an <svg> element is none, or holds more than shapes and words."""
+    if "<!" in svg:
+        raise ValueError("a picture declares what is no shape")
+    try:
+        parts = list(ElementTree.fromstring(svg).iter())
+    except ElementTree.ParseError as error:
+        raise ValueError(f"a picture is no SVG: {error}") from None
+    for part in parts:
+        wrong = [key for key in part.attrib if key.startswith("on") or "href" in key]
+        if part.tag not in SHAPES or wrong or any("url(" in v for v in part.attrib.values()):
+            raise ValueError(f"a picture holds <{part.tag} {' '.join(wrong)}>, which is no shape")
 
 
 def axis_label(name: str, unit: str) -> str:

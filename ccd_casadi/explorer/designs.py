@@ -25,7 +25,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out
-from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
+from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 
@@ -169,32 +169,47 @@ def _look(
     how: How,
     began: float,
 ) -> Look:
-    plant = scaled_system(problem, elements.system)
-    weights = problem.weights.at(*point)
-    inner = problem.inner
+    look = without_controller(problem, knobs, elements, how)
+    weights, inner, plant = problem.weights.at(*point), problem.inner, look.plant
     made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
     made = handed_out(plant, made, inner.omega_low)
-    cost, broken = hardware_at(problem, knobs.theta)
-    standing, reason = judged(problem, made.figures, broken)
+    standing, reason = judged(problem, made.figures, unmet(problem, knobs.theta))
     if elements.error > OWN and standing is not Standing.REFUSED:
         standing, reason = Standing.NEAR, ""
     finite = all(np.isfinite(getattr(made.controller, part)).all() for part in "ABCD")
+    return replace(
+        look, weights=weights, figures=made.figures,
+        controller=made.controller if finite and made.controller.A.size else None,
+        standing=standing, reason=reason,
+        active=active_constraints(inner, made.figures) if standing is Standing.KEPT else (),
+        seconds=perf_counter() - began,
+    )  # fmt: skip
+
+
+def without_controller(
+    problem: CoDesignProblem, knobs: Knobs, elements: Elements, how: How, words: str = ""
+) -> Look:
+    """A place without a controller, and why."""
+    nan = float("nan")
     return Look(
         knobs=knobs,
         problem=problem,
         elements=elements,
         modal=modal_plant(elements.system, problem.suspension),
-        plant=plant,
-        weights=weights,
-        figures=made.figures,
-        controller=made.controller if finite and made.controller.A.size else None,
+        plant=scaled_system(problem, elements.system),
+        weights=problem.weights,
+        figures=DesignFigures(
+            0.0, 0.0, Outcome.NOT_FINITE, nan, nan, nan, False, nan, nan, nan, nan,
+            Certificate(False, nan, nan, nan, False),
+        ),
+        controller=None,
         how=how,
-        standing=standing,
-        reason=reason,
-        cost=cost,
-        active=active_constraints(inner, made.figures) if standing is Standing.KEPT else (),
-        seconds=perf_counter() - began,
-    )
+        standing=Standing.REFUSED,
+        reason=words,
+        cost=hardware_cost(plant_of(problem), knobs.theta),
+        active=(),
+        seconds=0.0,
+    )  # fmt: skip
 
 
 def judged(
@@ -211,11 +226,6 @@ def judged(
     ]
     missed += [f"the constraint {name} on θ is not met" for name in broken]
     return (Standing.MISSED, "; ".join(missed)) if missed else (Standing.KEPT, "")
-
-
-def hardware_at(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[float, list[str]]:
-    """f(θ), and the names of the constraints on θ that are not met."""
-    return hardware_cost(plant_of(problem), theta), list(unmet(problem, tuple(theta)))
 
 
 def _excess(problem: CoDesignProblem, row: DesignFigures) -> float:

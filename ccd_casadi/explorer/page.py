@@ -28,8 +28,9 @@ from ccd_casadi.explorer.panels import EMPTY, FIGURES, LOOKS, OVER_HZ, Drawn, dr
 from ccd_casadi.explorer.pins import Kept, Pins
 from ccd_casadi.explorer.sections import Designed, anchored, designed
 from ccd_casadi.explorer.session import Session, searched_exactly
-from ccd_casadi.explorer.words import end_words, machine_html, move_words, standing_html
+from ccd_casadi.explorer.words import machine_html, move_words, standing_html
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.package_text import package_text
 
 TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once
@@ -337,7 +338,9 @@ class Page:
 
     def _ended(self, code: int) -> None:
         self.solve_button.disabled, self.stop.disabled = False, True
-        self._said(f"the solve ended: {end_words(code)}")
+        known = {exit_code.value: exit_code.words for exit_code in ExitCode}
+        words = known.get(code, f"exit code {code}")
+        self._said(f"the solve ended: {words}")
         if code in (0, 4):
             self._go_to_solved()
         if (self._solved / "report.html").exists():

@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.explorer.designs import Elements, How, Look, Standing, elements_at, hardware_at
+from ccd_casadi.explorer.designs import How, Look, Standing, elements_at, without_controller
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.fixed_structure import Certificate as SetCertificate
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.design import Progress
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_system
+from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
 from ccd_casadi.inner_problem.sections_search import prepared, with_range
-from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.units import sections_unit
 from ccd_casadi.support.arrays import Array
@@ -78,44 +78,14 @@ def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) 
     controller = controller_of(structure_of(problem), kappa)
     found = judged_corners(problem, knobs.theta, controller)
     elements = elements_at(problem, knobs.theta)
-    cost, broken = hardware_at(problem, knobs.theta)
+    broken = unmet(problem, knobs.theta)
     standing, reason = _standing(found)
     if standing is Standing.KEPT and broken:
         standing, reason = Standing.MISSED, f"the constraint {broken[0]} on θ is not met"
-    look = _look(problem, knobs, elements, cost, reason)
+    look = without_controller(problem, knobs, elements, how, reason)
     return replace(
-        look, figures=_figures(found), controller=controller, how=how, standing=standing,
+        look, figures=_figures(found), controller=controller, standing=standing,
         kappa=kappa, seconds=perf_counter() - began,
-    )  # fmt: skip
-
-
-def empty_look(problem: CoDesignProblem, knobs: Knobs, elements: Elements, words: str) -> Look:
-    """A place without a controller yet."""
-    return _look(problem, knobs, elements, hardware_at(problem, knobs.theta)[0], words)
-
-
-def _look(
-    problem: CoDesignProblem, knobs: Knobs, elements: Elements, cost: float, words: str
-) -> Look:
-    nan = float("nan")
-    return Look(
-        knobs=knobs,
-        problem=problem,
-        elements=elements,
-        modal=modal_plant(elements.system, problem.suspension),
-        plant=scaled_system(problem, elements.system),
-        weights=problem.weights,
-        figures=DesignFigures(
-            0.0, 0.0, Outcome.NOT_FINITE, nan, nan, nan, False, nan, nan, nan, nan,
-            Certificate(False, nan, nan, nan, False),
-        ),
-        controller=None,
-        how=How.SECTIONS,
-        standing=Standing.REFUSED,
-        reason=words,
-        cost=cost,
-        active=(),
-        seconds=0.0,
     )  # fmt: skip
 
 

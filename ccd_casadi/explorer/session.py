@@ -10,10 +10,18 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.explorer.designs import Elements, How, Look, elements_at, present, searched
+from ccd_casadi.explorer.designs import (
+    Elements,
+    How,
+    Look,
+    elements_at,
+    present,
+    searched,
+    without_controller,
+)
 from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.explorer.modes import KnownModes, in_modal_form
-from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_look
+from ccd_casadi.explorer.sections import Designed, anchored, judged_look
 from ccd_casadi.explorer.words import surface_modes_html
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -78,7 +86,8 @@ class Session:
         problem = anchored(problem, self.designed_for)
         if self.kappa is None:
             elements = elements_at(problem, knobs.theta)
-            return empty_look(problem, knobs, elements, "no controller yet: design one here")
+            words = "no controller yet: design one here"
+            return without_controller(problem, knobs, elements, How.SECTIONS, words)
         return judged_look(problem, knobs, self.kappa, How.HELD)
 
     def took_sections(self, found: Designed) -> Look | None:

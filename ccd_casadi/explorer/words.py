@@ -99,17 +99,6 @@ def sampled_words(sampled: AsSampled, S_max: float) -> str:
     )
 
 
-def end_words(code: int) -> str:
-    """An exit code of `solve` in words."""
-    found = {
-        0: "done and verified",
-        3: "no feasible design",
-        4: "finished, not verified",
-        130: "stopped; what is sampled is kept",
-    }
-    return found.get(code, f"exit code {code}")
-
-
 def pin_columns(
     names: Sequence[str], scales: Sequence[float], pins: Sequence[tuple[str, Look]],
     colours: Sequence[str],

@@ -57,7 +57,7 @@ class ChannelBounds:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Constraints on every plant; SI, frequencies in rad/s, None: no such bound.
+    """Bounds that hold on every plant; SI, frequencies in rad/s, None: no such bound.
 
         |S(jω)| <= S_max,   |S(jω_low)| <= S_low
         |S(jω)| <= 1/√2                             for ω <= ω_b

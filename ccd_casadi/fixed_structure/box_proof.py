@@ -1,9 +1,10 @@
 """A proof that a controller keeps its bounds on a whole box of plants, by branch and bound.
 
-Frequency and up to four uncertain parameters are divided until enclosures (`enclosure`) say on
-every sub-box that the loop has no pole on the axis and every figure stays below 1 + `slack` times
-its bound. With the model's own loop stable, so are all of them. What the given number of boxes does
-not close is still bounded: the proof then names the factor that is proven.
+Frequency and the uncertain parameters are divided until enclosures say on every sub-box that the
+loop has no pole on the axis and every figure stays below 1 + `slack` times its bound: all figures
+of one channel with up to four parameters (`enclosure`), |S| alone of more (`mode_discs`). With the
+model's own loop stable, so are all of them. What the given number of boxes does not close is still
+bounded: the proof then names the factor that is proven.
 """
 
 import itertools
@@ -13,18 +14,18 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
-from ccd_casadi.fixed_structure.loop import closed_loops, stable
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.mode_discs import ChannelFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
 
 SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
-MOST_PARAMETERS = 4
+SLACK_OF_MANY = 0.05  # of discs of modes
+FEW_PARAMETERS = 4
 MOST_BOXES = 500_000  # some twenty seconds
 AT_ONCE = 20_000
 ABOVE = 3.0  # times ω_b and the fastest pole: from there on frequencies are counted by 1/ω
@@ -39,8 +40,7 @@ class ProofOutcome(StrEnum):
     OPEN = "stability is not proven on the whole box within the number of boxes"
     REFUTED = "a plant of the box exceeds a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
-    TOO_MANY_PARAMETERS = "more than four uncertain parameters"
-    SEVERAL_CHANNELS = "the plant has several inputs or outputs"
+    NOT_SQUARE = "the plant has not as many channels as outputs"
     NOT_MODAL = "a given damping matrix couples the modes"
     VARIES = "a theta varies, and moves the modes: its range was searched"
 
@@ -49,8 +49,9 @@ class ProofOutcome(StrEnum):
 class Proof:
     """What is proven on the box: every |figure| <= `levels` times its bound, by kind of bound.
 
-    `slack` was asked for. `boxes` were looked at. Of a refuted box `option`, `point`, the bound and
-    the factor by which it is passed at least; enclosures say so, not a sample.
+    `slack` was asked for; `of_S`: of |S| alone. `boxes` were looked at. Of a refuted box `option`,
+    `point`, the bound and the factor by which it is passed at least; enclosures say so, not a
+    sample.
     """
 
     outcome: ProofOutcome
@@ -61,6 +62,7 @@ class Proof:
     option: int = 0
     point: tuple[float, ...] = ()
     passed: tuple[str, float] = ("", np.nan)
+    of_S: bool = False
 
     @property
     def proven(self) -> bool:
@@ -86,8 +88,9 @@ class Proof:
         if not self.stable:
             return f"between these plants nothing is proven: {self.outcome.value}"
         worst = max(self.levels.values(), default=0.0)
+        figure = "|S|" if self.of_S else "every figure"
         return (
-            f"proven for the whole box by {self.boxes} enclosures: stable, every figure at most "
+            f"proven for the whole box by {self.boxes} enclosures: stable, {figure} at most "
             f"{worst:.5g} of its bound"
         )
 
@@ -100,32 +103,36 @@ def prove(
     bounds: Bounds,
     sampling: Sampling | None = None,
     *,
-    slack: float = SLACK,
+    slack: float | None = None,
     most_boxes: int = MOST_BOXES,
 ) -> Proof:
     """Bounds and stability of the SI controller κ with ω_b (rad/s) on the whole box.
 
-    Of SISO plants with modal damping. The box is that of `uncertain`, all its options; the plant's
-    modal data and κ count as exact.
+    Of plants with modal damping. The box is that of `uncertain`, all its options; the plant's
+    modal data and κ count as exact. Of several channels or more than four parameters the bounds on
+    |S| alone, with `SLACK_OF_MANY` by default.
     """
     names = uncertain.names
+    many = isinstance(structure, ChannelStructure) or len(names) > FEW_PARAMETERS
+    slack = slack or (SLACK_OF_MANY if many else SLACK)
 
     def without(outcome: ProofOutcome) -> Proof:
         return Proof(outcome, slack, names)
 
-    several = any(system.B.shape[1] != 1 or len(system.C) != 1 for system in uncertain.options)
-    if several or isinstance(structure, ChannelStructure):
-        return without(ProofOutcome.SEVERAL_CHANNELS)
+    outputs = inputs = np.eye(1)
+    if isinstance(structure, ChannelStructure):
+        outputs, inputs = structure.decoupling.outputs, structure.decoupling.inputs
+    if len(uncertain.options[0].C) != outputs.shape[1] or outputs.shape[0] != outputs.shape[1]:
+        return without(ProofOutcome.NOT_SQUARE)
     if uncertain.ranges:
         return without(ProofOutcome.VARIES)
-    if len(names) > MOST_PARAMETERS:
-        return without(ProofOutcome.TOO_MANY_PARAMETERS)
-    models = [uncertain.plant(uncertain.nominal, i) for i in range(len(uncertain.options))]
-    problem = problem_for(models, structure, bounds, sampling)
-    P = problem.plants
-    if not stable(closed_loops(P, structure, in_problem_units(problem, kappa))).all():
+    models = [uncertain.plant(uncertain.nominal, i).plant_si()
+              for i in range(len(uncertain.options))]  # fmt: skip
+    K = controller_of(structure, kappa)
+    if not all(Loop(model, K, sampling).stable for model in models):
         return without(ProofOutcome.UNSTABLE)
-    unit = ABOVE * max(bandwidth, float(np.abs(P.poles).max()) * P.omega_0, bounds.omega_low)
+    fastest = max(float(np.abs(model.rates).max()) for model in models)
+    unit = ABOVE * max(bandwidth, fastest, bounds.omega_low)
     levels: dict[str, float] = {}
     looked = 0
     for option in range(len(models)):
@@ -134,8 +141,12 @@ def prove(
             return without(ProofOutcome.NOT_MODAL)
         period = None if sampling is None else sampling.period * unit
         delay = 0.0 if sampling is None else sampling.delay * unit
-        family = LoopFamily(plant, names, structure, structure.in_units(kappa, 1.0 / unit, 1.0),
-                            bounds, bandwidth, unit, period, delay)  # fmt: skip
+        own = structure.in_units(kappa, 1.0 / unit, 1.0)
+        parts = ((structure, own),) if isinstance(structure, Structure) else (
+            tuple(structure.split(own))
+        )  # fmt: skip
+        given = (plant, names, *parts[0], bounds, bandwidth, unit, period, delay)
+        family = ChannelFamily(*given, parts, outputs, inputs) if many else LoopFamily(*given)
         boxes = _first(family, uncertain.box)
         share = most_boxes // len(models)
         spent = 0
@@ -152,7 +163,7 @@ def prove(
                     middle = 0.5 * (part.low + part.high)[1:, j]
                     passed = (found.names[k], float(found.somewhere[k, j]))
                     return Proof(ProofOutcome.REFUTED, slack, names, {}, looked + spent, option,
-                                 tuple(map(float, middle)), passed)  # fmt: skip
+                                 tuple(map(float, middle)), passed, many)  # fmt: skip
                 closed = worst <= 1.0 + slack
                 if spent >= share:
                     closed[:] = True
@@ -168,7 +179,7 @@ def prove(
         outcome = ProofOutcome.OPEN
     elif highest > 1.0 + slack:
         outcome = ProofOutcome.LOOSER
-    return Proof(outcome, slack, names, levels, looked)
+    return Proof(outcome, slack, names, levels, looked, of_S=many)
 
 
 def _first(family: LoopFamily, box: Array) -> Boxes:
@@ -187,11 +198,15 @@ def _first(family: LoopFamily, box: Array) -> Boxes:
         steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 9)])
         cells += [(Chart.HIGH, a, b) for a, b in itertools.pairwise(steps)]
     cells.append((Chart.POINT, low * scale, low * scale))
-    chart = np.array([cell[0] for cell in cells])
-    ends = [np.array([[cell[i] for cell in cells]]) for i in (1, 2)]
-    count = len(cells)
-    return Boxes(chart, np.concatenate([ends[0], np.tile(box[0][:, None], (1, count))]),
-                 np.concatenate([ends[1], np.tile(box[1][:, None], (1, count))]))  # fmt: skip
+    pieces = [np.array([[low], [high]]).T for low, high in box.T]
+    for i, (low, high) in enumerate(box.T.tolist()):
+        if 0.0 < 2.0 * low < high:  # a factor: its lowest values are found in pieces only
+            ends = np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
+            pieces[i] = np.stack([ends[:-1], ends[1:]], axis=1)
+    every = [*itertools.product(cells, *pieces)]
+    chart = np.array([one[0][0] for one in every])
+    ends = np.array([[one[0][1:], *one[1:]] for one in every], float)
+    return Boxes(chart, ends[..., 0].T, ends[..., 1].T)
 
 
 def _divided(boxes: Boxes, spread: Array) -> Boxes:
@@ -204,7 +219,7 @@ def _divided(boxes: Boxes, spread: Array) -> Boxes:
     rows = np.arange(len(along))
     a, b = boxes.low[along, rows], boxes.high[along, rows]
     middle = 0.5 * (a + b)
-    wide = (along == 0) & (b > 4.0 * a)
+    wide = ((along == 0) | (a > 0.0)) & (b > 4.0 * a)
     with np.errstate(invalid="ignore"):
         middle = np.where(wide, np.where(a > 0.0, np.sqrt(a * b), 0.1 * b), middle)
     left, right = boxes.high.copy(), boxes.low.copy()

@@ -33,6 +33,7 @@ from ccd_casadi.support.units import counted
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
 AT_ONCE = 64  # plants
+ROUNDING = 10.0 * float(np.finfo(float).eps)
 REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
 
 
@@ -165,7 +166,8 @@ def judged(
     poles = [np.linalg.eigvals(S.A) for S in loops]
     grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
     found = [PlantFigures(False, one) for one in grown]
-    good = [i for i, S in enumerate(loops) if grown[i] < -_rounding(S.A)]
+    # A pole that is no further from the axis than rounding may move it may lie on it.
+    good = [i for i, S in enumerate(loops) if grown[i] < -ROUNDING * np.linalg.norm(S.A)]
     if not good:
         return found
     corner = 0.0
@@ -241,11 +243,6 @@ def _rows(
     weighted = tops.get(f"weighted KS of {own.name}", (missing, missing))[0]
     numbers = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1)
     return [ChannelFigures(own.name, *figures) for figures in numbers.tolist()], confirmed
-
-
-def _rounding(A: Array) -> float:
-    """What rounding may move a pole by: one that is no further from the axis may lie on it."""
-    return float(10.0 * np.finfo(float).eps * np.linalg.norm(A))
 
 
 def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:

@@ -52,7 +52,7 @@ def find_decoupling(plant: ScaledPlant) -> Decoupling:
     if p != m:
         words = f"has {p} outputs and {m} inputs; sections need as many of one as of the other"
         raise PlantError(words)
-    static = static_gain(plant)
+    static = -plant.C @ np.linalg.solve(plant.A, plant.B)
     blocks = [(c.outputs, c.inputs) for c in plant.channels] or [(np.eye(p), np.eye(m))]
     outputs, inputs, gains = [], [], []
     for out, into in blocks:
@@ -109,11 +109,6 @@ def channel_bounds(
                       tuple(map(float, force[i])), **given.get(name, {}))
         for i, name in enumerate(decoupling.names)
     )  # fmt: skip
-
-
-def static_gain(plant: ScaledPlant) -> Array:
-    """G(0) of the scaled plant."""
-    return np.asarray(-plant.C @ np.linalg.solve(plant.A, plant.B))
 
 
 def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:

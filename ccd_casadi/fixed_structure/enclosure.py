@@ -109,7 +109,7 @@ class LoopFamily:
             ("LEVEL", S, np.sqrt(0.5) * below),
         ]
         if b.shape is not None:
-            counts = inside if b.shape_ends is ShapeEnd.S_MAX else below
+            counts = below if self.shape_ends_early else inside
             counts = np.where(low >= self.corner * (1.0 - 1e-12), np.inf, counts)
             found.append(("SHAPE", *self._risen(S, P * D * over, x, y, low, high, counts)))
         if b.weighted_level is not None and b.weights is not None:
@@ -234,6 +234,11 @@ class LoopFamily:
         rising = S * x.of(n) * inverse(_either(level, x, y)).of(n)
         limit = np.where(level, top * np.maximum(low, omega_low), top * self.unit * v)
         return _either(level, S, rising), limit * counts
+
+    @property
+    def shape_ends_early(self) -> bool:
+        """Whether the shape counts below ω_b only."""
+        return self.bounds.shape_ends is ShapeEnd.CROSSING
 
     @property
     def corner(self) -> float:

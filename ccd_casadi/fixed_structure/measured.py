@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
 from scipy.signal import find_peaks
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.interchange import mat_variables
 
 BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25
@@ -29,7 +29,8 @@ class MeasuredResponse:
 
     `unstable_poles` of G. `poles_at_zero`: n of G ~ (jω)^-n below the first line; by default by the
     slope of the first lines. `modelled`: a model stands behind it, which decides what lines leave
-    open. Raises UserError where that is no response.
+    open. `spread` of repeated measurements, of the shape of G: each entry lies within it of the
+    plant's. Raises UserError where that is no response.
     """
 
     hz: Array
@@ -37,9 +38,16 @@ class MeasuredResponse:
     unstable_poles: int = 0
     poles_at_zero: int | None = None
     modelled: bool = False
+    spread: Array | None = None
 
     def __post_init__(self) -> None:
         shape = self.G.shape
+        if self.spread is not None and (
+            self.spread.shape != shape or not (self.spread >= 0.0).all()
+        ):
+            raise UserError(
+                "the spread of a measured response needs one value, 0 or more, for each"
+            )
         if self.hz.ndim != 1 or len(self.hz) < 5 or shape[:1] != self.hz.shape or (
             len(shape) not in (1, 3)
         ):  # fmt: skip
@@ -91,7 +99,8 @@ class MeasuredResponse:
         turned = np.clip(1.0 + np.log10(below / hz[0]), 0.0, 1.0)[:, None, None]  # in a decade
         start = self.static * (-1j) ** self.slope
         lower = (start + turned * (first - start)) * ((below / hz[0]) ** -self.slope)[:, None, None]
-        return replace(self, hz=np.append(below, hz), G=np.concatenate([lower, self.matrix]))
+        G = np.concatenate([lower, self.matrix])
+        return replace(self, hz=np.append(below, hz), G=G, spread=None)
 
     def at(self, hz: float) -> np.ndarray:
         """G (p, m) between the lines, straight over ln f."""
@@ -105,12 +114,13 @@ class MeasuredResponse:
         """leftᵀ G right as a response of one channel, on about `most` of the lines."""
         every = slice(None, None, 1 + len(self.hz) // most)
         G = np.einsum("p,kpm,m->k", left, self.matrix[every], right)
-        return replace(self, hz=self.hz[every], G=G, poles_at_zero=self.slope)
+        return replace(self, hz=self.hz[every], G=G, poles_at_zero=self.slope, spread=None)
 
 
 def read_frequency_response(path: str | Path) -> MeasuredResponse:
     """A CSV with a header of f_hz and re, im (or magnitude or magnitude_db, and phase_deg or
-    phase_rad), or a .mat or .npz file with these names or with f_hz and a complex G.
+    phase_rad), or a .mat or .npz file with these names or with f_hz and a complex G. Beside re and
+    im, or G, there may be the `spread` of repeated measurements.
 
     G is displacement over force, m/N; of several channels (k, p, m), .mat and .npz only. Raises
     UserError with what is missing.
@@ -119,7 +129,7 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
     if path.suffix.lower() == ".npz":
         return _of_columns(_npz(path), path)
     if path.suffix.lower() == ".mat":
-        return _of_columns(_mat(path), path)
+        return _of_columns(_named(mat_variables(path)), path)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
@@ -160,29 +170,19 @@ def _named(variables: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
-def _mat(path: Path) -> dict[str, np.ndarray]:
-    try:
-        variables = loadmat(path)
-    except OSError as error:
-        words = f"cannot be read as a frequency response: {error.strerror or error}"
-        raise UserError(f"{path}: {words}") from None
-    except Exception as error:  # whatever its reader stumbles over in a damaged or newer file
-        words = f"is not a .mat file of version 7 or older ({described(error)}); save -v7, or a CSV"
-        raise UserError(f"{path}: {words}") from None
-    return _named(variables)
-
-
 def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
     if "hz" not in columns:
-        raise UserError(f"{path}: has no column f_hz; name the frequencies so")
+        raise UserError(f"{path}: has no column f_hz; give the frequencies that name")
     hz = np.real(columns["hz"]).astype(float)
     if "G" in columns:
-        G = np.asarray(columns["G"], complex)
+        G, spread = np.asarray(columns["G"], complex), columns.get("spread")
         if G.ndim == 3 and len(G) != len(hz):  # lines last, as MATLAB has them
             G = np.moveaxis(G, -1, 0)
-        return MeasuredResponse(hz, G)
+            spread = spread if spread is None else np.moveaxis(spread, -1, 0)
+        return MeasuredResponse(hz, G, spread=spread)
     if "re" in columns and "im" in columns:
-        return MeasuredResponse(hz, columns["re"] + 1j * columns["im"])
+        spread = columns.get("spread")
+        return MeasuredResponse(hz, columns["re"] + 1j * columns["im"], spread=spread)
     size = columns.get("size")
     if "db" in columns:
         size = 10.0 ** (columns["db"] / 20.0)

@@ -87,7 +87,7 @@ def design_on_data(
     responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
     shapes = {one.matrix.shape[1:] for one in responses}
     if len(shapes) != 1:
-        raise UserError("the measured responses have unlike numbers of channels; give one kind")
+        raise UserError("the measured responses have different numbers of channels; give one kind")
     if period is not None and any(one.hz[-1] > 0.5 / period for one in responses):
         raise UserError("the lines reach beyond half the sampling rate; drop those above")
     if shapes != {(1, 1)} and isinstance(structure, Structure):

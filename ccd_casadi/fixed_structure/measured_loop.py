@@ -5,7 +5,8 @@ Bounds are held on every line. Between two lines L = GK is taken to lie within r
     r = 2 h²/8 max|L''|,   L'' by the second differences at both ends and one line further:
 
 twice the error of linear interpolation, where L bends between two lines as around them. A
-resonance that fits between two lines is not seen. With it σ_max(S) <= 1/(least σ_min(I + L) on the
+resonance that fits between two lines is not seen. Where measurements were repeated, their spread
+Δ adds ‖Δ |K|‖ to r at the lines. With it σ_max(S) <= 1/(least σ_min(I + L) on the
 chord less r); where L is large the same of L⁻¹ = (GK)⁻¹, which is nearly straight there.
 
 Stability is the winding of F = det(I + GK). Over all ω > 0 its angle grows by
@@ -44,9 +45,9 @@ class MeasuredFigures:
     """A loop on its lines. Frequencies in rad/s, KS in N/m, GS in m/N; NaN where not stable.
 
     Of several channels the largest singular values. `right_half_plane`: Z. `sure`: whether the
-    assumptions that the data can show hold. `S_between` bounds |S| between the lines by r, infinite
-    where I + L may be singular on the curve; `bandwidth` is the largest that the shape allows on
-    the lines.
+    assumptions that the data can show hold. `S_between` bounds |S| on and between the lines by r,
+    infinite where I + L may be singular on the curve; `bandwidth` is the largest that the shape
+    allows on the lines.
     """
 
     stable: bool
@@ -91,7 +92,7 @@ def judge(
     joint = whole.G @ k
     Z, doubts = winding(measured, joint, int(integrator))
     first = len(whole.hz) - len(hz)
-    reach = between(hz, joint[first:])
+    reach = between(measured, joint[first:], k[first:])
     if not np.isfinite(reach).all():
         doubts.append(f"between {np.isinf(reach).sum()} pairs of lines GK may pass -1")
     head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
@@ -172,20 +173,27 @@ def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
     return np.asarray(SAFETY * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
 
 
-def between(hz: Array, L: np.ndarray) -> Array:
+def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
     """What σ_max(S) may reach between neighbouring lines (k - 1,): infinite where nothing is sure.
 
     By L, or where it is large and its inverse the smoother by 1 + σ_max(T), T = (I + L⁻¹)⁻¹.
+    L = GK at each line is known within u = ‖Δ |K|‖, so L⁻¹ within ‖L⁻¹‖²u/(1 - ‖L⁻¹‖u).
     """
-    direct, inverse = _clearances(hz, L), _clearances(hz, np.linalg.inv(L))
+    hz, over, unsure = measured.hz, np.linalg.inv(L), np.zeros(len(L))
+    if measured.spread is not None:
+        unsure = gain(measured.spread.reshape(measured.matrix.shape) @ np.abs(k))
+    far = gain(over) * unsure
+    with np.errstate(divide="ignore"):
+        of_inverse = np.where(far < 1.0, gain(over) * far / np.maximum(1.0 - far, 0.0), np.inf)
+    direct, inverse = _clearances(hz, L, unsure), _clearances(hz, over, of_inverse)
     with np.errstate(divide="ignore"):
         by_L = np.where(direct > 0.0, 1.0 / np.maximum(direct, 0.0), np.inf)
         by_inverse = np.where(inverse > 0.0, 1.0 + 1.0 / np.maximum(inverse, 0.0), np.inf)
     return np.minimum(by_L, by_inverse)
 
 
-def _clearances(hz: Array, L: np.ndarray) -> Array:
-    """Least σ_min(I + L) between neighbouring lines (k - 1,): on the chord, less r.
+def _clearances(hz: Array, L: np.ndarray, unsure: Array) -> Array:
+    """Least σ_min(I + L) between neighbouring lines (k - 1,): on the chord, less r and `unsure`.
 
     Of several channels that at a place near by, less half the step to the next.
     """
@@ -199,7 +207,7 @@ def _clearances(hz: Array, L: np.ndarray) -> Array:
         places = np.eye(L.shape[1]) + L[:-1] + BETWEEN[:, None, None, None] * step
         least = np.linalg.svd(places, compute_uv=False)[..., -1].min(axis=0)
         least = least - 0.5 * BETWEEN[1] * gain(step)
-    return np.asarray(least - interpolation_errors(hz, L))
+    return np.asarray(least - interpolation_errors(hz, L) - np.maximum(unsure[1:], unsure[:-1]))
 
 
 def winding(

@@ -84,7 +84,7 @@ def run_race(
         lead = field[0].point
         going = sum(runner.running for runner in field)
         tell(f"{np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
-             f"{lead.assessment.violation:.1g}; {going} of {len(running)} go on")  # fmt: skip
+             f"{lead.assessment.violation:.1g}; {going} of {len(running)} continue")  # fmt: skip
     return field
 
 

@@ -33,7 +33,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Structure:
-    """How many of each section; `least_damping` of every pair of zeros and poles of the biquads."""
+    """Number of sections of each kind; `least_damping` of the biquads' zeros and poles."""
 
     integrator: bool = True
     lead: int = 1

@@ -164,7 +164,8 @@ class ModalSum:
     """One option of an uncertain plant as Σ b_i c_i/(s² + g_i s + k_i), time in 1/`unit`, SI else.
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
-    `rigid` ones have their suspension's instead.
+    `rigid` ones have their suspension's instead. `drive` (n, m), `reading` (n, p) are b_i and c_i,
+    `strength` the products of the first of each.
     """
 
     omega: Array
@@ -173,6 +174,14 @@ class ModalSum:
     given: Array
     zeta: float
     strength: Array
+    drive: Array
+    reading: Array
+
+    def only(self, i: int) -> "ModalSum":
+        """Its mode number i alone, of unit strength."""
+        own = {name: getattr(self, name)[i : i + 1] for name in
+               ("omega", "rigid", "given", "drive", "reading")}  # fmt: skip
+        return replace(self, strength=np.ones(1), **own)
 
     def poles(
         self, names: tuple[str, ...], low: Array, high: Array
@@ -191,12 +200,14 @@ class ModalSum:
             if self.rigid[i]:
                 w_r, ratio = self.suspended
                 k, g = one * w_r**2, one * (2.0 * ratio * w_r) + factor * self.given[i]
+                damped &= _least(g) > 0.0
             else:
                 flexible += 1
                 own = values.get(f"mode_shift {flexible}")
                 w = shift * omega if own is None else shift * (own + 1.0) * omega
-                k, g = w * w, factor * (w * (2.0 * self.zeta) + self.given[i])
-            damped &= (_least(k) > 0.0) & (_least(g) > 0.0)
+                own_g = w * (2.0 * self.zeta) + self.given[i]
+                k, g = w * w, factor * own_g
+                damped &= (_least(w) > 0.0) & (_least(own_g) > 0.0) & (_least(factor) > 0.0)
             half = g * 0.5
             under = k - half * half
             light = under.centre.real > 0.0
@@ -223,7 +234,7 @@ def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum |
     return ModalSum(
         modal.natural / unit, modal.rigid,
         (w_r / unit, uncertain.suspension.damping_ratio), diagonal / unit, zeta,
-        modal.B[:, 0] * modal.C[0] / unit**2,
+        modal.B[:, 0] * modal.C[0] / unit**2, modal.B / unit**2, modal.C.T,
     )  # fmt: skip
 
 

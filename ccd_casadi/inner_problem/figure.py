@@ -1,6 +1,6 @@
 """What an inner problem gives the outer one to count beside the hardware cost.
 
-v(θ) = max ω_b   or   v(θ) = min e,      J = w1 f(θ) + w2 v(θ)
+v(θ) = max ω_b,   min e   or   min t,      J = w1 f(θ) + w2 v(θ)
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from ccd_casadi.support.units import HZ
 class Figure:
     """A value v of the inner problem: its key, its symbol, and how it is shown.
 
-    `unit` and `factor` (per SI unit) are for the eye.
+    `unit` and `factor` (per SI unit) are for the eye, `entry` is its stem in result.json.
     """
 
     key: str
@@ -22,6 +22,7 @@ class Figure:
     unit: str
     factor: float
     larger_is_better: bool
+    entry: str
 
     def gain(self, other: float, than: float) -> float:
         """By how much (relative) a value is better than another; negative where it is worse."""
@@ -36,5 +37,7 @@ class Figure:
         return f"{self.factor * value:.{digits}g} {self.unit}"
 
 
-BANDWIDTH = Figure("bandwidth", "bandwidth", "ω_b", "rad/s", "Hz", 1.0 / HZ, True)
-RMS_ERROR = Figure("rms_error", "RMS error", "e", "m", "nm", 1e9, False)
+BANDWIDTH = Figure("bandwidth", "bandwidth", "ω_b", "rad/s", "Hz", 1.0 / HZ, True, "bandwidth")
+RMS_ERROR = Figure("rms_error", "RMS error", "e", "m", "nm", 1e9, False, "error_rms")
+MOVE_TIME = Figure("move_time", "move time", "t", "s", "ms", 1e3, False, "move_time")
+FIGURES = {figure.key: figure for figure in (BANDWIDTH, RMS_ERROR, MOVE_TIME)}

@@ -2,13 +2,15 @@
 
 import hashlib
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.analysis.driven_plant import with_motion
+from ccd_casadi.analysis.motor import Motion
 from ccd_casadi.plants.differenced import own_plant
 from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.places import Places, placed
@@ -23,7 +25,7 @@ class PlantSource:
     """Where the model comes from: a known name or `file.py:function`, and its options.
 
     `fixed`: parameters that are not in θ, each with value and unit. `places`: where its forces and
-    sensors stand, if not at nodes.
+    sensors stand, if not at nodes. `motion`: the move that it is for, and its motors.
     """
 
     model: str | None
@@ -34,6 +36,7 @@ class PlantSource:
     content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
     fixed: tuple[tuple[str, float, str], ...] = ()
     places: Places | None = None
+    motion: Motion | None = None
 
     @property
     def held(self) -> dict[str, float]:
@@ -64,6 +67,7 @@ class PlantSource:
             "options": options,
             **({"fixed": self.held} if self.fixed else {}),
             **({"places": vars(self.places)} if self.places else {}),
+            **({"motion": repr(self.motion)} if self.motion else {}),
         }
 
 
@@ -86,6 +90,8 @@ def plant_from(
     Raises UserError where the plant cannot be built, and UserCodeRefused where a user's function
     must not run.
     """
+    if source.motion is not None:
+        return _plant_with_motion(source.pinned(), names, lower, upper)
     if source.places is not None:
         return _placed_plant(source.pinned(), names, lower, upper)
     if source.model is not None:
@@ -94,29 +100,47 @@ def plant_from(
     return _own_plant(source.pinned(), names, lower, upper)
 
 
+Names = tuple[str, ...]
+Ends = tuple[float, ...]
+
+
+def _below(
+    source: PlantSource, taken: Sequence[str], names: Names, lower: Ends, upper: Ends
+) -> Plant:
+    """The plant of a source as a function of the parameters that are not `taken`."""
+    at = [i for i, name in enumerate(names) if name not in taken]
+    fixed = tuple(item for item in source.fixed if item[0] not in taken)
+    return plant_from(
+        replace(source, fixed=fixed), tuple(names[i] for i in at), tuple(lower[i] for i in at),
+        tuple(upper[i] for i in at),
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _plant_with_motion(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
+    motion = source.motion
+    assert motion is not None
+    size = () if motion.motor is None else (motion.motor.size,)
+    plant = _below(replace(source, motion=None), size, names, lower, upper)
+    return with_motion(plant, motion, names, source.held)
+
+
+@lru_cache(maxsize=8)
+def _placed_plant(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
+    places = source.places
+    assert places is not None
+    held = {name: value for name, value in source.held.items() if name in places.names}
+    plant = _below(replace(source, places=None), places.names, names, lower, upper)
+    whole = placed(plant, places, (*names, *held))
+    return with_fixed(whole, held) if held else whole
+
+
 @lru_cache(maxsize=8)
 def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
     model, held = model_named(source.model), source.held
     assert model is not None
     plant = model.build((*names, *held), **dict(source.options))
     return with_fixed(plant, held) if held else plant
-
-
-@lru_cache(maxsize=8)
-def _placed_plant(
-    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
-) -> Plant:
-    places = source.places
-    assert places is not None
-    at = [i for i, name in enumerate(names) if name not in places.names]
-    own = tuple(item for item in source.fixed if item[0] not in places.names)
-    held = {name: value for name, value in source.held.items() if name in places.names}
-    plant = plant_from(
-        replace(source, places=None, fixed=own), tuple(names[i] for i in at),
-        tuple(lower[i] for i in at), tuple(upper[i] for i in at),
-    )  # fmt: skip
-    whole = placed(plant, places, (*names, *held))
-    return with_fixed(whole, held) if held else whole
 
 
 @lru_cache(maxsize=8)

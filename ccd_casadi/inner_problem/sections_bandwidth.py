@@ -12,14 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.analysis.move_time import MoveTime
+from ccd_casadi.fixed_structure import SectionsDesign, Structure
 from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.design import Progress
-from ccd_casadi.fixed_structure.least_error import least_error
+from ccd_casadi.fixed_structure.least_value import Goal, RmsError, least_value
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
+from ccd_casadi.inner_problem.move_figures import FREE, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
@@ -35,22 +37,19 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 
-MOST_ANCHORS = 3
-DISTINCT = 0.1  # relative: local optima further below the best are no anchors
-ROUNDS = 6  # of a design on the set and a search for plants that are worse
 FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
 LOST = 1e-6  # relative: of the bandwidth, by rounding
 FEW = 8  # starts of the search at a θ where no anchor ends certified
-SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
 
 
 @dataclass(frozen=True)
 class SectionsValue:
     """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
 
-    Of a problem that minimises the RMS error, `error` in m is what the gradient is of, `bandwidth`
-    that of the design. `syntheses`: climbs and multi-start searches that it took. At a kink of the
-    value the gradient is that of one side, and `envelope` has the others.
+    Of a problem that minimises something else, `error` is that in SI (RMS error in m, time of a
+    move in s) and what the gradient is of, `bandwidth` that of the design. `syntheses`: climbs and
+    multi-start searches that it took. At a kink of the value the gradient is that of one side, and
+    `envelope` has the others. `anew`: no anchor led to the design, but a search at θ.
     """
 
     theta: tuple[float, ...]
@@ -60,10 +59,11 @@ class SectionsValue:
     syntheses: int
     error: float = float("nan")
     envelope: Envelope | None = None
+    anew: bool = False
 
     @property
     def value(self) -> float:
-        """What J counts: the error where the problem minimises that, else ω_b*."""
+        """What J counts: what the problem minimises, or ω_b*."""
         return self.bandwidth if np.isnan(self.error) else self.error
 
     @property
@@ -95,20 +95,20 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
     initial = warm_starts(problem, structure_of(problem), plants, bounds)
     made: SectionsDesign | None = None
-    spent = 0
+    spent, anew = 0, False
     if initial:
         made = searched(problem, plants, initial)
         spent += 1
     if made is None or (sections.starts and not made.certified):
         made = searched(problem, plants, initial, min(FEW, sections.starts))
-        spent += 1
+        spent, anew = spent + 1, True
     while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
         again = searched(problem, plants, [made.kappa])
         spent += 1
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
             break
         made = again
-    return valued(problem, theta, plants, made, spent)
+    return replace(valued(problem, theta, plants, made, spent), anew=anew)
 
 
 def valued(
@@ -118,11 +118,12 @@ def valued(
     made: SectionsDesign,
     spent: int,
 ) -> SectionsValue:
-    """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least error."""
+    """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least of another
+    figure."""
     point = tuple(float(v) for v in theta)
     error, envelope = np.nan, None
-    if made.certified and problem.figure is RMS_ERROR:
-        made, error, envelope = _least_error(problem, plants, made)
+    if made.certified and problem.figure is not BANDWIDTH:
+        made, error, envelope = _least(problem, theta, plants, made)
     elif made.certified:
         sampling = sections_of_problem(problem).sampling
         envelope = bandwidth_envelope(plants, bounds_of(problem), made, sampling)
@@ -133,14 +134,14 @@ def valued(
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
-    """Raise UserError where J counts the RMS error, for a command that knows ω_b alone."""
+    """Raise UserError where J counts another figure, for a command that knows ω_b alone."""
     if problem.figure is not BANDWIDTH:
-        words = f"{command} counts the bandwidth; solve, inner and retrain count the error"
-        raise UserError(f'inner.minimise: is "rms_error", and {words}')
+        words = f"{command} counts the bandwidth; solve, inner and retrain count the others"
+        raise UserError(f'inner.minimise: is "{problem.figure.key}", and {words}')
 
 
 def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
-    """The design, no longer a certified one where the least error asks for more bandwidth."""
+    """The design, no longer a certified one where what is minimised asks for more bandwidth."""
     least = sections_of_problem(problem).bandwidth_least
     if made.bandwidth >= least:
         return made
@@ -150,19 +151,35 @@ def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
     return replace(made, outcome=SectionsOutcome.BOUND_NOT_MET, words=words, short=short)
 
 
-def _least_error(
-    problem: CoDesignProblem, plants: Sequence[ScaledPlant], made: SectionsDesign
+def goal_of(
+    problem: CoDesignProblem, theta: Sequence[float], plants: Sequence[ScaledPlant]
+) -> Goal:
+    """What is made small besides -ω_b, on the plants of the problem's set at θ."""
+    structure, sampling = structure_of(problem), sections_of_problem(problem).sampling
+    assert isinstance(structure, Structure)
+    if problem.figure is RMS_ERROR:
+        assert problem.budget is not None
+        return RmsError(tuple(plants), structure, problem.budget, sampling)
+    assert sampling is not None
+    free = plants_of(replace(problem, suspension=FREE), theta)
+    return MoveTime(tuple(free), structure, sampling, motion_of(problem, theta))
+
+
+def _least(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    plants: Sequence[ScaledPlant],
+    made: SectionsDesign,
 ) -> tuple[SectionsDesign, float, Envelope | None]:
-    """The design of least RMS error, that in m, and its gradients to θ."""
+    """The design of the least value, that in SI, and its gradients to θ."""
     sections, bounds = sections_of_problem(problem), bounds_of(problem)
-    assert problem.budget is not None
     made = too_slow(problem, made)
     if not made.certified:
         return made, np.nan, None
     started = with_sections(problem, anchors=sections.error_anchors)
-    found = least_error(
-        plants, bounds, made, problem.budget, sampling=sections.sampling,
+    found = least_value(
+        plants, bounds, made, goal_of(problem, theta, plants), sampling=sections.sampling,
         least_bandwidth=sections.bandwidth_least,
         initial=warm_starts(started, structure_of(problem), plants, bounds),
     )  # fmt: skip
-    return found.design, found.error, found.envelope
+    return found.design, found.value, found.envelope

@@ -15,7 +15,7 @@ from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, Options
-from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR, Figure
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR, Figure
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights
@@ -72,9 +72,9 @@ class SectionsProblem(ControllerProblem):
     `anchors` (κ in SI) and the `members` of the plant set (option, point of the box): from these
     on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
     before. Both are empty before it. `frequencies` (rad/s) bound those of K, alike at every
-    θ; None: by the plant at the start. `minimise` "rms_error": at a θ the search goes on from there
-    to the least RMS error under the problem's budget, at `bandwidth_least` (rad/s) or more, from
-    that controller and the `error_anchors` (κ in SI).
+    θ; None: by the plant at the start. `minimise` "rms_error" or "move_time": at a θ the search
+    goes on from there to the least of it under the problem's budget or in its move, at
+    `bandwidth_least` (rad/s) or more, from that controller and the `error_anchors` (κ in SI).
     `channels` of a plant with several outputs; where the case names none they are found, with
     `structure` for each.
     """
@@ -98,8 +98,8 @@ class SectionsProblem(ControllerProblem):
 
     @property
     def figure(self) -> Figure:
-        """The least RMS error in m where that is minimised, else ω_b*."""
-        return RMS_ERROR if self.minimise == RMS_ERROR.key else BANDWIDTH
+        """The least RMS error or move time where that is minimised, else ω_b*."""
+        return FIGURES[self.minimise]
 
     @property
     def plant_options(self) -> tuple[Options, ...]:
@@ -114,8 +114,8 @@ class SectionsProblem(ControllerProblem):
                 words = 'controller.structure = "sections" needs as many of one as of the other'
                 counts = f"has {m} inputs and {p} outputs"
                 raise PlantError(f'{counts}; {words}: leave some out, or "h_infinity"')
-            if p > 1 and self.figure is RMS_ERROR:
-                words = 'has several outputs; inner.minimise = "rms_error" is for one: drop it'
+            if p > 1 and self.figure is not BANDWIDTH:
+                words = f'has several outputs; inner.minimise = "{self.minimise}" is for one'
                 raise PlantError(words)
             if not self.channels:
                 continue
@@ -138,7 +138,7 @@ class SectionsProblem(ControllerProblem):
 
     def with_anchor(self, kappa: tuple[float, ...], most: int) -> Self:
         """With one more anchor of what it minimises, first, `most` at most."""
-        name = "error_anchors" if self.figure is RMS_ERROR else "anchors"
+        name = "anchors" if self.figure is BANDWIDTH else "error_anchors"
         others = (anchor for anchor in getattr(self, name) if anchor != kappa)
         return replace(self, **{name: (kappa, *others)[:most]})  # type: ignore[arg-type]
 
@@ -173,6 +173,6 @@ class SectionsProblem(ControllerProblem):
             found["shape_ends"] = self.shape_ends.value
         if self.channels:
             found["channels"] = [channel.identity() for channel in self.channels]
-        if self.figure is RMS_ERROR:
+        if self.figure is not BANDWIDTH:
             found["least_error"] = [self.bandwidth_least, self.error_anchors]
         return found

@@ -14,7 +14,10 @@ from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
+from ccd_casadi.inner_problem.figure import MOVE_TIME
+from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import goal_of
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     sections_of_problem,
@@ -43,7 +46,10 @@ def worst_members(
     turn: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Excess, tuple[Member, ...]]:
-    """The worst plant of the box for a design, and those to add: past a bound, each a new one."""
+    """The worst plant of the box for a design, and those to add: past a bound, each a new one.
+
+    Where a move's time counts the plant that settles latest besides, if it is later than v.
+    """
     sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
     heads, count = worst_plants(
         uncertain, structure_of(problem), made.kappa, made.bandwidth, bounds_of(problem),
@@ -62,6 +68,13 @@ def worst_members(
         ]
         if head.value > WITHIN and (not near or min(near) > APART) and len(found) < AT_ONCE:
             found.append((head.option, tuple(map(float, head.point))))
+    if problem.figure is MOVE_TIME and made.controller is not None:
+        value = float(np.exp(goal_of(problem, theta, ()).at(made.kappa)[0]))
+        time, option, point = latest_plant(problem, theta, made.controller, sections.seed + turn)
+        if progress is not None:
+            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms told")
+        if time > value:
+            found.append((option, tuple(map(float, point))))
     return heads[0], tuple(found)
 
 

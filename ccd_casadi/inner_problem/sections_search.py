@@ -11,10 +11,10 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.design import Progress
-from ccd_casadi.fixed_structure.least_error import LeastError, least_error
+from ccd_casadi.fixed_structure.least_value import LeastValue, least_value
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import searched, sections_value, too_slow
+from ccd_casadi.inner_problem.sections_bandwidth import goal_of, searched, sections_value, too_slow
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     plants_of,
@@ -126,23 +126,23 @@ def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) ->
     return replace(problem, controller=replace(sections, members=(*sections.members, *members)))
 
 
-def least_error_at(
+def least_value_at(
     problem: CoDesignProblem,
     theta: Sequence[float],
     made: SectionsDesign,
     progress: Progress | None = None,
-) -> tuple[CoDesignProblem, LeastError]:
+) -> tuple[CoDesignProblem, LeastValue]:
     """The problem with the plants that were found worse on the way, and the design on all of them,
     which is the first of its anchors of least error.
 
-    The problem has a budget; `made` is its certified design of largest bandwidth.
+    `made` is its certified design of largest bandwidth.
     """
-    budget, wider = problem.budget, problem
-    assert budget is not None
+    wider = problem
     for turn in range(ROUNDS_OF_ERROR):
         problem, sections = wider, sections_of_problem(wider)
-        found = least_error(
-            plants_of(problem, theta), bounds_of(problem), made, budget,
+        plants = plants_of(problem, theta)
+        found = least_value(
+            plants, bounds_of(problem), made, goal_of(problem, theta, plants),
             sampling=sections.sampling, least_bandwidth=sections.bandwidth_least,
             initial=[np.array(kappa) for kappa in sections.error_anchors], progress=progress,
         )  # fmt: skip
@@ -159,11 +159,11 @@ def least_from(
     progress: Progress | None = None,
 ) -> tuple[CoDesignProblem, SectionsDesign]:
     """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
-    one of least error, not certified where it has to be slower than is allowed."""
+    one of the least of another figure, not certified where it has to be slower than is allowed."""
     if problem.figure is BANDWIDTH or not made.certified:
         return problem, made
     made = too_slow(problem, made)
     if not made.certified:
         return problem, made
-    problem, found = least_error_at(problem, theta, made, progress)
+    problem, found = least_value_at(problem, theta, made, progress)
     return problem, found.design

@@ -184,7 +184,11 @@ def sweep_starts(
     """
     n_S, n_T = problem.sweep_points
     merit = np.full((n_S + 2, n_T + 2), -np.inf)
-    merit[1:-1, 1:-1] = np.array([_merit(problem, row) for row in rows]).reshape(n_S, n_T)
+    each = [
+        np.log(row.bandwidth) - 3.0 * _violation(problem, row) if row.certified else -np.inf
+        for row in rows
+    ]
+    merit[1:-1, 1:-1] = np.reshape(each, (n_S, n_T))
     found = []
     for i in range(1, n_S + 1):
         for j in range(1, n_T + 1):
@@ -198,12 +202,6 @@ def sweep_starts(
 
 def _violation(problem: InnerProblem, row: DesignFigures) -> float:
     return max(0.0, problem.excess(row))
-
-
-def _merit(problem: InnerProblem, row: DesignFigures) -> float:
-    if not row.certified:
-        return -np.inf
-    return float(np.log(row.bandwidth)) - 3.0 * _violation(problem, row)
 
 
 class _Uncertified(Exception):

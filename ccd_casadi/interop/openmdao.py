@@ -94,10 +94,10 @@ class CertifiedLoop(_Component):
 class LargestBandwidth(_Component):
     """The true inner problem at θ: ω_b*(θ), every bound of the case kept, with f and λ.
 
-    Outputs `bandwidth` (rad/s), or `rms_error` (m) where the case minimises that, `hardware_cost`
-    and `constraints`. The partials are the envelope gradient; it jumps where the binding bounds
-    change. A fixed structure needs the problem of a finished run, `read_run(folder).problem`, whose
-    anchors make ω_b*(θ) a function of θ alone.
+    Outputs `bandwidth` (rad/s), or `rms_error` (m) or `move_time` (s) where the case minimises
+    that, `hardware_cost` and `constraints`. The partials are the envelope gradient; it jumps where
+    the binding bounds change. A fixed structure needs the problem of a finished run,
+    `read_run(folder).problem`, whose anchors make ω_b*(θ) a function of θ alone.
 
     Raises UserError for a fixed structure without anchors.
     """

@@ -15,6 +15,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.metadata import version
@@ -23,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from llvmlite import binding
-from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
 from ccd_casadi.kernels import sources
@@ -103,7 +103,7 @@ def ensure_compiled() -> None:
     What a process leaves undone is compiled where it is needed, in silence.
     """
     kernels = _kernels()
-    folder = Path(next(iter(kernels.values())).stats.cache_path)
+    folder = _folder(kernels)
     stamp, state = folder / "compiled.stamp", _state()  # before: sources may change meanwhile
     if _read(stamp) == state:
         return
@@ -132,22 +132,20 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
     root = str(Path(__file__).parents[PACKAGE.count(".") + 1])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
     settings = os.environ | {WORKER: "1", "PYTHONPATH": path}
-    left, workers = set(kernels), []
+    folder, began, workers = _folder(kernels), time.time(), []
     # not -m, with which the package would import all that its commands need
     start = [sys.executable, "-c", f"from {PACKAGE} import compilation as c; c.work()"]
-    read, write = os.pipe()  # one for all: lines are short, so they do not mix
-    with os.fdopen(read) as lines, Progress(len(left), "compiling kernels") as bar:
+    with Progress(len(kernels), "compiling kernels") as bar:
         try:
-            with os.fdopen(write, "wb") as theirs:
-                for first in range(count):
-                    command = [*start, *PARTS[first::count]]
-                    workers.append(subprocess.Popen(command, env=settings, stdout=theirs))
-            for line in lines:
-                if line.strip() in left:
-                    left.remove(line.strip())
-                    bar.advance()
-            done = sum(worker.wait() == 0 for worker in workers) == count
-            bar.advance(len(left) if done else 0)  # what was on disk already
+            for first in range(count):
+                command = [*start, *PARTS[first::count]]
+                workers.append(subprocess.Popen(command, env=settings, stdout=subprocess.DEVNULL))
+            while any(worker.poll() is None for worker in workers):
+                time.sleep(0.1)
+                written = sum(file.stat().st_mtime > began for file in folder.glob("*.nbi"))
+                bar.advance(written - bar.done)
+            done = all(worker.wait() == 0 for worker in workers)
+            bar.advance(len(kernels) - bar.done if done else 0)  # what was on disk already
         finally:
             for worker in workers:
                 worker.kill()
@@ -164,12 +162,13 @@ def _kernels() -> dict[str, Any]:
         if name.startswith(PACKAGE + "."):
             for kernel in vars(module).values():
                 if isinstance(kernel, Dispatcher):
-                    found[_name(kernel)] = kernel
+                    found[f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"] = kernel
     return found
 
 
-def _name(kernel: Any) -> str:
-    return f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+def _folder(kernels: dict[str, Any]) -> Path:
+    """Where Numba keeps them."""
+    return Path(next(iter(kernels.values())).stats.cache_path)
 
 
 def _state() -> str:
@@ -211,21 +210,8 @@ def _say(words: str) -> None:
         say(words, sys.stderr)
 
 
-class _Report(event.Listener):
-    """In a process that compiles: the name of each kernel done, on stdout."""
-
-    def on_start(self, event: Any) -> None:
-        pass
-
-    def on_end(self, event: Any) -> None:
-        kernel = event.data["dispatcher"]
-        if kernel.py_func.__module__.startswith(PACKAGE):
-            os.write(1, f"{_name(kernel)}\n".encode())
-
-
 def work() -> None:
     """Compile the parts that the command line names; Ctrl-C ends it without words."""
-    event.register("numba:compile", _Report())
     try:
         for part in sys.argv[1:]:
             compile_part(part)

@@ -50,19 +50,11 @@ class ClosedLoop:
         return StateSpace(self.A, self.B_r, self.C_u, self.D_u, period=self.period)
 
 
-def closed_matrix(G: StateSpace, K: StateSpace) -> np.ndarray:
-    """[[A - B D_K C, B C_K], [-B_K C, A_K]] of a plant (A, B, C) without feedthrough.
-
-    Analytic in the matrices of both, which may be complex.
-    """
-    return np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-
-
 def closed_loop(G: StateSpace, K: StateSpace) -> ClosedLoop:
     """The loop of a plant without feedthrough (u to y) and a controller (e to u), of one time."""
     m, p, k = G.B.shape[1], len(G.C), len(K.A)
     return ClosedLoop(
-        A=closed_matrix(G, K),
+        A=np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]]),
         B_r=np.vstack([G.B @ K.D, K.B]),
         B_d=np.vstack([G.B, np.zeros((k, m))]),
         C_y=np.hstack([G.C, np.zeros((p, k))]),

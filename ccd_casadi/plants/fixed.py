@@ -14,7 +14,6 @@ from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
 
 
 def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:
@@ -71,34 +70,45 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
     free = ca.MX.sym("theta", len(place))
     entries = iter(ca.vertsplit(free))
     theta = [fixed[name] if name in fixed else next(entries) for name in plant.names]
-    nearby, domain, shapes, drawing = plant.nearby, plant.domain, plant.shapes, plant.drawing
+    domain = plant.domain
+    return through(
+        plant, of, own.at,
+        names=tuple(plant.names[i] for i in place),
+        hardware=ca.Function("hardware", [free], plant.hardware.call([ca.vertcat(*theta)])),
+        domain=None if domain is None else (domain[0][place], domain[1][place]),
+    )  # fmt: skip
 
-    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
-        assert nearby is not None
-        return of(nearby(own.at(theta), reach, pool))
+
+def through(
+    plant: Plant,
+    of: Callable[[Evaluate], Evaluate],
+    own: Callable[[Sequence[float]], tuple[float, ...]],
+    **others: Any,
+) -> Plant:
+    """The plant as a function of another θ: `own` makes its own of that, `of` wraps what evaluates.
+
+    `others`: fields that are given as they are, of the new θ.
+    """
+    shapes, drawing = plant.shapes, plant.drawing
 
     def shown(theta: Sequence[float], count: int) -> ModeShapes:
         assert shapes is not None
-        return shapes(own.at(theta), count)
+        return shapes(own(theta), count)
 
     def drawn(thetas: Mapping[str, Sequence[float]]) -> Figure:
         assert drawing is not None
-        return drawing({name: own.at(theta) for name, theta in thetas.items()})
+        return drawing({name: own(theta) for name, theta in thetas.items()})
 
-    return replace(
-        plant,
-        names=tuple(plant.names[i] for i in place),
-        evaluate=own,
-        hardware=ca.Function("hardware", [free], plant.hardware.call([ca.vertcat(*theta)])),
-        references={name: of(closer) for name, closer in plant.references.items()},
-        values=None if plant.values is None else of(plant.values),
-        notes=lambda theta: plant.notes(own.at(theta)),
-        nearby=None if nearby is None else near,
-        domain=None if domain is None else (domain[0][place], domain[1][place]),
-        doubt=lambda theta: plant.doubt(own.at(theta)),
-        shapes=None if shapes is None else shown,
-        drawing=None if drawing is None else drawn,
-    )
+    seen: dict[str, Any] = {
+        "evaluate": of(plant.evaluate),
+        "references": {name: of(closer) for name, closer in plant.references.items()},
+        "values": None if plant.values is None else of(plant.values),
+        "notes": lambda theta: plant.notes(own(theta)),
+        "doubt": lambda theta: plant.doubt(own(theta)),
+        "shapes": None if shapes is None else shown,
+        "drawing": None if drawing is None else drawn,
+    }
+    return replace(plant, **(seen | others))
 
 
 REMEMBERED = 64  # θ whose matrices are kept

@@ -19,12 +19,12 @@ from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
 from ccd_casadi.plants.axes import followed_modes, in_axes
+from ccd_casadi.plants.fixed import through
 from ccd_casadi.plants.modal import RIGID_RATIO
 from ccd_casadi.plants.nodes import Between, Point, Points, names_in
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 
 
@@ -89,10 +89,6 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     def below(theta: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(theta[i]) for i in own)
 
-    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
-        assert plant.nearby is not None
-        return of(plant.nearby(below(theta), reach, pool))
-
     def notes(theta: Sequence[float]) -> tuple[str, ...]:
         whole = plant.evaluate(below(theta))
         error = between.left_out(_flexible(whole)[1].T @ whole.B)
@@ -106,20 +102,18 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     x = ca.MX.sym("theta", len(names))
     f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
     rules = _rules(whole, x)
-    return Plant(
+    return through(
+        plant,
+        of,
+        below,
         names=tuple(names),
         constraint_names=(*plant.constraint_names, *rules),
         evaluate=whole,
         hardware=ca.Function("hardware", [x], [f, ca.vertcat(lam, *rules.values())]),
         outputs=axes or len(places.sensors) or plant.outputs,
         inputs=axes or len(places.actuators),
-        references={name: of(closer) for name, closer in plant.references.items()},
-        exact_hessian=plant.exact_hessian,
-        values=None if plant.values is None else of(plant.values),
         notes=notes,
-        nearby=None if plant.nearby is None else near,
         domain=_domain(plant, whole, len(names)),
-        doubt=lambda theta: plant.doubt(below(theta)),
         shapes=whole.shapes if nodes.shape[1] == 2 else None,
         drawing=whole.drawing if nodes.shape[1] < 3 else None,
     )  # fmt: skip

@@ -18,7 +18,6 @@ from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.process_pool import Pool
 
 ModelFunction = Callable[..., Mapping[str, Any]]
 Evaluate = Callable[[Sequence[float]], "Mechanics"]
@@ -59,15 +58,14 @@ def to_first_order(system: Mechanics, step: Array) -> Mechanics:
 
 @dataclass(frozen=True)
 class Plant:
-    """A model bound to its parameters: what the design loop asks of any plant.
+    """A plant model bound to its parameters, as the design loop uses it.
 
     `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
     `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
     plant modelled more closely, by name, without derivatives: a design is certified on them again,
     not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
     reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
-    known. `nearby` makes, of θ and a relative reach, a cheaper `values` that holds within it and is
-    to be checked by the true one. `doubt` says what is wrong with the derivatives at θ, empty where
+    known. `doubt` says what is wrong with the derivatives at θ, empty where
     nothing is. Without `exact_hessian` second derivatives of `hardware` cost too much to be asked
     for. `shapes` are so many of the lowest flexible modes at θ as pictures need them, `drawing` is
     of several θ by name; None where the plant has no such picture.
@@ -83,7 +81,6 @@ class Plant:
     exact_hessian: bool = True
     values: Callable[[Sequence[float]], Mechanics] | None = None
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
-    nearby: Callable[[Sequence[float], float, Pool], Evaluate] | None = None
     domain: tuple[Array, Array] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None

@@ -89,6 +89,12 @@ class ScaledPlant:
         D = np.zeros((self.C.shape[0], self.B.shape[1]))
         return StateSpace(w0 * self.A, w0 / self.force * self.B, self.C.copy(), D)
 
+    def changes_si(self) -> list[tuple[Array, Array, Array]]:
+        """∂A, ∂B and ∂C of `plant_si` to each parameter."""
+        w0 = self.omega_0
+        return [(w0 * dA, w0 / self.force * dB, dC)
+                for dA, dB, dC in zip(self.dA, self.dB, self.dC, strict=True)]  # fmt: skip
+
     def controller_si(self, A: Array, B: Array, C: Array) -> StateSpace:
         """A controller of the scaled plant, error in to force out, time in s."""
         D = np.zeros((C.shape[0], B.shape[1]))

@@ -14,7 +14,7 @@ from ccd_casadi.reporting.loops import bandwidth_level, margin_words, over_hz
 from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ, number, shown
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
@@ -192,8 +192,8 @@ def _caption(loop: LoopView, channels: Sequence[Channel]) -> str:
     K = np.linalg.norm(loop.controller, 2, axis=(1, 2))
     i = int(K.argmax())
     words += (
-        f" The controller's gain is {number(gain, 3)} N/m at {number(float(loop.hz[0]), 3)} Hz and "
-        f"at most {number(float(K[i]), 3)} N/m, at {number(float(loop.hz[i]), 4)} Hz."
+        f" The controller's gain is {shown(gain, 'N/m')} at {number(float(loop.hz[0]), 3)} Hz and "
+        f"at most {shown(float(K[i]), 'N/m')}, at {number(float(loop.hz[i]), 4)} Hz."
     )
     below = [hz for hz in loop.antiresonances_hz if hz > loop.bandwidth_hz]
     if below:

@@ -123,10 +123,10 @@ def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list
     """J and what it counts, true and predicted; `of`: which bandwidth it is, in words."""
     figure, guess = problem.figure, r["surrogate_bandwidth_hz"]
     value = ("Predicted bandwidth", f"{number(guess, 6)} Hz")
-    if "error_rms_of_set" in r and not figure.larger_is_better:
-        e, guess = (1e9 * r[key] for key in ("error_rms_of_set", "surrogate_error_rms"))
-        value = ("RMS error e", f"{number(e, 6)} nm over the set (predicted {number(guess, 6)})")
-    v = figure.symbol
+    v, words, entry = figure.symbol, figure.words, figure.entry
+    if f"{entry}_of_set" in r and not figure.larger_is_better:
+        e, guess = (figure.shown(r[key], 6) for key in (f"{entry}_of_set", f"surrogate_{entry}"))
+        value = (f"{words[0].upper()}{words[1:]} {v}", f"{e} over the set (predicted {guess})")
     J = f"{problem.w1:g} f(θ) + ({problem.w2:g}) {v}, {v} in {figure.si_unit}"
     return [
         ("Objective J", number(r["objective"], 7), J),

@@ -1,6 +1,7 @@
 """Closed loops over frequency: σ_max of S, KS and T against what is forbidden to them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -71,10 +72,12 @@ def sensitivity_panel(
     curves: Sequence[Curve], ends: tuple[float, float], S_max: float, at: Sequence[Level] = (),
     label: str = "σ_max(S) (–)", **more: Any,
 ) -> Panel:  # fmt: skip
-    """S of any loops, with S_max and -3 dB."""
-    levels = (Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY))
-    kept = {"legend": "lower right", **more}
-    return over_hz(label, curves, ends, levels=(*levels, *at), **kept)
+    """S of any loops, with S_max, -3 dB, and the words of ω_b where S crosses that."""
+    levels = [Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY)]
+    levels += [replace(level, text="") for level in at]
+    words = tuple(Mark(v.value, 2**-0.5, v.text, "", v.colour, (8.0, -8.0)) for v in at)
+    kept = {"legend": "lower right", **more, "marks": (*more.get("marks", ()), *words)}
+    return over_hz(label, curves, ends, levels=tuple(levels), **kept)
 
 
 def gain_panels(views: Sequence[LoopView], *, bounds: bool = True) -> list[Panel]:

@@ -71,7 +71,7 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
         joint = one.matrix @ K
         S = sensitivity(joint)
         if not one.modelled:  # of a model ‖S‖∞ is known
-            reach = between(hz, joint)  # drawn at the middle of two lines
+            reach = between(one, joint, K)  # drawn at the middle of two lines
             curves["at most"].append(Curve(np.sqrt(hz[1:] * hz[:-1]),
                                            np.where(reach < np.inf, reach, np.nan), colour=GREY,
                                            width=0.9))  # fmt: skip

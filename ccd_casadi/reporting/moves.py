@@ -1,17 +1,31 @@
 """A move and a step of force of a design on every plant of its set; a move on the machine."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis import loop_figures
+from ccd_casadi.analysis.motor import UNLIMITED, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
-from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table, Words
+from ccd_casadi.drawing.content import (
+    Band,
+    Curve,
+    Figure,
+    Level,
+    Lines,
+    Panel,
+    Section,
+    Table,
+    Words,
+)
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
+from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -34,14 +48,22 @@ def move_parts(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
     loops: Sequence[Loop], bandwidth_hz: float,
 ) -> tuple[Lines, str, Table]:  # fmt: skip
-    """Error of the default move of `robustness` on the plants of `loops`, their rigid bodies free:
-    without and with mass feedforward (the last panel), its words and numbers."""
-    profile = setpoint(LIMITS)
-    modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
-    ahead = mass_feedforward(modal, 0)
-    ways = {"without feedforward": None} | ({} if ahead is None else {"mass feedforward": ahead})
+    """Error of the case's move, or of the default one of `robustness`, on the plants of `loops`,
+    their rigid bodies free: without and with feedforward (the last panel), its words and numbers.
+    """
+    if problem.source.motion is not None:
+        motion = motion_of(problem, theta)
+        profile, window = motion.cycle.profile, motion.motion.window
+        name, other = "feedforward up to snap", "the move of [move]"
+        ahead: Array | None = motion.forward
+    else:
+        profile, window = setpoint(LIMITS), WINDOW
+        modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
+        name, ahead = "mass feedforward", mass_feedforward(modal, 0)
+        other = "for other moves [move] of the case, or the options of robustness"
+    ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     free = free_loops(problem, theta, controller)
-    found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=WINDOW,
+    found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=bandwidth_hz)  # fmt: skip
     end = profile.duration
     time = np.linspace(0.0, (1.0 + AFTER) * end, POINTS)
@@ -50,7 +72,8 @@ def move_parts(
         error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made])
         panels.append(over_plants(
             1e3 * time, error, f"error, {name} (µm)", legend="upper right",
-            levels=(Level(1e3 * end, "end of the move", True, GREY),),
+            levels=(Level(1e3 * end, "end of the move", True, GREY),
+                    *(Level(side * 1e6 * window, "") for side in (-1.0, 1.0))),
         ))  # fmt: skip
         columns += _columns(error)
         heads += [f"µm, {name}", "least", "largest"] if len(error) > 1 else [f"µm, {name}"]
@@ -59,12 +82,58 @@ def move_parts(
     how = "hold and delay exact, at the instants" if sampled else "continuous loop"
     where = "without the suspension" if found[0][0].free else "on the soft suspension"
     caption = (
-        f"{number(1e3 * LIMITS.stroke)} mm in {number(1e3 * end, 4)} ms "
-        f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; for other moves "
-        f"the options of robustness). {' '.join(words)}"
+        f"{number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in {number(1e3 * end, 4)} ms "
+        f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; {other}). "
+        f"{' '.join(words)}"
     )
     lines = Lines((tuple(panels),), "Error of a move", (3.2,))
     return lines, caption, over_time(heads, *columns)
+
+
+def cycle_section(
+    problem: CoDesignProblem, theta: Sequence[float], result: Mapping[str, Any]
+) -> list[Section]:
+    """Force and heat over a cycle of the case's move, what limits it, and its time over the heat
+    that is allowed; nothing for a case without a motor."""
+    own, told = problem.source.motion, result.get("move")
+    if own is None or own.motor is None or not told:
+        return []
+    found, motor = motion_of(problem, theta), own.motor
+    profile, forces, settled = found.cycle.profile, found.forward[2], told["settled_latest"]
+    k, R, _ = motor.at(found.mass)
+    time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
+    force = np.outer(profile.at(time)[2], forces)
+    heat = R / k**2 * (force**2).sum(axis=1)
+    end = Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
+    mean = Level(told["power"], "mean")
+    ms = 1e3 * time
+    panels = [
+        Panel("time (ms)", "force of a motor (N)", (Curve(ms, force[:, 0]),), levels=(end,)),
+        Panel("time (ms)", "heat (W)", (Curve(ms, heat),), levels=(mean,)),
+    ]
+    if not own.required:
+        watts = told["power"] * np.linspace(0.1, 2.0, 39)
+        limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
+        times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
+        late = 0.0 if settled is None else settled - profile.duration
+        curve = Curve(watts, 1e3 * (np.array(times) + late))
+        panels.append(Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
+    share = f"{number(100.0 * told['heat_share'], 3)} % of the heat"
+    if motor.peak_current[0] < UNLIMITED:
+        share += f" and {number(100.0 * told['peak_share'], 3)} % of the peak force"
+    settling = "it does not settle on the whole set" if settled is None else (
+        f"on every plant of the set it has settled after {number(1e3 * settled, 4)} ms"
+    )  # fmt: skip
+    words = (
+        f"A cycle of {number(ms[-1], 4)} ms: {number(told['peak_force'], 4)} N and "
+        f"{number(told['peak_current'], 3)} A at most, {number(told['rms_force'], 4)} N RMS, "
+        f"{number(told['power'], 4)} W: {share} that the motor allows. The setpoint takes "
+        f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
+        f"{settling}."
+    )
+    table = over_time(("ms", "N", "W"), ms, force[:, 0], heat)
+    lines = Lines((tuple(panels),), "A cycle of the motor", (3.0,))
+    return [Section("The motor", (Figure(lines, words, (table,)),))]
 
 
 def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:

@@ -72,7 +72,8 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     mu, kink = result["controller"]["multipliers"], result["kkt"].get("kink")
     if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
         mu = kink["multipliers"]
-    gain = "raise ω_b" if problem.figure is BANDWIDTH else "lower the RMS error"
+    v = problem.figure
+    gain = "raise ω_b" if v is BANDWIDTH else f"lower the {v.words}"
     names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S", "LEVEL": "-3 dB below ω_b",
              "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip

@@ -37,11 +37,10 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_p
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_section import budget_section
-from ccd_casadi.reporting.facts import binding, design_facts, theta_table, theta_words
+from ccd_casadi.reporting.facts import binding, design_facts, theta_table
 from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
-from ccd_casadi.reporting.inner_sweep import sweep_data, sweep_figure
 from ccd_casadi.reporting.landscape import (
     caption_disagreement,
     caption_landscape,
@@ -51,7 +50,7 @@ from ccd_casadi.reporting.landscape import (
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
-from ccd_casadi.reporting.moves import force_step, move_parts
+from ccd_casadi.reporting.moves import cycle_section, force_step, move_parts
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
     binding_words,
@@ -71,8 +70,8 @@ if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.verified import Solution
 
 ORDER = (
-    "glance", "design", "controller", "limits", "start", "theta", "stage", "loop", "move", "force",
-    "budget", "history", "trust", "sweep",
+    "glance", "design", "controller", "limits", "start", "theta", "stage", "loop", "move", "motor",
+    "force", "budget", "history", "trust",
 )  # fmt: skip
 
 
@@ -145,7 +144,6 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
             "theta": lambda: [_theta(problem, solution, verified, truths)],
             "history": lambda: [_history(case, problem, solution, verified)],
             "trust": lambda: _trust(solution),
-            "sweep": lambda: [_sweep(problem, solution, verified, truths)],
         }
     return [parts[name] for name in ORDER if name in parts]
 
@@ -173,6 +171,7 @@ def design_parts(
         "glance": lambda: [glance(own, theta, view(), move())],
         "design": lambda: [design_section(problem, result)],
         "move": move_section,
+        "motor": lambda: cycle_section(own, theta, result),
         "force": lambda: [Section("A step of force", (force_step(loops(), view().bandwidth_hz),))],
         "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_section(own, theta, K),
@@ -285,21 +284,6 @@ def _trust(solution: "Solution") -> list[Section]:
         return []
     body = (Words(recommendation(qualities)), table_trust(qualities), trust_figure(qualities))
     return [Section("Can the surrogate be trusted?", body)]
-
-
-def _sweep(
-    problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign", truths: Truths
-) -> Section:
-    heading = "The inner problem at the optimum"
-    result = solution.result
-    optimum = (result["omega_S_hz"], result["omega_T_hz"], result["bandwidth_hz"])
-    processes = solution.outcome.surrogates
-    sweep = sweep_data(problem, processes, truths, verified.theta, optimum)
-    if sweep is None:
-        words = f"Too few syntheses at {theta_words(result)} to draw the inner problem there."
-        return Section(heading, (Words(words),))
-    bounds = {name: bound for name, (_, bound) in problem.inner.bounds.items()}
-    return Section(heading, (sweep_figure(sweep, bounds),))
 
 
 def provenance(case: Case, result: Mapping[str, Any]) -> Section:

@@ -1,6 +1,5 @@
 """What a run's store knows: true inner problems per θ, and single designs."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +9,6 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.store import SampleStore
 
-NEAR = 1e-6  # share of the box within which a design counts as one at θ
-
 
 @dataclass(frozen=True)
 class Truths:
@@ -20,13 +17,6 @@ class Truths:
     theta: np.ndarray
     bandwidth_hz: np.ndarray
     designs: tuple[Sample, ...]
-
-    def near(self, problem: CoDesignProblem, theta: Sequence[float]) -> tuple[Sample, ...]:
-        """The designs at θ, to within rounding of the box."""
-        width = np.array(problem.upper) - np.array(problem.lower)
-        return tuple(
-            s for s in self.designs if np.abs((np.array(s.theta) - theta) / width).max() <= NEAR
-        )
 
 
 def read_truths(path: Path, problem: CoDesignProblem) -> Truths:

@@ -11,9 +11,10 @@ from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 
 WORDS = {"bandwidth": "bandwidth ω_b", "sensitivity_peak": "peak of S", "rms_error": "RMS error",
+         "move_time": "move time",
          "sensitivity_low": "|S| at ω_low", "compliance": "compliance |GS|"}  # fmt: skip
 AXES = {"bandwidth": "Hz", "sensitivity_peak": "–", "sensitivity_low": "–", "compliance": "m/N",
-        "rms_error": "nm"}  # fmt: skip
+        "rms_error": "nm", "move_time": "ms"}  # fmt: skip
 LEAST_BAND = 3.0  # standardised residuals shown at least, either way
 
 

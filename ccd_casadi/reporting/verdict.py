@@ -18,6 +18,7 @@ NEXT = {  # what to do about a line that failed
     "survives": "a [robust] set in the case",
     "deployable": "a higher rate or less delay",
 }
+NO_SET = "[robust] names no plant"  # as verified_sections says it
 STATUS = {
     "verified": "verified",
     "not_verified": "not verified",
@@ -99,6 +100,8 @@ def advice(result: Mapping[str, Any]) -> str:
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
     if states.get("survives") == State.WARNED:
         words = "Do not build this: it does not survive small errors of its model."
+        if str(result["verdict"]["survives"].get("words")).startswith(NO_SET):
+            words = "Do not build this yet: it was judged on the model alone."
         return f"{words} Next: {NEXT['survives']}."
     warned = [name for name, state in states.items() if state == State.WARNED]
     if warned:

@@ -77,7 +77,7 @@ def robustness(
     quiet: bool = True,
     workers: Pool | None = None,
 ) -> Study:
-    """Put a run's controller through all that is demanded; nothing is designed anew. `workers`
+    """Study a run's controller on all demands; nothing is designed. `workers`
     share what they can."""
     d = demands or Demands()
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
@@ -180,7 +180,6 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "tolerance": hard.tolerance,
             "samples": len(hard.judged) + hard.failed,
             "no_plant": hard.failed,
-            "reduced_model_difference": hard.difference,
             "unstable": hard.unstable,
             "stable_above_S_max": hard.above(S_max),
             "yield": hard.within(S_max).entry,

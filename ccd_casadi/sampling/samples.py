@@ -7,6 +7,7 @@ import numpy as np
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.sampling.rows import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.plain_values import restored
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
@@ -16,7 +17,8 @@ class BandwidthSample:
     """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible.
 
     An infeasible one says what falls short, and by how much (ln) at least: `violation`. With
-    `error`, the least RMS error in m, the gradient is of that, and ω_b that of its controller.
+    `error`, the least RMS error in m or time of a move in s, the gradient is of that, and ω_b that
+    of its controller.
     """
 
     theta: tuple[float, ...]
@@ -30,6 +32,7 @@ class BandwidthSample:
     syntheses: int
     kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
     error: float | None = None
+    anew: bool = False  # whether no anchor leads to κ, but a search at this θ did
 
     @property
     def x(self) -> tuple[float, ...]:
@@ -89,38 +92,18 @@ def sample_of(
 
 def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample:
     """What was stored of a unit of work. Raises KeyError, TypeError or ValueError if damaged."""
-    feasible = payload["bandwidth"] is not None
-    nan = float("nan")
     gradient = payload["gradient"] or [None] * len(theta)
-    active, shortfall = payload["active"], payload["shortfall"]
-    kappa, error = payload.get("kappa"), payload.get("error")
-    sized = ("bandwidth",) if kappa is not None else ("bandwidth", "omega_S", "omega_T")
-    positive = [payload[key] for key in sized] if feasible else []
-    violation, syntheses = payload["violation"], payload["syntheses"]
-    if (
-        len(gradient) != len(theta)
-        or not all(v is None or type(v) is float for v in gradient)
-        or not all(type(v) is float and 0.0 < v < np.inf for v in positive)
-        or not (violation is None or type(violation) is float)
-        or not all(isinstance(word, str) for word in [shortfall, *active])
-        or type(syntheses) is not int
-        or not all(type(v) is float for v in kappa or ())
-        or not (error is None or (type(error) is float and error > 0.0))
-    ):
+    nothing = dict.fromkeys(("bandwidth", "omega_S", "omega_T"), np.nan) | {"violation": np.inf}
+    given = nothing | {key: value for key, value in payload.items() if value is not None}
+    given |= {"theta": theta, "gradient": [np.nan if v is None else v for v in gradient]}
+    sample: BandwidthSample = restored(BandwidthSample, given)
+    sizes = [1.0 if sample.error is None else sample.error]
+    if payload["bandwidth"] is not None:
+        sizes += [sample.bandwidth]
+        sizes += [] if "kappa" in payload else [sample.omega_S, sample.omega_T]
+    if len(gradient) != len(theta) or not all(0.0 < size < np.inf for size in sizes):
         raise ValueError("a stored result holds what none is made of")
-    return BandwidthSample(
-        theta=theta,
-        bandwidth=payload["bandwidth"] if feasible else nan,
-        gradient=tuple(nan if v is None else v for v in gradient),
-        omega_S=payload["omega_S"] if feasible and kappa is None else nan,
-        omega_T=payload["omega_T"] if feasible and kappa is None else nan,
-        active=tuple(active),
-        shortfall=shortfall,
-        violation=np.inf if violation is None else violation,
-        syntheses=syntheses,
-        kappa=tuple(kappa or ()),
-        error=error,
-    )
+    return sample
 
 
 def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerProblem) -> QuantitySample:

@@ -84,7 +84,7 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, W
     names = [axis_label(name, unit) for name, unit, _ in theta_axes(problem)]
     cost = f"cost f ({problem.cost_unit})" if problem.cost_unit else "cost f"
     head = (
-        "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "box look",
+        "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "global check",
         "s", "certified",
     )  # fmt: skip
     rows: list[tuple[Any, ...]] = []

@@ -75,7 +75,7 @@ def _descent(
         "last_gradient": run["history"][-1]["gradient"],
     }
     words = [
-        f"{LABELS[name].capitalize()} (best of {run['runs']} runs) ends at J = "
+        f"S{LABELS[name][1:]} (best of {run['runs']} runs) ends at J = "
         f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, "
         f"{ratio:.0f} times as many; all its runs together took {run['syntheses_of_all_runs']}."
     ]
@@ -99,8 +99,8 @@ def _sequential(run: dict[str, Any], best: dict[str, Any], name: str) -> tuple[d
     speed = 100.0 * (best["bandwidth_hz"] / run["bandwidth_hz"] - 1.0)
     found = {"hardware_cost_percent": cost, "bandwidth_percent": speed}
     words = (
-        f"Against the design {LABELS[name]} (hardware cost {run['hardware_cost']:.5g}, "
-        f"{run['bandwidth_hz']:.2f} Hz) co-design changes the hardware cost by {cost:+.1f} % and "
-        f"the bandwidth by {speed:+.1f} %."
+        f"Against the {LABELS[name].replace(',', ' design,')} (hardware cost "
+        f"{run['hardware_cost']:.5g}, {run['bandwidth_hz']:.2f} Hz) co-design "
+        f"changes the hardware cost by {cost:+.1f} % and the bandwidth by {speed:+.1f} %."
     )
     return found, words

@@ -21,7 +21,7 @@ from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
 
 DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
-_DISK = "see to the disk or choose another --out, then give the same command: it resumes"
+_DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
 

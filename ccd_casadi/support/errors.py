@@ -1,4 +1,4 @@
-"""The base of every error that a user can cause and mend, and its one line."""
+"""The base of every error that a user can cause and correct, and its one line."""
 
 from importlib import import_module
 from typing import Any
@@ -9,7 +9,7 @@ class UserError(ValueError):
 
 
 class PlantError(UserError):
-    """A model returned something that is no plant; the message says what and how to mend it."""
+    """A model returned something that is not a plant; the message says what to correct."""
 
 
 def described(error: BaseException) -> str:

@@ -11,13 +11,20 @@ LONGEST = 1000  # characters of a line: somebody else's message in it may have m
 
 
 class ExitCode(IntEnum):
-    """How a command ended."""
+    """How a command ended, and the words for it."""
 
-    DONE = 0
-    BAD_INPUT = 2
-    INFEASIBLE = 3
-    NOT_VERIFIED = 4
-    INTERRUPTED = 130
+    words: str
+
+    DONE = 0, "done and verified"
+    BAD_INPUT = 2, "bad input"
+    INFEASIBLE = 3, "no feasible design"
+    NOT_VERIFIED = 4, "finished, not verified"
+    INTERRUPTED = 130, "interrupted; what is sampled is kept"
+
+    def __new__(cls, code: int, words: str) -> "ExitCode":
+        found = int.__new__(cls, code)
+        found._value_, found.words = code, words
+        return found
 
     @classmethod
     def of(cls, status: str) -> "ExitCode":
@@ -43,7 +50,13 @@ def usable_cores() -> int:
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, as every other bad input, without the usage."""
+    """An argument parser whose errors are one line, as every other bad input, without the usage;
+    its help ends with the exit codes."""
+
+    def format_help(self) -> str:
+        """The help with the exit codes below."""
+        self.epilog = "Exit codes: " + ", ".join(f"{code:d} {code.words}" for code in ExitCode)
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Leave with BAD_INPUT."""

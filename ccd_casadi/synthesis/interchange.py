@@ -134,16 +134,12 @@ def write_mat(path: Path, design: DesignFile) -> None:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def read_mat(path: Path) -> DesignFile:
-    """Every struct with A, B, C, D in a .mat file, ours or another's, and θ where it is there.
-
-    A file with the matrices themselves is one system without a name. Names and units may be
-    missing: they are then u1, …; Ts defaults to 0. Nothing in the file is executed. Raises
-    UserError naming file and variable where something is missing or damaged.
-    """
+def mat_variables(path: Path) -> dict[str, Any]:
+    """What a .mat file holds by name. Raises UserError where it cannot be read."""
     try:
         with path.open("rb") as stream:
-            content = scipy.io.loadmat(stream, squeeze_me=False, struct_as_record=True)
+            content: dict[str, Any] = scipy.io.loadmat(stream)
+            return content
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such file") from None
     except OSError as error:
@@ -153,6 +149,16 @@ def read_mat(path: Path) -> DesignFile:
         raise UserError(f"{path}: {words}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
         raise UserError(f"{path}: is not a readable .mat file: {_one_line(error)}") from None
+
+
+def read_mat(path: Path) -> DesignFile:
+    """Every struct with A, B, C, D in a .mat file, ours or another's, and θ where it is there.
+
+    A file with the matrices themselves is one system without a name. Names and units may be
+    missing: they are then u1, …; Ts defaults to 0. Nothing in the file is executed. Raises
+    UserError naming file and variable where something is missing or damaged.
+    """
+    content = mat_variables(path)
     systems = {name: _system(path, name, struct) for name, struct in _structs(path, content)}
     if not systems:
         raise UserError(f"{path}: holds no struct with A, B, C, D; save one for each system")

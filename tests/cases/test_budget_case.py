@@ -9,7 +9,7 @@ import pytest
 from case_documents import TWO_MASS
 
 from ccd_casadi.budget import Kind, ShapedSpectrum, TabulatedSpectrum
-from ccd_casadi.budget.quadrature import integrate
+from ccd_casadi.budget.frequency import integrate
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case

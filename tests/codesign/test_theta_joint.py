@@ -97,7 +97,8 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         first = sampler.bandwidths(np.array(problem.start))[0]
         promised = proposed(problem, first, 0.05)
         assert promised.gain > 0.0
-        last, best = together(sampler, np.array(problem.start))
+        last, best, settled = together(sampler, np.array(problem.start))
+        assert settled
         assert best.feasible
         assert objective_of(problem, best) < objective_of(problem, first) - 0.5 * promised.gain
         assert best.theta == pytest.approx((55.0, 55.0), abs=1e-6)

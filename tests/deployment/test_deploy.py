@@ -192,7 +192,7 @@ def test_an_unstable_loop_leaves_no_code(
     two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "controller.c").write_text("of an earlier deployment")
-    options = ["--rate-hz", "400", "--out", str(tmp_path), "--method", "zoh", "--quiet"]
+    options = ["--rate-hz", "400", "--out", str(tmp_path), "--method", "tustin", "--quiet"]
     assert main([str(two_mass_run), *options]) == 4
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"deploy.json", "report.html", "report.json"}

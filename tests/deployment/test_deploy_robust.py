@@ -132,9 +132,7 @@ def test_a_run_that_is_not_verified_is_refused_unless_asked(
     ).replace("NOT verified", "").replace("not been verified", "")
 
 
-@pytest.mark.parametrize(
-    "method", [pytest.param("auto", marks=pytest.mark.slow), "prewarped", "tustin"]
-)
+@pytest.mark.parametrize("method", [pytest.param("auto", marks=pytest.mark.slow), "foh", "tustin"])
 def test_a_rate_below_twice_the_peak_is_one_line(
     robust_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
 ) -> None:

@@ -39,7 +39,7 @@ def lead(channels: int = 1) -> StateSpace:
 
 
 def loop(period: float, delay: float, channels: int = 1) -> StateSpace:
-    K = discretise(lead(channels), Conversion(Discretisation.RAMP, True, HZ), period, delay)
+    K = discretise(lead(channels), Conversion(Discretisation.RAMP, True), period, delay)
     return closed_loop(sampled(stage(channels), period, delay), K).S
 
 
@@ -102,7 +102,7 @@ def test_an_unstable_loop_has_no_figures() -> None:
 @pytest.mark.parametrize("channels", [1, 2])
 def test_a_simulation_measures_the_same_sensitivity(channels: int) -> None:
     period, delay = 3e-3, 4.2e-3
-    conversion = Conversion(Discretisation.TUSTIN, False, HZ)
+    conversion = Conversion(Discretisation.TUSTIN, False)
     G = sampled(stage(channels), period, delay)
     K = discretise(lead(channels), conversion, period, delay)
     S = closed_loop(G, K).S
@@ -119,8 +119,8 @@ def test_figures_of_loops_side_by_side_are_the_wholes() -> None:
     period, delay = 1e-3, 5e-4
     one = sampled_figures(loop(period, delay))
     both = together([one, sampled_figures(loop(period, 2.0 * delay))])
-    K = discretise(lead(), Conversion(Discretisation.RAMP, True, HZ), period, delay)
-    slow = discretise(lead(), Conversion(Discretisation.RAMP, True, HZ), period, 2.0 * delay)
+    K = discretise(lead(), Conversion(Discretisation.RAMP, True), period, delay)
+    slow = discretise(lead(), Conversion(Discretisation.RAMP, True), period, 2.0 * delay)
     S1 = closed_loop(sampled(stage(), period, delay), K).S
     S2 = closed_loop(sampled(stage(), period, 2.0 * delay), slow).S
     zero = np.zeros((len(S1.A), len(S2.A)))
@@ -140,27 +140,14 @@ def test_figures_of_loops_side_by_side_are_the_wholes() -> None:
 def test_methods_approach_the_continuous_controller(method: Discretisation, lead_on: bool) -> None:
     """At low frequency K(z) is K(s), advanced by αT where the lead is on."""
     K, period, delay = lead(), 1e-4, 1e-4
-    conversion = Conversion(method, lead_on, HZ * 20.0)
+    conversion = Conversion(method, lead_on)
     omega = HZ * np.array([1.0, 5.0, 20.0])
     found = discretise(K, conversion, period, delay).response(omega)[:, 0, 0]
     s = 1j * omega[:, None, None]
     exact = (K.C @ np.linalg.solve(s * np.eye(2) - K.A, K.B + 0j) + K.D)[:, 0, 0]
-    held = 0.5 * period if method is Discretisation.STEP else 0.0
-    advance = conversion.advance(period, delay) * period - held
+    advance = conversion.advance(period, delay) * period
     np.testing.assert_allclose(found, exact * np.exp(1j * omega * advance), rtol=2e-3)
-    assert conversion.advance(period, delay) == pytest.approx(
-        0.0 if not lead_on else 2.0 if method is Discretisation.STEP else 1.5
-    )
-
-
-def test_prewarping_is_exact_at_its_frequency() -> None:
-    K, omega = lead(), HZ * 100.0
-    found = discretise(K, Conversion(Discretisation.PREWARPED, False, omega), 2e-3, 0.0)
-    exact = K.C @ np.linalg.solve(1j * omega * np.eye(2) - K.A, K.B + 0j) + K.D
-    at = found.response(np.array([omega]))[0]
-    np.testing.assert_allclose(at, exact, rtol=1e-12)
-    with pytest.raises(ValueError, match="half the sampling rate"):
-        discretise(K, Conversion(Discretisation.PREWARPED, False, omega), 6e-3, 0.0)
+    assert conversion.advance(period, delay) == pytest.approx(1.5 if lead_on else 0.0)
 
 
 @few(max_examples=40)
@@ -190,7 +177,7 @@ def test_needed_rate(met: Callable[[float], bool], found: float | None) -> None:
 
 def test_a_simulation_goes_on_from_its_state() -> None:
     G = sampled(stage(), 1e-3, 1e-3)
-    K = discretise(lead(), Conversion(Discretisation.STEP, True, HZ), 1e-3, 1e-3)
+    K = discretise(lead(), Conversion(Discretisation.RAMP, True), 1e-3, 1e-3)
     r = np.random.default_rng(0).normal(size=(60, 1, 1))
     whole, _ = simulate(G, K, r)
     first, state = simulate(G, K, r[:25])

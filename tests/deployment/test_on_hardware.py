@@ -12,12 +12,12 @@ from sampled_simulation import simulate
 from structured_text import run as run_text
 from test_deploy_code import of_one_channel, random_controller
 
+from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.anti_windup import back_calculation, limited, takeover
 from ccd_casadi.deployment.c_code import vectors
-from ccd_casadi.deployment.feedforward import feedforward
 from ccd_casadi.deployment.move import PARTS, Hardware, move
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
 from ccd_casadi.deployment.structured_text import structured_text

@@ -37,7 +37,7 @@ from ccd_casadi.synthesis import derivatives, synthesis
 KINDS = kinds()
 SYNTHESISE = [  # every way to a controller
     (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design_with_gradients"),
-    (sections_bandwidth, "synthesise"), (sections_bandwidth, "least_error"),
+    (sections_bandwidth, "synthesise"), (sections_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design
     "mixed": (outer_mixed, "kkt_certificate"), "sections": (outer_sections, "worst_members"),

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.codesign import sections_races
+from ccd_casadi.codesign import outer_sections
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.codesign.outer_sections import by_pieces
 from ccd_casadi.codesign.run import solve
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
@@ -175,12 +177,35 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
         return with_sections(case, anchors=((case.inner.S_max,),)), design
 
-    monkeypatch.setattr(sections_races, "prepared", raced)
+    monkeypatch.setattr(outer_sections, "prepared", raced)
     case = quick(PID)
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
             asked = replace(case, inner=replace(case.inner, S_max=bound))
-            found, words = sections_races.seeded_and_prepared(store, asked, 0, True)
+            found, words = outer_sections.seeded_and_prepared(store, asked, 0, True)
             assert (sections_of_problem(found).anchors, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip
+
+
+def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
+    anchored: CoDesignProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no anchor leads to one: a single search with starts, whatever θ the pieces ask for."""
+    honest, searches = sections_bandwidth.searched, []
+
+    def counted(case: Any, plants: Any, initial: Any, starts: Any = None, *rest: Any) -> Any:
+        searches.append(starts)
+        return honest(case, plants, initial, starts, *rest)
+
+    monkeypatch.setattr(sections_bandwidth, "searched", counted)
+    with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
+        alone = Sampler(with_sections(anchored, anchors=()), store, pool)
+        truth = TrueBandwidth(alone, "near by")
+        first = truth.at(np.array(anchored.start))
+        assert first.anew
+        _, best = by_pieces(truth, first, 1e-3, 0.1)
+    assert not best.anew
+    assert best.value >= first.value * (1.0 - 1e-6)
+    assert sum(starts is not None for starts in searches) == 1
+    assert len(searches) > 2

@@ -16,8 +16,8 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.codesign.outer_sections import seeded_and_prepared
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.sections_races import seeded_and_prepared
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem

@@ -19,18 +19,13 @@ from ccd_casadi.explorer.landscape import landscape_of
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.panels import drawn
 from ccd_casadi.explorer.session import Session
-from ccd_casadi.explorer.words import (
-    end_words,
-    machine_html,
-    move_words,
-    standing_html,
-    survival_words,
-)
+from ccd_casadi.explorer.words import machine_html, move_words, standing_html, survival_words
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.bode import loop_panels
 from ccd_casadi.reporting.machine import lumped, lumped_svg
 from ccd_casadi.reporting.true_samples import read_truths
+from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Outcome
 
@@ -328,5 +323,5 @@ def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):
     assert over.wait(300.0)
     assert codes == [2]
     assert "none.toml: there is no such file" in said[0]
-    assert "not verified" in end_words(4)
+    assert "not verified" in ExitCode(4).words
     solve.stop()  # there is nothing left to stop

@@ -75,6 +75,9 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
 def test_a_page_says_first_whether_to_build_it(states: dict, said: str) -> None:
     assert advice(result_of(**states)).startswith(said)
     assert advice({"status": "verified"}) == ""
+    alone = result_of(survives="warned")  # nothing was found against it
+    alone["verdict"]["survives"]["words"] = "[robust] names no plant but the model; stable for"
+    assert advice(alone).startswith("Do not build this yet: it was judged on the model alone.")
 
 
 def test_a_peak_is_above_or_below_what_it_is_held_against() -> None:

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -9,6 +10,7 @@ from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +31,7 @@ from ccd_casadi.drawing.content import (
     Lines,
     Page,
     Panel,
+    Picture,
     Section,
     Table,
     ThetaPath,
@@ -357,8 +360,8 @@ def test_a_foreign_or_damaged_report_json_is_told(
 ) -> None:
     place = tmp_path / "report.json"
     for text, said in (
-        ("{", "is no report.json"), ('{"format": 2, "pages": {}}', "format: is not 1"),
-        ('{"format": 1, "pages": {"../a.html": {}}}', "names what is no page"),
+        ("{", "is not a report.json"), ('{"format": 2, "pages": {}}', "format: is not 1"),
+        ('{"format": 1, "pages": {"../a.html": {}}}', "names a file that is not a page"),
         ('{"format": 1, "pages": {"a.html": {"head": 3}}}', "is not what a page shows"),
     ):  # fmt: skip
         place.write_text(text)
@@ -454,3 +457,39 @@ def test_tables_round_and_escape() -> None:
     assert '<td class="n">–</td>' in html
     head = Head("t", "good", "", "", "", "")
     Document(painted(Page(head, (Section("<h>", (Words("x"),)),))))
+
+
+@pytest.mark.parametrize(
+    "svg",
+    [
+        "<svg><script>alert(1)</script></svg>",
+        '<svg onload="alert(1)"/>',
+        '<svg><a href="https://elsewhere.example"><text>here</text></a></svg>',
+        "<svg><foreignObject><p>words</p></foreignObject></svg>",
+        '<svg><rect style="fill: url(https://elsewhere.example)"/></svg>',
+        "</figure><h1>words of somebody else</h1>",
+        '<!DOCTYPE svg [<!ENTITY a "aaaa">]><svg><text>&a;</text></svg>',
+    ],
+)
+def test_a_picture_of_a_strangers_report_holds_shapes_and_words_alone(
+    two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], svg: str
+) -> None:
+    with pytest.raises(ValueError, match="picture"):
+        Picture(svg)
+    shutil.copy(two_mass_run / "report.json", tmp_path)
+    place = tmp_path / "report.json"
+    text = json.loads(place.read_text(encoding="utf-8"))
+
+    def planted(item: Any) -> int:
+        if isinstance(item, dict):
+            if item.get("") == "Picture":
+                item["svg"] = svg
+                return 1
+            return sum(map(planted, item.values()))
+        return sum(map(planted, item)) if isinstance(item, list) else 0
+
+    assert planted(text) > 0
+    place.write_text(json.dumps(text), encoding="utf-8")
+    assert report_command([str(tmp_path), "--quiet"]) == 2
+    assert "is not what a page shows" in capsys.readouterr().err
+    assert not (tmp_path / "report.html").exists()

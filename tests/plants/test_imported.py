@@ -268,7 +268,7 @@ def test_static_correction_restores_the_compliance_that_truncation_loses() -> No
     ("file", "text", "words"),
     [
         ("index.csv", None, "index.csv: cannot be read"),
-        ("dofs.csv", "kind,name,dof\nin,u,5000\nout,y,0\n", "5000 is no row of a matrix of 50"),
+        ("dofs.csv", "kind,name,dof\nin,u,5000\nout,y,0\n", "5000 is not a row of a matrix of 50"),
         ("dofs.csv", "kind,name,dof\nin,u,0\n", "names no out"),
         ("dofs.csv", "kind,name,dof\nforce,u,0\n", "needs the columns kind"),
         ("M00.mtx", "nonsense", "M00.mtx: cannot be read"),

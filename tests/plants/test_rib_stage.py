@@ -388,3 +388,12 @@ def test_threads_change_no_digit() -> None:
 def test_refusals_say_what_to_change(call) -> None:
     with pytest.raises(StageError, match=r"give|move|needs|must|keep"):
         call()
+
+
+def test_without_derivatives_the_matrices_are_the_same_to_the_bit() -> None:
+    stage, theta = RibStage(order=COARSE), (1.2e-3, 3.3e-3, 7e-3, 7e-3, 16e-3, 70e-3)
+    whole = stage.mechanics(theta)
+    bare = stage.mechanics(theta, derivatives=False)
+    for name in ("M", "D", "K", "B", "C"):
+        np.testing.assert_array_equal(getattr(bare, name), getattr(whole, name))
+    assert [len(item) for item in bare.derivatives] == [0] * 5

@@ -149,7 +149,7 @@ def test_a_sampled_move_tends_to_the_continuous_one() -> None:
     apart = []
     for rate in (4e3, 8e3):
         period = 1.0 / rate
-        tustin = Conversion(Discretisation.TUSTIN, False, 100.0)
+        tustin = Conversion(Discretisation.TUSTIN, False)
         K = discretise(controller, tustin, period, 0.5 * period)
         found = simulate(Loop(plant, K, Sampling(rate, 0.5e6 * period)), profile, axis=0,
                          forces=None, window=1e-7, bandwidth_hz=15.0)  # fmt: skip

@@ -108,7 +108,7 @@ def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
     tau = np.log(0.1)
     found = assess(problem, kappa, tau, depth=-3.0)
     si = problem.structure.in_units(kappa, members.omega_0, members.force)
-    conversion = Conversion(Discretisation.TUSTIN, False, 1.0)
+    conversion = Conversion(Discretisation.TUSTIN, False)
     K = discretise(state_space(problem.structure, si), conversion, sampling.period, sampling.delay)
     S = closed_loop(sampled(plant().plant_si(), sampling.period, sampling.delay), K).S
     w = found.poles[0] * 0.5 * members.period

@@ -9,7 +9,7 @@ import pytest
 from fixed_structure_loops import BOUNDS, FAST, loop, plant
 from scipy.io import savemat
 
-from ccd_casadi.fixed_structure import Sampling, Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
 from ccd_casadi.fixed_structure.line_problem import line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel
 from ccd_casadi.fixed_structure.loop import plant_set
@@ -186,7 +186,7 @@ def test_two_channels_are_designed_on_two_responses_and_judged_apart(tmp_path: P
         grown = np.angle(F[1:] / F[:-1]).sum()
         assert -np.pi + np.angle(-F[0]) + grown == pytest.approx(np.angle(F[-1]))
     other = MeasuredResponse(plants[0].hz, plants[0].G[:, :1, :1])
-    with pytest.raises(UserError, match="unlike numbers of channels"):
+    with pytest.raises(UserError, match="different numbers of channels"):
         design_on_data([plants[0], other], structure, bounds, period=period)
 
 
@@ -208,3 +208,31 @@ def test_mistakes_in_files(tmp_path: Path, text: str, words: str) -> None:
         read_frequency_response(path)
     with pytest.raises(UserError, match="cannot be read"):
         read_frequency_response(tmp_path / "none.csv")
+
+
+def test_what_repeated_measurements_leave_open_is_in_the_bound_on_S(tmp_path) -> None:
+    """Every response within the spread of the mean stays below what is said of the mean."""
+    rng = np.random.default_rng(4)
+    hz = np.geomspace(1.0, 400.0, 300)
+    s = 1j * HZ * hz
+    G = (1.0 / (s + 5.0))[:, None, None] * np.array([[1.0, 0.1], [0.0, 0.8]])
+    spread = 0.05 * np.abs(G)
+    K = StateSpace(
+        -60.0 * HZ * np.eye(2), 60.0 * HZ * np.eye(2), 100.0 * np.eye(2), np.zeros((2, 2))
+    )
+    bounds = Bounds(S_max=10.0, S_low=2.0, omega_low=HZ)
+    plain, wide = (
+        judge(MeasuredResponse(hz, G, spread=one), K, bounds, integrator=False)
+        for one in (None, spread)
+    )
+    assert plain.stable
+    assert wide.S_peak == plain.S_peak
+    assert plain.S_between < wide.S_between < np.inf
+    for _ in range(50):
+        moved = G + spread * np.exp(2j * np.pi * rng.random(G.shape))
+        S = np.linalg.inv(np.eye(2) + moved @ K.response(HZ * hz))
+        assert np.linalg.norm(S, 2, axis=(1, 2)).max() <= wide.S_between
+    np.savez(tmp_path / "two.npz", f_hz=hz, G=G, spread=spread)
+    assert np.array_equal(read_frequency_response(tmp_path / "two.npz").spread, spread)
+    with pytest.raises(UserError, match="spread"):
+        MeasuredResponse(hz, G, spread=spread[:5])

@@ -124,7 +124,7 @@ def modes_at(stage: RibStage, theta: tuple[float, ...]) -> ModeSet:
     return _spectra(stage.order, stage.geometry, stage.modes, stage.truncation, theta)
 
 
-@lru_cache(maxsize=2)  # factorisations are large
+@lru_cache(maxsize=1)  # factorisations are large
 def _spectra(
     order: MeshOrder,
     geometry: Geometry,

@@ -6,7 +6,6 @@ from functools import partial
 
 import casadi as ca
 
-from ccd_casadi.case_studies.rib_stage import nearby
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE, FINE, MeshOrder
 from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, RibStage
@@ -16,9 +15,8 @@ from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.fixed import Ordered
-from ccd_casadi.plants.plant import Evaluate, Plant
+from ccd_casadi.plants.plant import Plant
 from ccd_casadi.plants.registry import Model
-from ccd_casadi.support.process_pool import Pool
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
 MODES = {10: ModeCount(), 20: TWENTY}
@@ -94,7 +92,6 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         inputs=count or len(stage.actuator_points),
         references={name: evaluator(variant) for name, variant in references.items()},
         values=evaluator(stage),
-        nearby=partial(_nearby, stage, evaluate) if nearby.applies(stage) else None,
         shapes=lambda theta, count: mode_shapes(stage, evaluate.own(theta), count),
         drawing=partial(_drawing, stage, evaluate),
     )
@@ -104,17 +101,6 @@ def _drawing(stage: RibStage, order: Ordered, thetas: Mapping[str, Sequence[floa
     from ccd_casadi.case_studies.rib_stage.drawing import drawing  # matplotlib is slow to import
 
     return drawing(stage.geometry, {name: order.own(theta) for name, theta in thetas.items()})
-
-
-def _nearby(
-    stage: RibStage, order: Ordered, theta: Sequence[float], reach: float, pool: Pool
-) -> Evaluate:
-    """A reduced basis of the stage within ± reach of θ, its snapshots solved by the pool."""
-    here = order.own(theta)
-    tasks = [(stage, place) for place in nearby.places(here, reach)]
-    made = dict(pool.map_unordered(nearby.numbered_snapshot, list(enumerate(tasks))))
-    evaluate = nearby.reduced(stage, here, [made[i] for i in range(len(tasks))])
-    return lambda values: evaluate(order.own(values))
 
 
 def _points(points: Points) -> tuple[Point, ...] | None:

@@ -133,7 +133,7 @@ def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) ->
             place = folder / "dofs.csv"
             dof, gain = number_in(place, "dof", row["dof"]), number_in(place, "gain", row["gain"])
             if dof != int(dof) or not 0 <= dof < size:
-                words = f"{dof:g} is no row of a matrix of {size}; count from 0"
+                words = f"{dof:g} is not a row of a matrix of {size}; count from 0"
                 raise PlantError(f"{place}: dof: {words}")
             found[int(dof), names.index(row["name"])] += gain
     return found

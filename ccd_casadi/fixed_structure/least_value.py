@@ -1,20 +1,21 @@
-"""The least RMS error of a fixed structure on a set of plants, within the bounds of the bandwidth.
+"""The least value of a figure of a fixed structure on a set of plants, within the bounds of the
+bandwidth: the RMS error, or the time of a move.
 
-    min ln e(κ)   s.t.  every bound of `figures` at a bandwidth of at least ω_min,
-    e² = mean over the plants of the error's variance under an `ErrorBudget`
+    min ln v(κ)   s.t.  every bound of `figures` at a bandwidth of at least ω_min
 
 By quadratic programmes in a trust region, from a controller that meets the bounds: the gradient
-of ln e is exact (adjoint Lyapunov equations), its curvature learnt from it, that of the bounds
-exact. The merit is ln e + ρ max(0, max c); a step counts only where every loop stays stable.
-A little is paid for bandwidth, so that ω_b is what the bounds leave free at this κ. At its end
+of ln v is exact, its curvature learnt from it, that of the bounds exact. The merit is
+ln v + ρ max(0, max c); a step counts only where every loop stays stable. A little is paid for
+bandwidth, so that ω_b is what the bounds leave free at this κ. At its end
 
-    d ln e*/dθ = ∂ ln e/∂θ + Σ μ_j ∂c_j/∂θ        (envelope theorem)
+    d ln v*/dθ = ∂ ln v/∂θ + Σ μ_j ∂c_j/∂θ        (envelope theorem)
 
 but for that payment, `REWARD` dτ/dθ.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -42,16 +43,31 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 STEP = 1e-30  # of κ along the imaginary axis
-REWARD = 1e-6  # of ln ω_b in ln e
+REWARD = 1e-6  # of ln ω_b in ln v
 SLOWER = 0.1  # of the largest bandwidth: where a search from a given κ begins
 KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
 
 
+class Goal(Protocol):
+    """A figure of a controller on a set of plants that is made small, in SI, and its derivatives;
+    its logarithm is what is searched on."""
+
+    def at(self, kappa: Array) -> tuple[float, Array]:
+        """ln v at κ in SI, and its gradient; infinite where a loop is unstable."""
+
+    def to_theta(self, kappa: Array) -> Array:
+        """∂ ln v/∂θ at a fixed κ."""
+
+    def shown(self, value: float) -> str:
+        """v with its unit."""
+
+
 @dataclass(frozen=True)
 class RmsError:
-    """e of a controller on SISO plants in SI, and its derivatives to κ."""
+    """The RMS error e of a controller on SISO plants, e² the mean of its variances; derivatives by
+    adjoint Lyapunov equations."""
 
-    plants: tuple[StateSpace, ...]
+    plants: tuple[ScaledPlant, ...]
     structure: Structure
     budget: ErrorBudget
     hold: Sampling | None
@@ -66,24 +82,25 @@ class RmsError:
         ]
         return self._summed(kappa, [changes] * len(self.plants))
 
-    def to_theta(self, kappa: Array, plants: Sequence[ScaledPlant]) -> Array:
-        """∂ ln e/∂θ at a fixed κ; `plants` are those of the error, with dA, dB, dC."""
-        none = [np.zeros((len(p.C), p.B.shape[1])) for p in plants]
+    def to_theta(self, kappa: Array) -> Array:
+        """∂ ln e/∂θ at a fixed κ."""
+        none = np.zeros((1, 1))
         changes = [
-            [
-                Change(StateSpace(p.omega_0 * dA, p.omega_0 / p.force * dB, dC, D), None)
-                for dA, dB, dC in zip(p.dA, p.dB, p.dC, strict=True)
-            ]
-            for p, D in zip(plants, none, strict=True)
+            [Change(StateSpace(*change, none), None) for change in plant.changes_si()]
+            for plant in self.plants
         ]
         return self._summed(np.asarray(kappa, float), changes)[1]
 
+    def shown(self, value: float) -> str:
+        """In nm."""
+        return f"{1e9 * value:.4g} nm RMS"
+
     def _summed(self, kappa: Array, changes: Sequence[Sequence[Change]]) -> tuple[float, Array]:
         """ln e and its derivatives to what the changes of each plant's loop are of."""
-        K = state_space(self.structure, kappa)
+        K, budget = state_space(self.structure, kappa), replace(self.budget, window=None)
         total = None
         for plant, own in zip(self.plants, changes, strict=True):
-            found = variance_slopes(Loop(plant, K, self.hold), self.budget, own)
+            found = variance_slopes(Loop(plant.plant_si(), K, self.hold), budget, own)
             if found is None:
                 return np.inf, np.full(len(own), np.nan)
             total = found if total is None else replace(
@@ -95,44 +112,41 @@ class RmsError:
 
 
 @dataclass(frozen=True)
-class LeastError:
-    """A design with its RMS error in m over the set, and that of the controller it began with.
+class LeastValue:
+    """A design with its value v over the set in SI, and that of the controller it began with.
 
-    `design.multipliers`: change of ln e per ln of a bound; `design.kkt_residual` is over ‖∇ ln e‖.
-    `envelope` has de*/dθ where the plants carry derivatives; None where the end is not stationary.
+    `design.multipliers`: change of ln v per ln of a bound; `design.kkt_residual` is over ‖∇ ln v‖.
+    `envelope` has dv*/dθ where the plants carry derivatives; None where the end is not stationary.
     """
 
     design: SectionsDesign
-    error: float
-    first_error: float
+    value: float
+    first_value: float
     steps: int
     envelope: Envelope | None
 
 
-def least_error(
+def least_value(
     plants: Sequence[ScaledPlant],
     bounds: Bounds,
     design: SectionsDesign,
-    budget: ErrorBudget,
+    goal: Goal,
     *,
     sampling: Sampling | None = None,
     least_bandwidth: float = 0.0,
     initial: Sequence[Array] = (),
     progress: Progress | None = None,
-) -> LeastError:
+) -> LeastValue:
     """From `initial` (κ in SI), or a certified design and its other local optima, to the least
-    RMS error in m: from the latter where nothing is given or what is leads to no certified design.
+    value of the goal: from the latter where nothing is given or that leads to no certified design.
 
     `least_bandwidth` in rad/s. What the judge does not confirm is not handed out: the design that
     it began with is, then. A local optimum, as any search from given starts finds.
     """
     structure = design.structure
     if not isinstance(structure, Structure):
-        raise ValueError("the least RMS error is searched for one input and one output only")
+        raise ValueError("the least value is searched for one input and one output only")
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
-    goal = RmsError(
-        tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), sampling
-    )
     w0, force = problem.plants.omega_0, problem.plants.force
     floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
 
@@ -145,7 +159,7 @@ def least_error(
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
     first = float(np.exp(goal.at(design.kappa)[0]))
-    best = LeastError(design, first, first, 0, None)
+    best = LeastValue(design, first, first, 0, None)
     steps = 0
     slower = max(SLOWER * design.bandwidth, least_bandwidth)
     given = [(slower, tuple(map(float, item))) for item in initial]
@@ -161,15 +175,14 @@ def least_error(
         end, count = descend(model, start, first_hessian, problem.margin)
         steps += count
         made, conditions = _judged(problem, plants, sampling, end, design, floor)
-        error = float(np.exp(end.value + REWARD * end.x[-1]))
-        tell(f"{1e9 * error:.4g} nm RMS at {made.bandwidth / HZ:.2f} Hz, {count} steps: "
-             f"{made.words}")  # fmt: skip
-        if made.certified and error < best.error:
-            direct = goal.to_theta(made.kappa, plants)
+        value = float(np.exp(end.value + REWARD * end.x[-1]))
+        tell(f"{goal.shown(value)} at {made.bandwidth / HZ:.2f} Hz, {count} steps: {made.words}")
+        if made.certified and value < best.value:
+            direct = goal.to_theta(made.kappa)
             envelope = envelope_of(problem, end.x[:-1], conditions, direct)
             if envelope is not None:
-                envelope = envelope.times(error)
-            best = replace(best, design=made, error=error, envelope=envelope)
+                envelope = envelope.times(value)
+            best = replace(best, design=made, value=value, envelope=envelope)
     return replace(best, steps=steps)
 
 

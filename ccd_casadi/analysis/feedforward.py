@@ -7,6 +7,8 @@ F_0 is the suspension's stiffness, F_1 its damping, F_2 the mass; F_3 (jerk) mak
 Steinbuch 2004). A setpoint of fourth order has all of these derivatives bounded.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
@@ -23,16 +25,36 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
 
     Taylor coefficients by Cauchy's integral on a circle within which the inverse is analytic: its
     aliasing error is RADIUS^(POINTS - ORDER). Raises UserError where the plant has a zero at s = 0,
-    so that no finite force holds a position.
+    so that no finite force holds a position. A plant whose rigid bodies are free has F_0 = F_1 = 0.
+    """
+    return feedforward_slopes(plant, (), period, delay)[0]
+
+
+def feedforward_slopes(
+    plant: StateSpace, changes: Sequence[tuple[Array, Array, Array]], period: float, delay: float
+) -> tuple[Array, Array]:
+    """F, and dF (k, ORDER + 1, m, p) of k changes (dA, dB, dC) of a square plant.
+
+    dG⁻¹ = -G⁻¹ dG G⁻¹
     """
     poles = np.abs(plant.poles)
     zeros = plant.zeros(float(poles.max()))
     nearest = min([*np.abs(zeros), poles.max()])
     if not nearest > 1e-9 * poles.max():
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
-    s = RADIUS * nearest * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
-    G = plant.at(s)
-    ahead = np.exp(s * (delay + 0.5 * period))[:, None, None] * np.linalg.pinv(G)
-    series = np.fft.fft(ahead, axis=0).real / POINTS
-    powers = (RADIUS * nearest) ** np.arange(ORDER + 1)
-    return np.asarray(series[: ORDER + 1] / powers[:, None, None])
+    radius = RADIUS * nearest
+    s = radius * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
+    X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
+    inverse = np.linalg.pinv(plant.C @ X + plant.D)
+    ahead = np.exp(s * (delay + 0.5 * period))[:, None, None]
+
+    def series(values: np.ndarray) -> Array:
+        found = np.fft.fft(ahead * values, axis=0).real[: ORDER + 1] / POINTS
+        return np.asarray(found / radius ** np.arange(ORDER + 1)[:, None, None])
+
+    F, dF = series(inverse), np.zeros((len(changes), ORDER + 1, *inverse.shape[1:]))
+    for i, (dA, dB, dC) in enumerate(changes):
+        whole = s[:, None, None] * np.eye(len(poles)) - plant.A
+        dG = dC @ X + plant.C @ np.linalg.solve(whole, dA @ X + dB)
+        dF[i] = series(-inverse @ dG @ inverse)
+    return F, dF

@@ -1,0 +1,150 @@
+"""Structured synthesis beside SciPy's SLSQP from the same starts, on the same bounds, one judge.
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/structured_peers.py [--problems N] [--out FILE]
+
+The problems are chains of benchmarks/random_sections.py with two or three masses, something
+uncertain and a lead or biquads. The search of this package runs with 12 starts. Its peer is what
+one would write with a general optimiser: max τ over (κ, τ), the largest peak of every curve and
+plant as a constraint with its exact slopes, SLSQP from one start after the other (those that the
+search draws, half by rules, half at random) until all are used or it has had `PATIENCE` times the
+processor time. Every end is given the largest ω_b that its controller has and passes the gate of
+every design: the judge. One line of JSON a problem, counts at the end.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from random_sections import at_its_bandwidth, case
+from scipy.optimize import minimize
+from sections_judge import Case
+
+from ccd_casadi.fixed_structure.design import _pool, problem_for, synthesise_sections
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import Point
+from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
+from ccd_casadi.fixed_structure.race import started
+from ccd_casadi.fixed_structure.sections_design import designed
+from ccd_casadi.plants.scaling import ScaledPlant
+
+STARTS = 12
+PATIENCE = 10.0  # times the search's processor time that the peer may take
+STEPS = 300  # of SLSQP from one start
+INSIDE = 2e-6  # ln: what SLSQP's ends are pulled back by, so that the judge has no rounding to mind
+OUT = Path(__file__).with_suffix(".json")
+
+
+def problems(count: int) -> list[tuple[int, Case]]:
+    """Seeds and their problems."""
+    found: list[tuple[int, Case]] = []
+    seed = 1000
+    while len(found) < count:
+        asked = case(seed)
+        sections = asked.structure.lead + asked.structure.biquads
+        if len(asked.mass) > 1 and asked.uncertain.names and sections:
+            found.append((seed, asked))
+        seed += 1
+    return found
+
+
+def by_slsqp(problem: LoopProblem, start: Point, until: float) -> Point | None:
+    """SLSQP's end from a start, at the bandwidth that it has; None where its loops are unstable."""
+    curves = [*problem.curves, Curve.S_LOW, Curve.CROSSING]
+    place = {(int(curve), plant): i for i, (curve, plant) in enumerate(
+        (curve, plant) for curve in curves for plant in range(problem.plants.count))}  # fmt: skip
+    last: dict[str, Any] = {"x": None}
+    best = np.append(start.kappa, start.tau)
+
+    def rows(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The largest constraint of every curve and plant, and its slopes."""
+        if time.process_time() > until:
+            raise TimeoutError
+        if last["x"] is not None and np.array_equal(last["x"], x):
+            return last["rows"]
+        value, slopes = np.full(len(place), -1.0), np.zeros((len(place), len(x)))
+        peaks = assess(problem, x[:-1], float(x[-1])).peaks
+        if peaks is None:  # unstable
+            value += 3.0
+        else:
+            for j in np.argsort(peaks.value):  # the largest is written last
+                i = place[int(peaks.curve[j]), int(peaks.plant[j])]
+                value[i] = peaks.value[j]
+                slopes[i] = np.append(peaks.to_kappa[j], peaks.to_tau[j])
+        last.update(x=x.copy(), rows=(value, slopes))
+        return value, slopes
+
+    def keep(x: np.ndarray) -> None:
+        nonlocal best
+        best = x.copy()
+
+    try:
+        best = minimize(
+            lambda x: -x[-1], best, jac=lambda x: -np.eye(len(x))[-1], method="SLSQP",
+            callback=keep, options={"maxiter": STEPS},
+            bounds=[*zip(*problem.box, strict=True), (-8.0, 3.0)],
+            constraints={"type": "ineq", "fun": lambda x: -rows(x)[0] - INSIDE,
+                         "jac": lambda x: -rows(x)[1]},
+        ).x  # fmt: skip
+    except TimeoutError:
+        pass
+    kappa = np.clip(best[:-1], *problem.box)
+    end = Point(kappa, float(best[-1]), assess(problem, kappa, float(best[-1])))
+    return at_its_bandwidth(problem, end) if end.assessment.stable else None
+
+
+def peer(asked: Case, plants: list[ScaledPlant], seconds: float) -> tuple[float, int, float]:
+    """The best judged bandwidth in Hz (0: none), starts used, processor time."""
+    began = time.process_time()
+    problem: Any = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
+    best, used = 0.0, 0
+    for kappa in _pool(problem, STARTS, np.random.default_rng(0)):
+        if time.process_time() - began > seconds:
+            break
+        used += 1
+        end = by_slsqp(problem, started(problem, kappa), began + seconds)
+        if end is not None:
+            made = designed(problem, plants, asked.sampling, end, (), 1, 0, 0, 0.0)
+            if made.certified:
+                best = max(best, made.bandwidth / (2.0 * np.pi))
+    return best, used, time.process_time() - began
+
+
+def main() -> None:
+    """Every problem, a line each, and the counts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--problems", type=int, default=20)
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for seed, asked in problems(options.problems):
+        plants = asked.uncertain.plants(asked.uncertain.corners())
+        began = time.process_time()
+        made = synthesise_sections(plants, asked.structure, asked.bounds, sampling=asked.sampling,
+                                   starts=STARTS, seed=0)  # fmt: skip
+        own = time.process_time() - began
+        theirs, used, spent = peer(asked, plants, PATIENCE * own)
+        rows.append({
+            "seed": seed, "hz": made.bandwidth / (2.0 * np.pi) if made.certified else 0.0,
+            "seconds": round(own, 2), "slsqp_hz": theirs, "slsqp_starts": used,
+            "slsqp_seconds": round(spent, 2),
+        })  # fmt: skip
+        print(json.dumps(rows[-1]), flush=True)
+    ratio = np.array([(row["hz"] + 1e-9) / (row["slsqp_hz"] + 1e-9) for row in rows])
+    counts = {
+        "problems": len(rows),
+        "certified": sum(row["hz"] > 0.0 for row in rows),
+        "slsqp_certified": sum(row["slsqp_hz"] > 0.0 for row in rows),
+        "as_good_within_0.1_percent": int((ratio > 0.999).sum()),
+        "better_by_5_percent": int((ratio > 1.05).sum()),
+        "slsqp_time_over_ours": round(float(np.median(
+            [row["slsqp_seconds"] / row["seconds"] for row in rows])), 2),
+    }  # fmt: skip
+    print(json.dumps(counts))
+    options.out.write_text(json.dumps({"counts": counts, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""The time of a move with its settling on a set of plants, and its derivatives.
+
+At the instants of a sampled loop, hold and delay exact, with the feedforward of `feedforward`. Once
+the setpoint has come to rest, at t_0, the error is a sum of the loop's modes,
+
+    e_k = Σ_i ρ_i λ_i^k,   |e_k| <= E(k) = Σ_i √(|ρ_i λ_i^k|² + (r w)²)
+
+The exact time, from which on |e| stays within the window w, jumps by half an oscillation as a peak
+falls into it. What is optimised is when the envelope E crosses the window: no less, without jumps,
+smooth also where a mode is not excited (r rounds that kink), but not where two real poles meet: ρ
+is infinite there. The plants and the end of the setpoint
+come together smoothly and from above:
+
+    v = t_0 + t_0/s ln(1 + Σ_plants exp(s (t_i/t_0 - 1))) >= max(t_0, t_i)
+
+Its gradients are by perturbation of the modes, and by one adjoint recursion for each plant:
+
+    dλ_i = D_ii,   dρ_i = -Σ_{j≠i} (c_i D_ij b_j + c_j D_ji b_i)/(λ_i - λ_j) - …,   D = V⁻¹ dA V
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ccd_casadi.analysis.motor import STEP, MotionAt
+from ccd_casadi.analysis.move import driven_states, forward_force
+from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
+from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
+from ccd_casadi.lti.hold import Sampling, sampled, tustin
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.recurrence import states
+
+SHARPNESS = 200.0  # of the largest of the plants: twelve that are equally late add 1.3 %
+ROUNDED, MOST_ROUNDED = 0.005, 0.1  # r: of the window, for each mode; and for all together
+NOTHING = 1e-30  # share of the envelope: a mode with less has died out
+NEWTON = 50  # steps at most
+
+
+class _Crossing:
+    """When the envelope of one plant's error crosses the window, s, and its slopes."""
+
+    def __init__(
+        self, G: StateSpace, K: StateSpace, r: Array, f: Array, window: float, period: float
+    ) -> None:
+        self.plant, self.r, self.f = G, r, f
+        self.loop = loop = closed_loop(G, K)
+        self.poles, self.V = np.linalg.eig(loop.A)
+        self.stable, self.time = bool(np.abs(self.poles).max() < 1.0), np.inf
+        if not self.stable:
+            return
+        self.x = driven_states(loop, G, r, f)  # the last at rest but for the loop's own modes
+        self.still = np.eye(len(loop.A)) - loop.A
+        self.rest = np.linalg.solve(self.still, loop.B_r[:, 0] * r[-1])
+        self.W = np.linalg.inv(self.V)
+        self.c, self.b = loop.C_y[0] @ self.V, self.W @ (self.x[-1] - self.rest)
+        self.residues = -self.c * self.b
+        with np.errstate(divide="ignore"):
+            self.logs = np.log(np.abs(self.residues) / window), np.log(np.abs(self.poles))
+        size, rate = self.logs
+        # E is convex: Newton's steps from where one mode alone is in the window go up to it
+        k = float(np.max(-size / rate))
+        for _ in range(NEWTON):
+            alone = np.exp(size + k * rate)
+            rounded = np.hypot(alone, min(ROUNDED, MOST_ROUNDED / len(alone)))
+            self.shares = np.where(alone > NOTHING, alone**2 / rounded, 0.0)  # d ln of each
+            step = float((1.0 - rounded.sum()) / (self.shares @ np.maximum(rate, -1e3)))
+            if abs(step) < 1e-12 * len(r):
+                break
+            k += step
+        self.period, self.k = period, k
+        self.time = period * (len(r) - 1 + k)
+
+    def pulled(self) -> "_Crossing":
+        """With its slopes to the matrices, to the setpoint and to the force ahead."""
+        there = self.shares > 0.0
+        rate = float(self.shares[there] @ self.logs[1][there])
+        scale = -self.period / rate
+        zero = np.zeros_like(self.poles)
+        alpha = scale * np.divide(self.shares, self.residues, out=zero.copy(), where=there)
+        beta = scale * self.k * np.divide(self.shares, self.poles, out=zero.copy(), where=there)
+        gap = self.poles[:, None] - self.poles + np.eye(len(zero))
+        M = -np.outer(self.c, self.b) * (alpha[:, None] - alpha) / gap + np.diag(beta)
+        self.to_A = (self.W.T @ M @ self.V.T).real
+        self.to_C = -(self.V @ (alpha * self.b)).real
+        to_x = -((alpha * self.c) @ self.W).real
+        still = np.linalg.solve(self.still.T, to_x)
+        self.to_A -= np.outer(still, self.rest)
+        driven = np.zeros_like(self.x)
+        driven[0] = to_x
+        later = states(self.loop.A.T, driven)[:0:-1]  # λ_{k+1} of k = 0 ... N - 2
+        x, r, f, n = self.x[:-1], self.r[:-1], self.f[:-1], len(self.plant.A)
+        self.to_A += later.T @ x
+        self.to_B = later.T @ r - still * self.r[-1]
+        self.to_input = later[:, :n].T @ f[:, 0]
+        self.to_r = np.append(later @ self.loop.B_r[:, 0], -still @ self.loop.B_r[:, 0])
+        self.to_f = np.append(later[:, :n] @ self.plant.B[:, 0], 0.0)
+        return self
+
+    def along(self, moved: ClosedLoop, inputs: Array | None = None) -> float:
+        """dt along the imaginary part of a loop, and of its plant's inputs where they move."""
+        found = np.sum(self.to_A * moved.A.imag) + self.to_C @ moved.C_y[0].imag
+        found += self.to_B @ moved.B_r[:, 0].imag
+        if inputs is not None:
+            found += self.to_input @ inputs[:, 0].imag
+        return float(found / STEP)
+
+
+@dataclass(frozen=True)
+class MoveTime:
+    """v of a controller on SISO plants whose rigid bodies are free, with derivatives to κ and θ."""
+
+    plants: tuple[ScaledPlant, ...]
+    structure: Structure
+    hold: Sampling
+    motion: MotionAt
+
+    def at(self, kappa: Array) -> tuple[float, Array]:
+        """ln v (s) at κ in SI, and its gradient; infinite where a loop is unstable."""
+        kappa = np.asarray(kappa, float)
+        found = self._crossings(kappa)
+        if not all(each.stable for each in found):
+            return np.inf, np.full(len(kappa), np.nan)
+        stepped = state_spaces(self.structure, kappa + 1j * STEP * np.eye(len(kappa)))
+        moved = [
+            tustin(StateSpace(*(part[i] for part in stepped)), self.hold.period)
+            for i in range(len(kappa))
+        ]
+        value, weights, _ = self._together(found)
+        gradient = np.zeros(len(kappa))
+        for weight, each in zip(weights, found, strict=True):
+            if weight > NOTHING:
+                back = each.pulled()
+                slopes = [back.along(closed_loop(back.plant, K)) for K in moved]
+                gradient += weight * np.array(slopes)
+        return float(np.log(value)), gradient / value
+
+    def to_theta(self, kappa: Array) -> Array:
+        """∂ ln v/∂θ at a fixed κ."""
+        found, motion, step = self._crossings(np.asarray(kappa, float)), self.motion, 1j * STEP
+        T, tau = self.hold.period, self.hold.delay
+        value, weights, by_duration = self._together(found)
+        K = tustin(state_space(self.structure, kappa), T)
+        gradient = by_duration * motion.slopes(lambda cycle: cycle.profile.durations.sum())
+        signals = [
+            forward_force(item.profile, motion.forward + step * slope, self._time, T)
+            for item, slope in zip(motion.stepped, motion.forward_slopes, strict=True)
+        ]
+        for weight, each, plant in zip(weights, found, self.plants, strict=True):
+            if not weight > NOTHING:
+                continue
+            back, G = each.pulled(), plant.plant_si()
+            for i, (dA, dB, dC) in enumerate(plant.changes_si()):
+                moved = sampled(
+                    StateSpace(G.A + step * dA, G.B + step * dB, G.C + step * dC, G.D), T, tau
+                )
+                r, f = (signal.imag / STEP for signal in signals[i])
+                dt = back.along(closed_loop(moved, K), moved.B)
+                gradient[i] += weight * (dt + back.to_r @ r + back.to_f @ f[:, 0])
+        return np.asarray(gradient / value)
+
+    def times(self, kappa: Array) -> list[float]:
+        """When the envelope of each plant's error crosses the window, s."""
+        return [each.time for each in self._crossings(np.asarray(kappa, float))]
+
+    def shown(self, value: float) -> str:
+        """In ms."""
+        return f"{1e3 * value:.5g} ms of move and settling"
+
+    @cached_property
+    def _sampled(self) -> tuple[StateSpace, ...]:
+        hold = self.hold
+        return tuple(sampled(p.plant_si(), hold.period, hold.delay) for p in self.plants)
+
+    @cached_property
+    def _time(self) -> Array:
+        """Instants until setpoint and force ahead rest, s."""
+        T = self.hold.period
+        return T * np.arange(int(np.ceil(self.motion.cycle.profile.duration / T)) + 2, dtype=float)
+
+    def _crossings(self, kappa: Array) -> list[_Crossing]:
+        T, motion = self.hold.period, self.motion
+        K = tustin(state_space(self.structure, kappa), T)
+        r, f = forward_force(motion.cycle.profile, motion.forward, self._time, T)
+        return [_Crossing(G, K, r, f, motion.motion.window, T) for G in self._sampled]
+
+    def _together(self, found: Sequence[_Crossing]) -> tuple[float, Array, float]:
+        """v, ∂v/∂t_i and ∂v/∂t_0."""
+        t_0 = self.motion.cycle.profile.duration
+        late = np.array([each.time for each in found]) / t_0
+        top = max(1.0, float(late.max()))
+        shares = np.exp(SHARPNESS * (late - top))
+        whole = np.exp(SHARPNESS * (1.0 - top)) + shares.sum()
+        value = t_0 * (top + np.log(whole) / SHARPNESS)
+        weights = shares / whole
+        return float(value), weights, float(value / t_0 - weights @ late)

@@ -1,0 +1,113 @@
+"""[motor] and [move] of a case file: what they may say, and the move in SI."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from ccd_casadi.analysis.motor import UNLIMITED, Motion, Motor
+from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.cases.checks import NOT_NEGATIVE, POSITIVE, key, one_or_more, text
+
+Numbers = float | tuple[float, ...] | None
+OF_A_MOTOR = ("force_constant", "resistance", "peak_current", "moving_mass")
+SHORTEST = 1e-4  # s in which jerk changes, where neither snap nor a sampling rate is given
+
+
+@dataclass(frozen=True)
+class MotorSection:
+    """[motor]: one motor, or a catalogue as lists in rising order of the moving mass."""
+
+    force_constant: float | tuple[float, ...] | None = key(
+        one_or_more, None, says="force per current, a list for a catalogue", unit="N/A"
+    )
+    resistance: float | tuple[float, ...] | None = key(
+        one_or_more, None, says="of the warm coil", unit="ohm"
+    )
+    peak_current: float | tuple[float, ...] | None = key(
+        one_or_more, None, says="the largest for moments; absent: any", unit="A"
+    )
+    moving_mass: float | tuple[float, ...] | None = key(
+        one_or_more, None, says="added to the plant where each force enters", unit="kg"
+    )
+    rms_power: float | None = key(
+        POSITIVE, None, says="heat of all motors together, mean of a cycle, at most", unit="W"
+    )
+    size: str = key(text, "", says="the [theta] that is the moving mass, of any or of a list")
+
+
+@dataclass(frozen=True)
+class MoveSection:
+    """[move]: a setpoint of third or fourth order, made over and over."""
+
+    distance: float | None = key(POSITIVE, None, says="from rest to rest", unit="m")
+    velocity: float | None = key(POSITIVE, None, says="at most", unit="m/s")
+    acceleration: float | None = key(
+        POSITIVE, None, says="of the move; absent: the largest that the motor allows", unit="m/s²"
+    )
+    jerk: float | None = key(POSITIVE, None, says="at most", unit="m/s³")
+    snap: float | None = key(POSITIVE, None, says="at most; absent: jerk/sample", unit="m/s⁴")
+    settle_band: float | None = key(POSITIVE, None, says="of the error, to either side", unit="m")
+    dwell: float = key(NOT_NEGATIVE, 0.0, says="from a move to the next", unit="s")
+
+
+def check_motion(
+    sections: Mapping[str, Any], theta: Mapping[str, Any], fail: Callable[[str, str], Exception]
+) -> None:
+    """Raise where [move] and [motor] do not go together, or with the rest of the case."""
+    move, motor = sections["move"], sections["motor"]
+    given, timed = motor != MotorSection(), sections["inner"].minimise == "move_time"
+    if move == MoveSection():
+        if given or timed:
+            words = 'is missing: [motor] and minimise = "move_time" are about one; add a table'
+            raise fail("move", f"{words} [move]")
+        return
+    for name in ("distance", "velocity", "jerk", "settle_band"):
+        if getattr(move, name) is None:
+            raise fail(f"move.{name}", "is missing; add it")
+    if timed and sections["loop"].rate_hz is None:
+        raise fail("loop.rate_hz", 'is missing: minimise = "move_time" counts samples; add it')
+    if move.acceleration is None and not (motor.peak_current or motor.rms_power):
+        words = "is missing, and neither peak_current nor rms_power of [motor] bounds it"
+        raise fail("move.acceleration", f"{words}; give one of them")
+    if not given:
+        return
+    lists = {name: _listed(getattr(motor, name)) for name in OF_A_MOTOR}
+    for name, values in lists.items():
+        if len(values) != len(lists["force_constant"]) and (values or name == "resistance"):
+            raise fail(f"motor.{name}", "has not as many entries as force_constant; give as many")
+    mass = lists["moving_mass"]
+    least, most = theta.get(motor.size, (0.0, 0.0))
+    if not lists["force_constant"] or (len(lists["force_constant"]) > 1 and not motor.size):
+        words = "force_constant, or of a list the [theta] that chooses, is missing; add it"
+        raise fail("motor", words)
+    if not motor.size:
+        return
+    if not mass or list(mass) != sorted(set(mass)):
+        raise fail("motor.moving_mass", "gives no motor to choose; list them in rising order")
+    if len(mass) > 1 and not mass[0] <= least <= most <= mass[-1]:
+        words = f"reaches beyond the catalogue's moving masses {mass[0]:g} to {mass[-1]:g}"
+        raise fail(f"theta.{motor.size}", f"{words}; narrow it")
+
+
+def motion_problem(move: MoveSection, motor: MotorSection, rate_hz: float | None) -> Motion | None:
+    """The move and its motor in SI; None for a case without a move."""
+    if move == MoveSection():
+        return None
+    given = {item.name: getattr(move, item.name) for item in fields(move)}
+    shortest = SHORTEST if rate_hz is None else 1.0 / rate_hz
+    limits = Limits(
+        given["distance"], given["velocity"], move.acceleration or float("inf"), given["jerk"],
+        move.snap or given["jerk"] / shortest,
+    )  # fmt: skip
+    k, current = _listed(motor.force_constant), _listed(motor.peak_current)
+    made = None if motor == MotorSection() else Motor(
+        k, _listed(motor.resistance), current or (UNLIMITED,) * len(k),
+        _listed(motor.moving_mass) or (0.0,), motor.rms_power, motor.size,
+    )  # fmt: skip
+    return Motion(limits, given["settle_band"], move.dwell, made)
+
+
+def _listed(value: Numbers) -> tuple[float, ...]:
+    if value is None:
+        return ()
+    return tuple(map(float, value)) if isinstance(value, tuple) else (float(value),)

@@ -1,0 +1,264 @@
+"""Motor and move: against analysis, against a simulation of its own, and against differences."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmark_scripts import benchmark
+from case_documents import TWO_MASS
+from differences import slopes
+
+from ccd_casadi.analysis.driven_plant import with_motion
+from ccd_casadi.analysis.motor import STEP, UNLIMITED, Motion, Motor, cycle_of
+from ccd_casadi.analysis.move import simulate
+from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_time import _Crossing
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.inner_problem.figure import MOVE_TIME
+from ccd_casadi.inner_problem.move_figures import motion_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_search import least_from, prepared
+from ccd_casadi.lti.hold import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.plant import (
+    build_plant,
+    constraint_values,
+    hardware_cost,
+    hardware_slopes,
+    mechanics,
+)
+
+moves = benchmark("random_moves")
+EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
+BANG = Limits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
+MOTOR = Motor((30.0,), (4.0,), (10.0,), (2.0,), 50.0)
+
+
+def moving(motor: Motor, limits: Limits = BANG, dwell: float = 0.0) -> Motion:
+    return Motion(limits, 1e-6, dwell, motor=motor)
+
+
+# ---- analysis -----------------------------------------------------------------------------------
+
+
+def test_a_rigid_body_moves_bang_bang() -> None:
+    """T = 2 √(d m/F) at peak force, and P = R (F/k)² without a dwell."""
+    mass, F = 5.0, 300.0
+    found = cycle_of(moving(replace(MOTOR, rms_power=None)), np.array([mass]))
+    assert found.profile.duration == pytest.approx(2.0 * np.sqrt(0.1 * mass / F), rel=1e-4)
+    assert found.peak_force == pytest.approx(F)
+    assert found.rms_force == pytest.approx(F, rel=1e-4)
+    assert found.power == pytest.approx(4.0 * (F / 30.0) ** 2, rel=1e-4)
+    assert "peak force" in found.limits
+    hot = cycle_of(moving(MOTOR), np.array([mass]))
+    a = np.sqrt(50.0 / 4.0) * 30.0 / mass
+    assert hot.profile.duration == pytest.approx(2.0 * np.sqrt(0.1 / a), rel=1e-4)
+    assert hot.power == pytest.approx(50.0, rel=1e-10)
+    assert "heat" in hot.limits
+
+
+def test_a_longer_motor_gives_force_as_the_root_of_mass_and_power() -> None:
+    one, four = (replace(MOTOR, size="m", peak_current=(UNLIMITED,)) for _ in range(2))
+    forces = [
+        cycle_of(moving(motor), np.array([5.0]), mass).rms_force
+        for motor, mass in ((one, 2.0), (four, 8.0))
+    ]
+    assert forces[1] == pytest.approx(2.0 * forces[0], rel=1e-3)
+
+
+def test_one_mode_has_the_residual_vibration_of_a_bang_bang_move() -> None:
+    """(F/k) 4 sin²(ωT/4) once the force has gone, and (1/ζω) ln of it over the window to settle."""
+    mass, omega, zeta = 3.0, 2.0 * np.pi * 40.0, 1e-4
+    A = np.array([[0.0, 1.0], [-(omega**2), -2.0 * zeta * omega]])
+    plant = StateSpace(A, np.array([[0.0], [1.0 / mass]]), np.eye(2)[:1], np.zeros((1, 1)))
+    none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
+    hold = Sampling(50e3)
+    motion = moving(replace(MOTOR, rms_power=None))
+    profile = cycle_of(motion, np.array([mass])).profile
+    forward = np.zeros((5, 1))
+    forward[2] = mass
+    move = simulate(Loop(plant, none, hold), profile, axis=0, forces=forward, window=1e-6,
+                    bandwidth_hz=10.0)  # fmt: skip
+    after = move.time > profile.duration + 1e-4
+    y = move.position[after] - move.error[after]
+    amplitude = profile.acceleration / omega**2 * 4.0 * np.sin(omega * profile.duration / 4.0) ** 2
+    assert np.abs(y[: int(50e3 / 40.0)]).max() == pytest.approx(amplitude, rel=5e-3)
+    T = hold.period
+    count = int(np.ceil(profile.duration / T)) + 2
+    r = np.append(profile.at(np.arange(count - 1) * T)[0], 0.1)
+    f = move.force[:count]
+    found = _Crossing(sampled(plant, T, 0.0), tustin(none, T), r, f, 1e-6, T)
+    expected = profile.duration + np.log(amplitude / 1e-6) / (zeta * omega)
+    assert found.time == pytest.approx(expected, rel=5e-3)
+
+
+# ---- the time of a move -------------------------------------------------------------------------
+
+
+def test_random_moves_settle_at_the_sample_of_another_simulation() -> None:
+    """And the smooth time is none too early; all hundred by benchmarks/random_moves.py."""
+    rng = np.random.default_rng(7)
+    for number in range(6):
+        apart, error, exact, smooth = moves.compared(moves.drawn(rng), number % 2)
+        assert abs(apart) < 0.5
+        assert error < 1e-5  # of the window: 3e-8 was met
+        assert smooth >= exact * (1.0 - 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_its_derivatives(seed: int) -> None:
+    case = moves.drawn(np.random.default_rng(seed))
+    # a narrower window is nearer to the rounding of a position, which differences magnify
+    case = replace(case, motion=replace(case.motion, window=1e-6))
+    goal = case.goal()
+    value, to_kappa = goal.at(case.kappa)
+    assert value >= np.log(goal.motion.cycle.profile.duration)
+    numeric = slopes(lambda kappa: np.array([goal.at(kappa)[0]]), case.kappa, 5e-5)[0]
+    assert to_kappa == pytest.approx(numeric, abs=1e-6)
+    fixed = replace(case.motion.limits, acceleration=5.0)
+    still = replace(case, motion=replace(case.motion, limits=fixed, motor=None))
+    for one, step, known in ((still, 1e-4, 1e-6), (case, 1e-6, 1e-4)):
+        # where the motor sets the acceleration the setpoint's switches pass samples: small kinks
+        slope = one.goal().to_theta(case.kappa) * case.theta
+        numeric = slopes(
+            lambda s, one=one: np.array([one.goal(s * case.theta).at(case.kappa)[0]]),
+            np.ones(2), step,
+        )[0]  # fmt: skip
+        assert slope == pytest.approx(numeric, abs=known)
+    slope = case.at(case.theta).slopes(lambda cycle: cycle.profile.durations.sum()) * case.theta
+    numeric = slopes(
+        lambda s: np.array([case.at(s * case.theta).cycle.profile.duration]), np.ones(2), 1e-3
+    )[0]
+    assert slope == pytest.approx(numeric, abs=1e-6)
+
+
+def test_an_unstable_loop_has_no_time() -> None:
+    case = moves.drawn(np.random.default_rng(0))
+    assert case.goal().at(case.kappa + np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))[0] == np.inf
+
+
+# ---- the plant with its motor -------------------------------------------------------------------
+
+
+def test_the_motor_on_the_plant() -> None:
+    """Its mass where the force enters, its limits as λ(θ); all slopes."""
+    motor = replace(MOTOR, size="m")
+    limits = replace(BANG, acceleration=20.0, jerk=1e3, snap=1e5)
+    motion = moving(motor, limits, 0.1)
+    plant = build_plant(moves.axis, moves.NAMES, {})
+    names = ("carriage", "m", "stiffness")
+    driven, theta = with_motion(plant, motion, names, {}), np.array([4.0, 2.5, 1e6])
+    M = mechanics(driven, theta).M
+    assert np.diag(M) == pytest.approx([6.5, 3.0])
+    assert driven.constraint_names == ("peak force", "motor power")
+    values = constraint_values(driven, theta)
+    mass, k = 9.5, 30.0 * 2.5 / 2.0
+    assert values[0] == pytest.approx(mass * 20.0 / (10.0 * k) - 1.0, rel=1e-9)
+    assert hardware_cost(driven, theta) == pytest.approx(4.0)
+    df, dlam = hardware_slopes(driven, theta)
+    for row, f in zip((df, *dlam), (
+        lambda s: hardware_cost(driven, s * theta), *(
+            lambda s, i=i: constraint_values(driven, s * theta)[i] for i in range(2)
+        )), strict=True):  # fmt: skip
+        numeric = slopes(lambda s, f=f: np.array([f(s)]), np.ones(3), 1e-4)[0]
+        assert row * theta == pytest.approx(numeric, abs=1e-7)
+    dM = mechanics(driven, theta).derivatives[0]
+    numeric = slopes(lambda s: mechanics(driven, s * theta).M.ravel(), np.ones(3), 1e-3)
+    assert (dM.reshape(3, -1).T * theta) == pytest.approx(numeric, abs=1e-9)
+
+
+def test_a_catalogue_is_met_at_its_motors() -> None:
+    motor = Motor((20.0, 34.0), (3.0, 5.0), (9.0, 9.0), (0.4, 0.6), 50.0, "m")
+    assert motor.at(0.4) == pytest.approx((20.0, 3.0, 9.0))
+    assert motor.at(0.6) == pytest.approx((34.0, 5.0, 9.0))
+    k, _, _ = motor.at(0.5 + 1j * STEP)
+    assert (k.real, k.imag / STEP) == pytest.approx((27.0, 70.0))
+
+
+# ---- as a figure of the inner problem -----------------------------------------------------------
+
+
+def small() -> CoDesignProblem:
+    """The example with one plant beside the model's, and a PID."""
+    problem = problem_of(load_case(EXAMPLE))
+    sections = sections_of_problem(problem)
+    structure = replace(sections.structure, biquads=1)
+    uncertainty = replace(sections.uncertainty, resonance_shift=0.0)
+    few = replace(sections, structure=structure, uncertainty=uncertainty, starts=2)
+    return replace(problem, controller=few, start=(0.015, 0.8))
+
+
+def test_the_example_is_a_case_of_move_time() -> None:
+    problem = small()
+    assert problem.figure is MOVE_TIME
+    motion = motion_of(problem, problem.start)
+    forces = motion.forward[2]
+    own = mechanics(plant_of(problem), problem.start)
+    assert forces[0] == pytest.approx(own.M.sum(), rel=1e-6)  # the mass, the motor's in it
+    assert {"peak force", "heat"} & set(motion.cycle.limits)
+    own = problem.source.motion
+    assert own is not None
+    assert own.motor is not None
+    cooler = replace(own, motor=replace(own.motor, rms_power=1.0))
+    lighter = replace(problem.source, motion=cooler)
+    assert replace(problem, source=lighter).identity() != problem.identity()
+
+
+@pytest.mark.slow
+def test_the_envelope_gradient_is_the_slope_of_the_least_time() -> None:
+    problem, made = prepared(small())
+    problem, made = least_from(problem, problem.start, made)
+    assert made.certified
+    theta = np.array([0.0155, 0.85])
+    value = sections_value(problem, theta)
+    assert value.feasible
+    for i, h in enumerate((2e-6, 1e-4)):
+        ends = [sections_value(problem, theta + sign * h * np.eye(2)[i]) for sign in (1.0, -1.0)]
+        numeric = (ends[0].value - ends[1].value) / (2.0 * h)
+        assert value.gradient[i] == pytest.approx(numeric, rel=5e-3)
+
+
+MOTOR_OF = "[motor]\nforce_constant = {}\nresistance = {}\nrms_power = 5.0\n"
+MOVE = "[move]\ndistance = 0.01\nvelocity = 0.2\njerk = 1e3\nsettle_band = 1e-7\n"
+SECTIONS = '[controller]\nstructure = "sections"\n'
+
+
+@pytest.mark.parametrize(
+    ("inner", "added", "words"),
+    [
+        ('minimise = "move_time"', SECTIONS, "move: is missing"),
+        ("", "[motor]\nforce_constant = 20.0\n", "move: is missing"),
+        ("", "[move]\ndistance = 0.01\n", "move.velocity: is missing"),
+        ("", MOVE, "move.acceleration: is missing"),
+        ('minimise = "move_time"', SECTIONS + MOVE + "acceleration = 2.0\n", "loop.rate_hz"),
+        ("", MOVE + "acceleration = 2.0\n[motor]\nforce_constant = 20.0\n", "motor.resistance"),
+        ("", MOVE + MOTOR_OF.format([2.0, 3.0], [1.0, 2.0]), "motor: force_constant, or of a list"),
+        ("", MOVE + MOTOR_OF.format(2.0, 1.0) + 'size = "m"', "theta.m: is missing"),
+        ("", MOVE + MOTOR_OF.format(2.0, [1.0, 2.0]), "motor.resistance: has not as many"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_the_case(tmp_path: Path, inner: str, added: str, words: str) -> None:
+    path = tmp_path / "case.toml"
+    text = TWO_MASS.read_text().replace("[inner]", f"[inner]\n{inner}")
+    path.write_text(text.replace("w2 = -0.9950", "w2 = 1.0") if inner else text)
+    path.write_text(path.read_text() + "\n" + added)
+    with pytest.raises(CaseError) as caught:
+        load_case(path)
+    assert words in str(caught.value)
+
+
+def test_a_required_acceleration_binds_any_kind_of_controller(tmp_path: Path) -> None:
+    path = tmp_path / "case.toml"
+    motor = "[motor]\nforce_constant = 20.0\nresistance = 2.0\npeak_current = 12.0\n"
+    path.write_text(f"{TWO_MASS.read_text()}\n{MOVE}acceleration = 2.0\n{motor}")
+    problem = problem_of(load_case(path))
+    plant = plant_of(problem)
+    assert plant.constraint_names == ("peak force",)
+    masses = np.array([57.0, 61.0])
+    assert constraint_values(plant, masses)[0] == pytest.approx(118.0 * 2.0 / 240.0 - 1.0, rel=1e-6)
+    assert hardware_slopes(plant, masses)[1][0] == pytest.approx([2.0 / 240.0] * 2, rel=1e-6)

@@ -1,0 +1,153 @@
+"""The proof for several channels and many modes: discs hold, and what fails is not proven."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixed_structure_loops import BOUNDS, LATE, WEIGHTS
+from helpers import HZ, SUSPENSION
+
+from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, certify
+from ccd_casadi.fixed_structure.affine import Affine
+from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
+from ccd_casadi.fixed_structure.decoupling import given_decoupling
+from ccd_casadi.fixed_structure.enclosure import Boxes, Chart
+from ccd_casadi.fixed_structure.mode_discs import ChannelFamily, quotient
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.plants.plant import Mechanics
+
+# two carts of two masses, a weak spring and unlike places of drive and reading between them
+STIFFNESS = 7e7 * np.array(
+    [
+        [1.0, -1.0, 0.0, 0.0],
+        [-1.0, 1.0005, 0.0, -0.0005],
+        [0.0, 0.0, 0.8, -0.8],
+        [0.0, -0.0005, -0.8, 0.8005],
+    ]
+)
+NONE = [np.zeros((0, *shape)) for shape in ((4, 4), (4, 4), (4, 4), (4, 2), (2, 4))]
+DRIVE = np.array([[1.0, 0.0], [0.1, 0.0], [0.0, 1.0], [0.0, 0.1]])
+READING = np.array([[1.0, 0.0, 0.1, 0.0], [0.0, 0.0, 1.0, 0.05]])
+CARTS = Mechanics(
+    55.0 * np.eye(4), np.zeros((4, 4)), STIFFNESS, DRIVE, READING, 0.01, tuple(NONE)
+)  # fmt: skip
+BOX = UncertainPlant(
+    (CARTS,), SUSPENSION, WEIGHTS.M_K, mode_shift=0.02, damping=(0.5, 2.0), gain=0.02
+)
+ONE = Structure(biquads=1)
+BOTH = ChannelStructure(
+    given_decoupling(("a", "b"), np.eye(2).tolist(), np.eye(2).tolist()), (ONE, ONE)
+)
+KAPPA = np.tile(np.log(
+    [1e5, 0.5 * HZ, 3.0 * HZ, 60.0 * HZ, 250.0 * HZ, 0.3, 250.0 * HZ, 0.8, 300.0 * HZ, 0.7]
+), 2)  # fmt: skip
+BARE = Bounds(S_max=10.0, S_low=1.0, omega_low=0.5 * HZ)
+
+
+def peak(points: list, sampling: Sampling | None, kappa: np.ndarray = KAPPA) -> float:
+    """The judge's largest |S| of these plants; infinite where one is unstable."""
+    found = certify(BOX.plants(points), BOTH.state_space(kappa), BARE, sampling).plants
+    return max(one.S_peak if one.stable else np.inf for one in found)
+
+
+def drawn(count: int) -> list:
+    """Random points of the box, half of them with every parameter at an end."""
+    rng = np.random.default_rng(3)
+    share = rng.random((count, len(BOX.names)))
+    share[::2] = np.round(share[::2])
+    return [(0, point) for point in BOX.box[0] + share * (BOX.box[1] - BOX.box[0])]
+
+
+@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
+def test_what_random_plants_show_is_below_what_is_proven_and_close(sampling) -> None:
+    seen = peak(drawn(40), sampling)
+    proof = prove(BOX, BOTH, KAPPA, 1.0, replace(BARE, S_max=seen), sampling)
+    assert len(proof.parameters) > 4
+    assert proof.proven, proof.words
+    assert 1.0 <= proof.levels["S_MAX"] <= 1.05
+
+
+def test_a_bound_that_a_plant_exceeds_is_refuted_at_such_a_plant() -> None:
+    bounds = replace(BARE, S_max=0.98 * peak(drawn(1), LATE))
+    proof = prove(BOX, BOTH, KAPPA, 1.0, bounds, LATE, slack=1e-3)
+    assert proof.outcome is ProofOutcome.REFUTED
+    assert proof.passed[0] == "S_MAX"
+    own = peak([(0, np.array(proof.point))], LATE)
+    assert own >= proof.passed[1] * bounds.S_max * (1.0 - 1e-9)
+
+
+def test_an_unstable_plant_of_the_box_is_never_proven() -> None:
+    """With a gain at which the model is stable and a plant of the box is not: no bound helps."""
+    for factor in np.geomspace(2.0, 100.0, 20):
+        hot = KAPPA + np.log(factor) * (np.arange(len(KAPPA)) % len(ONE.names) == 0)
+        stable = [np.isfinite(peak([one], LATE, hot)) for one in ((0, BOX.nominal), *drawn(10))]
+        if not all(stable):
+            break
+    assert stable[0]
+    proof = prove(BOX, BOTH, hot, 0.1, replace(BARE, S_max=1e3), LATE, most_boxes=30_000)
+    assert not proof.stable
+
+
+@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
+@pytest.mark.parametrize("integrator", [True, False])
+def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
+    """|S| at random points of random boxes lies between what is said of the box."""
+    rng, count, unit = np.random.default_rng(5), 60, 4000.0
+    own = replace(ONE, integrator=integrator)
+    part = KAPPA[: len(ONE.names)] if integrator else np.delete(KAPPA[: len(ONE.names)], 1)
+    structure = replace(BOTH, structures=(own, own))
+    kappa = np.tile(part, 2)
+    K = structure.state_space(kappa)
+    plant = modal_sum(BOX, 0, unit)
+    assert plant is not None
+    parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
+    period, delay = (sampling.period * unit, sampling.delay * unit) if sampling else (None, 0.0)
+    family = ChannelFamily(plant, BOX.names, *parts[0], replace(BOUNDS, shape=None), 1.0, unit,
+                           period, delay, parts, np.eye(2), np.eye(2))  # fmt: skip
+    middle = np.vstack([np.exp(rng.uniform(*np.log([1.0, 2500.0]), count)),
+                        BOX.box[0][:, None] + rng.random((len(BOX.names), count))
+                        * (BOX.box[1] - BOX.box[0])[:, None]])  # fmt: skip
+    wide = np.concatenate([[1.0], BOX.box[1] - BOX.box[0]])[:, None]
+    half = 0.5 * wide * 10.0 ** rng.uniform(-6.0, 0.0, (len(wide), count))
+    half[0] = middle[0] * 10.0 ** rng.uniform(-6.0, -2.0, count)
+    low, high = middle - half, middle + half
+    low[1:] = np.maximum(low[1:], BOX.box[0][:, None])
+    high[1:] = np.minimum(high[1:], BOX.box[1][:, None])
+    scale = np.ones((len(low), 1))
+    scale[0] = (period or 1.0) / unit
+    chart = np.full(count, Chart.LOW if sampling is None else Chart.SAMPLED)
+    found = family.enclose(Boxes(chart, low * scale, high * scale))
+    k = found.names.index("S_MAX")
+    assert found.bounded.mean() > 0.5
+    for i in range(count):
+        for _ in range(3):
+            share = rng.random(len(low)) if rng.random() < 0.5 else rng.integers(0, 2, len(low))
+            at = low[:, i] + share * (high[:, i] - low[:, i])
+            loop = Loop(BOX.plant(at[1:]).plant_si(), K, sampling)
+            S = np.linalg.norm(loop.sensitivity(at[:1])[0], 2) / BOUNDS.S_max
+            assert found.somewhere[k, i] * (1.0 - 1e-9) <= S <= found.highest[k, i] * (1.0 + 1e-9)
+    small = (half / wide).max(axis=0) < 1e-3
+    spread = found.highest[k] / np.maximum(found.somewhere[k], 1e-9)
+    assert not small.any() or np.median(spread[small]) < 1.5
+
+
+def test_a_disc_holds_a_quotient_even_where_its_denominator_may_be_nought() -> None:
+    rng, count = np.random.default_rng(7), 400
+    wild = rng.normal(size=(3, count)) + 1j * rng.normal(size=(3, count))
+    D = Affine(
+        0.02 + 0.01j * rng.normal(size=count),
+        0.01 * (rng.normal(size=(3, count)) * 1j),
+        np.zeros(count),
+    )
+    N = Affine(1.0 + 0.1j * np.ones(count), 0.05 * wild, np.zeros(count))
+    centre, radius, _ = quotient(N, D)
+    assert np.isfinite(radius).all()
+    for _ in range(200):
+        t = (
+            np.sign(rng.normal(size=(3, count)))
+            if rng.random() < 0.5
+            else rng.uniform(-1, 1, (3, count))
+        )
+        value = (N.centre + (N.slope * t).sum(0)) / (D.centre + (D.slope * t).sum(0))
+        assert (np.abs(value - centre) <= radius * (1.0 + 1e-9)).all()
