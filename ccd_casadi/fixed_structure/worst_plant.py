@@ -55,7 +55,7 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
         found += [
             (option, np.where(np.arange(n) == row, value, corner))
             for option, corner in uncertain.corners()
-            for value in np.linspace(*box[:, row], ALONG)
+            for value in np.linspace(box[0, row], box[1, row], ALONG)
         ]
     if n == 0:
         return found
