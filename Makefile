@@ -62,11 +62,18 @@ bench: setup-test
 	$(BIN)/python benchmarks/synthesis.py
 
 # What runs offline beside other people's tools and designs; see docs/development/peers.md.
+# DRIVE and MIRROR are checkouts of the two repositories that are read, if there are any.
 peers: setup-test
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/back_ends.py 10 10
 	$(BIN)/python benchmarks/disk_drive.py
 	$(BIN)/python benchmarks/guided_beam.py
+	$(BIN)/python benchmarks/mathworks.py
+	$(BIN)/python benchmarks/stage_judge.py
+	$(BIN)/python benchmarks/mirror_held_out.py
+	test -z "$(DRIVE)" || $(BIN)/python benchmarks/drive_error.py --theirs $(DRIVE)
+	test -z "$(MIRROR)" || $(BIN)/python benchmarks/mirror_held_out.py --theirs $(MIRROR)
+	$(BIN)/python benchmarks/peer_table.py
 
 setup: $(VENV)/.ready
 setup-test: $(VENV)/.ready-test

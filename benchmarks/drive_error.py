@@ -1,19 +1,16 @@
 """The position error of the dual-stage disk drive, by PyHDDBenchmark's own simulation.
 
-    python benchmarks/drive_error.py --theirs DIR [--unchanged CASE]
+    python benchmarks/drive_error.py --theirs DIR
 
 DIR is a checkout of github.com/liuzd1997/PyHDDBenchmark. Its `function_simulation.py` takes minutes
 a case; the same recursion, compiled here, takes a fifth of a second and gives the nine figures that
 the benchmark publishes for its own controllers (13.51 to 14.54 %) to all their digits. It is run on
 those and on what benchmarks/disk_drive.json holds: 3σ of the head in per cent of the track's
-52.697 nm, and the largest stroke of the piezo. `--unchanged` runs the benchmark's own function on
-one of its nine cases with the controllers of the least error, as a check.
+52.697 nm, and the largest stroke of the piezo.
 """
 
 import argparse
 import json
-import os
-import sys
 from pathlib import Path
 
 import disk_drive as judge
@@ -118,37 +115,13 @@ def simulated(branches: list[judge.Branch], case: tuple, given: tuple) -> tuple[
     return 300.0 * float(head[part].std()) / TRACK, 1e9 * float(np.abs(stroke[part]).max())
 
 
-def unchanged(folder: Path, branches: list[judge.Branch], case: int) -> tuple[float, float]:
-    """The same by the benchmark's own function."""
-    import control
-
-    os.chdir(folder)
-    del sys.modules["plant"]  # the example's, of the same name
-    sys.path.insert(0, str(folder))
-    import function_simulation
-    import plant
-
-    ways = [control.ss(*one.controller, judge.T) for one in branches]
-    wire = control.ss([[0.0]], [[0.0]], [[0.0]], [[1.0]], judge.T / 2)
-    found = function_simulation.Function_simulation(
-        getattr(plant, f"Sys_Pc_vcm_c{case}"), getattr(plant, f"Sys_Pc_pzt_c{case}"),
-        ways[0], wire, ways[1], wire, plant.Ts, plant.Mr_f, case,
-    )  # fmt: skip
-    return 300.0 * float(np.std(found["yc"])) / TRACK, 1e9 * float(np.abs(found["yc_pzt"]).max())
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--theirs", type=Path, required=True)
-    parser.add_argument("--unchanged", type=int, choices=range(1, 10))
     given = parser.parse_args()
     sections = json.loads(judge.RESULTS.read_text())["sections"]
     sets = {judge.THEIRS: judge.theirs(given.theirs)}
     sets |= {name: judge.ours(own) for name, own in sections.items()}
-    if given.unchanged:
-        error, stroke = unchanged(given.theirs.resolve(), sets["least error"], given.unchanged)
-        print(f"case {given.unchanged}, its own function: {error:.3f} %, {stroke:.2f} nm")
-        return
     noise = disturbances(given.theirs)
     worst = {}
     for name, branches in sets.items():

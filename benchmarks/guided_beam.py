@@ -17,6 +17,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from peer_table import keep
 from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
@@ -83,6 +84,7 @@ def main(beams: list[tuple[float, float]]) -> None:
     print(
         "guide mm  tip mm   mass kg   |  rule: w Hz    -3 dB Hz  max|S| | free PID: -3 dB  max|S|"
     )
+    rows = []
     for guide, tip in beams:
         plant = scaled_plant(problem, (guide, tip))
         G, mass = plant.plant_si(), 2700.0 * 0.3 * 0.3 * 0.5 * (guide + tip)
@@ -110,6 +112,9 @@ def main(beams: list[tuple[float, float]]) -> None:
         assert stable
         print(f"{1e3 * guide:8.1f} {1e3 * tip:7.1f} {mass:9.2f}   | {low / HZ:12.2f} {width:10.2f} "
               f"{peak:8.4f} | {own_width:18.2f} {own_peak:8.4f}", flush=True)  # fmt: skip
+        what = f"{1e3 * guide:.0f}, {1e3 * tip:.0f} mm: -3 dB of S at \\|1 + L\\| >= 0.5"
+        rows.append([what, f"{width:.1f} Hz (their PID's rule)", f"{own_width:.1f} Hz"])
+    keep("guided beam", rows)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import ccd_casadi as ccd
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.least_error import RmsError
+from ccd_casadi.fixed_structure.least_value import RmsError
 from ccd_casadi.fixed_structure.local_search import LoopModel, descend
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.state_space import StateSpace
@@ -87,7 +87,7 @@ def of_beam(draws: int) -> list[list[str]]:
     problem = problem_for(plants, structure, bounds, None, (0.1, 5000.0))
     budget = ErrorBudget((Source("d", Kind.FORCE, ShapedSpectrum(2.0)),
                           Source("n", Kind.SENSOR_NOISE, ShapedSpectrum(2.0 * NOISE))))  # fmt: skip
-    goal = RmsError((nominal, *corners[:4]), structure, budget, None)
+    goal = RmsError(tuple(plants[:5]), structure, budget, None)
     w0, force = problem.plants.omega_0, problem.plants.force
     model = LoopModel(problem, lambda k: goal.at(structure.in_units(k, w0, force)), 1e-6, -9.0)
     pool = rng.uniform(*problem.box, (1500, len(problem.box[0])))

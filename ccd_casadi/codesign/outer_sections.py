@@ -280,16 +280,17 @@ def with_members(sampler: Sampler, kappa: Array, members: Sequence[Member]) -> S
 
 
 def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
-    """`together` again with the worst plants of its end, until there are none that are worse."""
+    """`together` again with the worst plants of its end, until it settles and none is worse."""
     for turn in range(ROUNDS):
-        sampler, best = together(sampler, theta)
+        sampler, best, settled = together(sampler, theta)
         if not best.feasible:
             break
         design, tell = value_at(sampler, best.theta).design, teller("on the way", sampler.quiet)
         members = worst_members(sampler.problem, best.theta, design, turn, tell)[1]
-        if not members:
+        if settled and not members:
             break
-        sampler, theta = with_members(sampler, design.kappa, members), np.array(best.theta)
+        theta = np.array(best.theta)
+        sampler = with_members(sampler, design.kappa, members) if members else sampler
     return sampler, best
 
 

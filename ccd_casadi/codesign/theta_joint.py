@@ -39,7 +39,7 @@ from ccd_casadi.support.arrays import Array
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
-CYCLES = 20  # sets of plants at most
+CYCLES = 6  # times at most that the plants are made anew before worse ones are looked for
 STEPS = 40  # of a search
 FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-6  # of w2 ω_b
@@ -57,18 +57,18 @@ class Proposal:
     gain: float
 
 
-def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
-    """From θ to where the joint search promises no more: the sampler of the problem whose anchor
-    is the controller there, and its true sample."""
+def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample, bool]:
+    """From θ towards where the joint search promises no more: the sampler of the problem whose
+    anchor is the controller there, its true sample, and whether no more is promised."""
     best = sampler.bandwidths(theta, "polishing")[0]
     J, reach = objective_of(sampler.problem, best), REACH
     for _ in range(CYCLES):
         if not np.isfinite(J) or reach < LEAST:
-            break
+            return sampler, best, True
         make = partial(proposed, sampler.problem, best, reach)
         found = sampler.kept("together", (*best.theta, reach), Proposal, make)
         if found.gain <= SETTLED * abs(J):
-            break
+            return sampler, best, True
         other = sampler.of(with_sections(sampler.problem, anchors=(found.kappa,)))
         sample = other.bandwidths(np.array(found.theta), "polishing")[0]
         gained = J - objective_of(other.problem, sample)
@@ -78,7 +78,7 @@ def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    return sampler, best
+    return sampler, best, False
 
 
 def proposed(problem: CoDesignProblem, sample: BandwidthSample, reach: float) -> Proposal:
