@@ -7,7 +7,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test tests test-room test-processors lint docs bench peers setup setup-test clean
+.PHONY: solve test tests test-fast test-room test-pythons test-processors lint docs bench peers setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
@@ -20,13 +20,9 @@ tests: setup-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 	$(BIN)/python benchmarks/processors.py --other
 
-# The room that one works in: `make test-room ROOM=kernels`, under a minute each.
-test-room: setup-test
-	$(BIN)/python -m pytest -n 2 --dist worksteal tests/$(ROOM)
-
-# The room that one works in, a folder of tests/: `make test-fast ROOM=pages`.
-ROOM ?= synthesis
-test-fast: setup-test
+# The room that one works in, a folder of tests/: `make test-fast ROOM=kernels`, under a minute each.
+ROOM ?= kernels
+test-fast test-room: setup-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal tests/$(ROOM)
 
 # The same with each Python that the package claims and that is found, in an environment of its own.

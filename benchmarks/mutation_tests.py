@@ -31,8 +31,16 @@ def _tests(*names: str) -> tuple[str, ...]:
 
 
 DESIGN_TESTS = _tests(
-    "weights", "kernel_parts", "loop_gains", "gamma_search", "gamma_error", "certificate",
-    "balance", "synthesis", "sensitivity", "channels",
+    "weights",
+    "kernel_parts",
+    "loop_gains",
+    "gamma_search",
+    "gamma_error",
+    "certificate",
+    "balance",
+    "synthesis",
+    "sensitivity",
+    "channels",
 )
 DIFFERENCES = "two_mass_plant or both_limits or both_sides_agree"  # many syntheses each
 GROUPS = (

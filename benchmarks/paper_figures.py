@@ -118,9 +118,7 @@ def _against(label: str, ours: float, paper: float) -> tuple[str, str, str, str]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "case", nargs="?", type=Path, default=ROOT / "runs" / "two_mass_paper.toml"
-    )
+    parser.add_argument("case", nargs="?", type=Path, default=ROOT / "runs" / "two_mass_paper.toml")
     parser.add_argument("--out", type=Path, default=Path("paper_figures.html"))
     given = parser.parse_args()
     found = sections(problem_of(load_case(given.case)), TWO_MASS)

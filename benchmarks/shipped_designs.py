@@ -64,8 +64,6 @@ def off_centre() -> str:
     return text + '\n[robust]\nplants = ["plants/off_centre.toml"]\n'
 
 
-
-
 def shipped() -> dict[str, tuple[str, Path | None, str]]:
     """θ as `inner` takes it, the folder that the case's files are in (None: a page), its text."""
     runs, examples = ROOT / "runs", ROOT / "examples"

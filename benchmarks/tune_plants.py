@@ -78,7 +78,9 @@ PLANTS = {
     "stage, modes collocated": (modes(FREE, (120.0, 0.01, 0.02), (400.0, 0.01, 0.02)), 5e3, 2e-4),
     "stage, mode non-collocated": (modes(FREE, (150.0, 0.02, -0.05)), 5e3, 2e-4),
     "stage, set of three": (
-        [modes(FREE, (f, 0.01, 0.02)) for f in (110.0, 120.0, 130.0)], 5e3, 2e-4
+        [modes(FREE, (f, 0.01, 0.02)) for f in (110.0, 120.0, 130.0)],
+        5e3,
+        2e-4,
     ),
     "MathWorks positioning": (positioning(), 2e3, 5e-4),
     "MathWorks flexible beam": (beam(), 5e3, 0.0),

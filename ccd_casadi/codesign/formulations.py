@@ -22,10 +22,15 @@ def formulation_of(case: Case, name: str) -> Formulation:
 
 
 def usual_name(case: Case, parameters: int) -> str:
-    """The formulation where the user names none: nested, or direct where nested has no end."""
+    """The formulation where the user names none: nested, or direct where nested has no end.
+
+    With sections `direct_starts = 1` says that each θ is dear: none is sampled.
+    """
     listed = any(len(one.values) > 1 for one in case.theta)
-    sampled_anew = listed and case.controller.structure == "sections"
-    slow = sampled_anew or slow_words(formulation_of(case, "nested"), parameters)
+    dear = listed or case.outer.direct_starts == 1
+    slow = (dear and case.controller.structure == "sections") or slow_words(
+        formulation_of(case, "nested"), parameters
+    )
     return "direct" if slow else "nested"
 
 

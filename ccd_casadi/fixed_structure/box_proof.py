@@ -27,6 +27,7 @@ SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
 SLACK_OF_MANY = 0.05  # of discs of modes
 FEW_PARAMETERS = 4
 MOST_BOXES = 500_000  # some twenty seconds
+MOST_OF_MANY = 250_000  # of each option
 AT_ONCE = 20_000
 ABOVE = 3.0  # times ω_b and the fastest pole: from there on frequencies are counted by 1/ω
 DECADES = 6.0  # of frequency cells at the start, downwards; below is one cell to 0
@@ -104,7 +105,7 @@ def prove(
     sampling: Sampling | None = None,
     *,
     slack: float | None = None,
-    most_boxes: int = MOST_BOXES,
+    most_boxes: int | None = None,
 ) -> Proof:
     """Bounds and stability of the SI controller κ with ω_b (rad/s) on the whole box.
 
@@ -148,7 +149,9 @@ def prove(
         given = (plant, names, *parts[0], bounds, bandwidth, unit, period, delay)
         family = ChannelFamily(*given, parts, outputs, inputs) if many else LoopFamily(*given)
         boxes = _first(family, uncertain.box)
-        share = most_boxes // len(models)
+        share = (most_boxes or MOST_BOXES) // len(models)
+        if many and most_boxes is None:
+            share = MOST_OF_MANY
         spent = 0
         while len(boxes.chart):
             again: list[Boxes] = []

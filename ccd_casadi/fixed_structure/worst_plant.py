@@ -29,6 +29,7 @@ from ccd_casadi.support.arrays import Array
 WITHIN = 1e-4  # ln: by how much a plant of the box may pass a bound and count as within
 UNSTABLE = 10.0  # ln: what an unstable loop counts as
 LATTICE = 200  # plants, evenly over the box
+ALONG = 61  # plants along each theta that varies, at every corner of the rest
 SEARCHES = 6
 ROUNDS = 7  # of a compass search, its step halved each time
 FEW = 4  # parameters up to which every one is moved on its own
@@ -50,6 +51,12 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
     """About `count` points over the box of every option, its corners among them."""
     box, n = uncertain.box, len(uncertain.names)
     found = uncertain.corners()
+    for row in range(n - len(uncertain.ranges), n):  # along a stroke what is worst comes and goes
+        found += [
+            (option, np.where(np.arange(n) == row, value, corner))
+            for option, corner in uncertain.corners()
+            for value in np.linspace(box[0, row], box[1, row], ALONG)
+        ]
     if n == 0:
         return found
     if n == 1:

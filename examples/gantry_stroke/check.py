@@ -90,7 +90,8 @@ def main(folder: Path) -> int:
     Ad = inverse @ (2.0 / T * eye + K["A"])
     Bd, Cd = (eye + Ad) @ inverse @ K["B"], K["C"]
     Dd = K["D"] + K["C"] @ inverse @ K["B"]
-    plate = beam(result["theta"]["h"], result["theta"]["wall"])
+    found = result["theta"] | result["fixed"]
+    plate = beam(found["h"], found["wall"])
     ends = case["theta"]["at"]["lower"], case["theta"]["at"]["upper"]
     least = (np.inf, 0.0)
     worst = dict.fromkeys(("S_max", "S_low", "shape", "largest |z|", "GS"), (0.0, 0.0))

@@ -9,6 +9,7 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.formulations import usual_name
 from ccd_casadi.codesign.theta_joint import JointModel, proposed, together
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
@@ -107,3 +108,12 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         again = together(Sampler(problem, store, Workers(1)), np.array(problem.start))[1]
         assert (again.theta, again.kappa) == (best.theta, best.kappa)  # all from the store
         assert last.spent.total == spent
+
+
+def test_where_each_theta_is_dear_none_is_sampled() -> None:
+    runs = ROOT / "runs"
+    chosen = {name: usual_name(load_case(runs / f"{name}.toml"), 6)
+              for name in ("rib_stage_built", "two_mass_built", "rib_stage")}  # fmt: skip
+    assert chosen == {
+        "rib_stage_built": "direct", "two_mass_built": "nested", "rib_stage": "nested"
+    }  # fmt: skip
