@@ -77,7 +77,7 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         raise PlantError(f"places.axes, quiet and damped {words}; add some, or drop a mode")
     between, own = Between(nodes), [list(names).index(name) for name in plant.names]
     points = Points(places.actuators, names), Points(places.sensors, names)
-    for group in points:
+    for group in points if places.sensors else points[:1]:
         still, slack = ~group.slope.any(axis=2), 1e-9 * np.ptp(nodes, axis=0)
         beyond = np.clip(group.constant, nodes.min(axis=0) - slack, nodes.max(axis=0) + slack)
         if (still & (beyond != group.constant)).any():
