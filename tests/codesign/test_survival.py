@@ -295,7 +295,7 @@ def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: boo
             problem(), inner=replace(problem().inner, S_max=S_max), suspension=SUSPENSION
         ),
         controller=loops.run,
-        sampled=sampling,
+        sampling=sampling,
     )
     good = perturbed.Judged((0.0,), True, 1.0, 1.0, -1.0)
     with mock.patch.object(perturbed, "judge", return_value=good):

@@ -51,7 +51,7 @@ class _Text(HTMLParser):
 
 
 def shown(item: Shown) -> str:
-    return _Text(item._repr_html_()).text
+    return _Text(item._repr_html_()).text.replace("\u00a0", " ")  # a unit stays with its number
 
 
 @pytest.fixture(scope="module")

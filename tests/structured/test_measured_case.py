@@ -61,7 +61,7 @@ def test_inner_designs_on_the_lines(
     assert figures.S_peak <= 2.0
     assert figures.bandwidth == pytest.approx(HZ * answer["bandwidth_hz"], rel=1e-6)
     # the page's data: |S| on the lines that it shows, none above the peak that the judge found
-    shown = (tmp_path / "run" / "report.html").read_text()
+    shown = (tmp_path / "run" / "report.html").read_text().replace("\u00a0", " ")
     assert escape(answer["words"]) in shown
     assert ("sampled at 10000 Hz" in shown) == sampled
     data = re.findall(r"<tr>((?:<td[^>]*>[^<]*</td>){7})</tr>", shown)
