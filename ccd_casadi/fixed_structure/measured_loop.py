@@ -37,6 +37,7 @@ GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above whi
 SAFETY = 2.0  # on the error of interpolation
 LARGE, SMALL = 2.0, 0.5  # gains of L at the first line at least, at the last at most
 HIDDEN = 0.05  # of GK beside a resonance narrower than the lines, between which it may reach 1
+LEAST_DAMPING = 5e-4  # of a resonance: lines closer than its width 2 ζ f cannot hide it
 BETWEEN = np.linspace(0.0, 1.0, 9)  # places on a chord
 
 
@@ -233,7 +234,8 @@ def winding(
     if np.linalg.norm(own[-1], 2) > SMALL:
         doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small")
     own = np.einsum("kii->ki", own)
-    falls = np.angle(own[1:] / own[:-1]) < -0.5 * np.pi
+    wide = np.diff(hz) > 2.0 * LEAST_DAMPING * hz[1:]
+    falls = (np.angle(own[1:] / own[:-1]) < -0.5 * np.pi) & wide[:, None]
     hidden = np.flatnonzero((falls & (np.abs(own[1:]) > HIDDEN)).any(axis=1))
     if len(hidden):
         where = f"between {hz[hidden[0]]:.4g} and {hz[hidden[0] + 1]:.4g} Hz"

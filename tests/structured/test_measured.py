@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.measured import (
     read_frequency_response,
 )
 from ccd_casadi.fixed_structure.measured_design import design_on_data
-from ccd_casadi.fixed_structure.measured_loop import judge
+from ccd_casadi.fixed_structure.measured_loop import judge, winding
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.state_space import StateSpace
@@ -112,6 +112,18 @@ def test_a_resonance_narrower_than_the_lines_is_not_sure() -> None:
         found = judge(MeasuredResponse(whole.hz, whole.G + mode), K, BOUNDS)
         assert ("narrower than the lines" not in found.words) == sure, found.words
         assert sure or not found.sure
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(2e-4, False), (5e-3, True)])
+def test_noise_between_lines_finer_than_a_resonance_is_no_doubt(
+    share: float, doubted: bool
+) -> None:
+    """A line turned by noise near a zero; `share`: what lines are apart, of the frequency."""
+    hz = 1000.0 * (1.0 + share * np.arange(60))
+    L = np.full((60, 1, 1), 0.1 - 0.02j)
+    L[30] *= -1.0 + 0.01j  # falls by more than 90 degrees on one side, whichever
+    doubts = winding(MeasuredResponse(hz, L[:, 0, 0], poles_at_zero=0), L)[1]
+    assert any("narrower than the lines" in words for words in doubts) == doubted
 
 
 def test_what_the_data_do_not_show_is_said() -> None:
