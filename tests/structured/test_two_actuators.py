@@ -182,7 +182,6 @@ def test_the_kept_controllers_of_the_disk_drive_keep_what_the_page_says(drive, n
     for temperature, gain in ((-1.0, 0.95), (0.0, 1.0), (1.0, 1.05)):
         found = drive.judge(branches, temperature, gain)
         assert found["stable"]
-        # the arm is free here, on a soft spring in the design: 2.0874
-        assert round(found["S_peak"], 3) <= 2.087
+        assert found["S_peak"] <= nine["S_peak"] * (1.0 + 1e-5)
         low, high = nine["bandwidth_hz"]
         assert low * (1.0 - 1e-4) <= found["bandwidth_hz"] <= high * (1.0 + 1e-4)
