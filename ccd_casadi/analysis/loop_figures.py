@@ -29,7 +29,9 @@ SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
 OCTAVE = 0.1
 LIGHT = 0.1  # damping of a root of K that is worth a word within NEAR of ω_b
 NEAR = 0.2
-RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 12 periods until 2 % are left
+RINGING = (
+    0.05  # damping of a root of the loop within an octave of ω_b: 12 periods until 2 % are left
+)
 
 
 @dataclass(frozen=True)
@@ -230,7 +232,5 @@ def loop_entry(
         "step_overshoot": found.step.overshoot,
         "settling_ms": 1e3 * found.step.settling,
         "force_step_max": found.step.by_force,
-        "loop_warnings": loop_warnings(
-            found.growth, found.light_roots, bandwidth, found.ringing
-        ),
+        "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth, found.ringing),
     }

@@ -20,9 +20,9 @@ NEXT = {  # what to do about a line that failed
     "loop": "a smaller S_max; with sections bandwidth_least_hz or least_damping",
 }
 USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
-    ("modulus_margin", 0.5, "the modulus margin is {:.3g}, usual is 0.5 or more"),
-    ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg, usual is 30 deg or more"),
-    ("gain_margin", 2.0, "the gain margin is {:.3g}, usual is 2 or more"),
+    ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),
+    ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg (usual: at least 30)"),
+    ("gain_margin", 2.0, "the gain margin is {:.3g} (usual: at least 2)"),
 )
 SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
 OVERSHOOT = 0.5  # of a step without feedforward
@@ -121,7 +121,9 @@ def advice(result: Mapping[str, Any]) -> str:
         words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
         after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
         return words + (f" Next: {NEXT['loop']}." if looked_at else "") + after
-    return "Build this after deploy: hold and delay are not judged yet." if unjudged else "Build this."
+    return (
+        "Build this after deploy: hold and delay are not judged yet." if unjudged else "Build this."
+    )
 
 
 def doubts(result: Mapping[str, Any]) -> list[str]:
@@ -138,8 +140,8 @@ def doubts(result: Mapping[str, Any]) -> list[str]:
     if "step_overshoot" in result and "move" not in result:
         overshoot = result["step_overshoot"]
         if overshoot > OVERSHOOT:
-            usual = f"{100.0 * OVERSHOOT:g} % at most"
-            found.append(f"a step overshoots by {100.0 * overshoot:.3g} %, usual is {usual}")
+            usual = f"usual: at most {100.0 * OVERSHOOT:g}"
+            found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
         if result["settling_ms"] is None:
             found.append("a step does not settle within 160 periods of the bandwidth")
     return [*found, *result.get("loop_warnings", ())]
@@ -154,5 +156,5 @@ def head_words(result: Mapping[str, Any]) -> str:
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
-        return "all checks passed"
+        return "all checks passed" + ("; the loop needs a look" if doubts(result) else "")
     return f"with warnings: {', '.join(warned)}"
