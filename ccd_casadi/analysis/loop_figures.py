@@ -29,9 +29,7 @@ SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
 OCTAVE = 0.1
 LIGHT = 0.1  # damping of a root of K that is worth a word within NEAR of ω_b
 NEAR = 0.2
-RINGING = (
-    0.05  # damping of a root of the loop within an octave of ω_b: 12 periods until 2 % are left
-)
+RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
 
 
 @dataclass(frozen=True)
