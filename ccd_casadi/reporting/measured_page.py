@@ -92,7 +92,7 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",
             y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
-         nyquist_panel(shown, bounds.S_max, HEIGHT)),
+         nyquist_panel(hz, shown, bounds.S_max, HEIGHT, ("the first", "the others"))),
         (over_hz("|G| (m/N)", curves["G"], ends),
          over_hz("|L| (–)", curves["L"], ends, levels=(Level(1.0, "1"), at))),
         (over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),

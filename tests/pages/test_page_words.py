@@ -17,6 +17,7 @@ from ccd_casadi.reporting.facts import conclusion
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
+from ccd_casadi.reporting.nyquist import nyquist_panel
 from ccd_casadi.reporting.robustness_figures import shown_peak
 from ccd_casadi.reporting.verdict import LINES, advice, run_head
 from ccd_casadi.studies.conclusions import conclusions
@@ -160,3 +161,24 @@ def test_insight_and_compare_begin_with_their_answer() -> None:
     said = conclusions(problem, {"lifted": best, "sequential": other})["sentences"]
     assert said[0].endswith("changes the hardware cost by -20.0 % and the bandwidth by +20.0 %.")
     assert conclusions(problem, {"lifted": best})["sentences"][0].startswith("The best J")
+
+
+def test_arrows_of_a_nyquist_plot_point_to_higher_frequencies() -> None:
+    """Each frequency stands where L has it, its arrow along L."""
+
+    def L(hz: np.ndarray | float) -> np.ndarray:
+        s = 1j * HZ * np.asarray(hz)
+        return np.asarray(9.0 / (s * (s + 1.0) * (s * s / 9.0 + 0.02 * s + 1.0)) / 3.0)
+
+    hz = np.geomspace(0.01, 10.0, 20000)
+    panel = nyquist_panel(hz, [L(hz)], 2.0)
+    marks = [mark for mark in panel.marks if mark.text]
+    heads = [curve for curve in panel.curves if len(curve.x) == 3]
+    assert len(marks) == len(heads) > 3
+    for mark, head in zip(marks, heads, strict=True):
+        at, place = float(mark.text.removesuffix(" Hz")), complex(mark.x, mark.y)
+        assert abs(L(at) - place) < 0.05  # three digits of the frequency
+        assert complex(head.x[1], head.y[1]) == place
+        ends = head.x[::2] + 1j * head.y[::2]
+        way = L(at * 1.001) - L(at / 1.001)
+        assert ((place - ends) * np.conj(way)).real.min() > 0.9 * abs(way) * abs(place - ends).max()
