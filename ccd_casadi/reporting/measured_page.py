@@ -28,6 +28,7 @@ from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sens
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.sections_page import controller_blocks
 from ccd_casadi.reporting.tables import over_frequency
+from ccd_casadi.reporting.verdict import advice
 from ccd_casadi.support.units import HZ, number, shown
 
 HEIGHT = 3.0  # inches of a row
@@ -49,7 +50,7 @@ def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[st
     head = Head(
         f"Controller on {case.file}", "good" if good else "bad",
         "verified" if good else "not verified", answer["reason"], f"{case.path.name} · {lines}",
-        lead,
+        lead, decision=advice(answer),
     )  # fmt: skip
     figures = Facts(tuple(_facts(case, answer))), Words(f"What this rests on: {answer['words']}.")
     sections = (

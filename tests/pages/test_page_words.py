@@ -18,7 +18,7 @@ from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
 from ccd_casadi.reporting.robustness_figures import shown_peak
-from ccd_casadi.reporting.verdict import LINES, advice
+from ccd_casadi.reporting.verdict import LINES, advice, run_head
 from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.support.units import HZ
 
@@ -68,7 +68,7 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
         ({}, "Build this."),
         ({"deployable": "unknown"}, "Build this after deploy"),
         ({"survives": "warned"}, "Do not build this: it does not survive"),
-        ({"predicted": "warned"}, "Build this if these warnings are acceptable: predicted."),
+        ({"predicted": "warned"}, "Build this only if you accept: predicted warned."),
         ({"survives": "warned", "deployable": "failed"}, "Do not build this: deployable failed."),
     ],
 )
@@ -78,6 +78,34 @@ def test_a_page_says_first_whether_to_build_it(states: dict, said: str) -> None:
     alone = result_of(survives="warned")  # nothing was found against it
     alone["verdict"]["survives"]["words"] = "[robust] names no plant but the model; stable for"
     assert advice(alone).startswith("Do not build this yet: it was judged on the model alone.")
+
+
+@pytest.mark.parametrize(
+    ("figures", "said"),
+    [
+        ({"modulus_margin": 0.4999, "phase_margin_deg": 29.9, "gain_margin": 1.999}, ""),
+        ({"modulus_margin": 0.4}, "the modulus margin is 0.4"),
+        ({"phase_margin_deg": 25.0, "gain_margin": None}, "the phase margin is 25 deg"),
+        ({"step_overshoot": 0.62, "settling_ms": 14.0}, "a step overshoots by 62 %"),
+        ({"step_overshoot": 0.62, "settling_ms": 14.0, "move": {}}, ""),
+        ({"step_overshoot": 0.1, "settling_ms": None}, "a step does not settle"),
+        ({"loop_warnings": ["the closed loop rings"]}, "the closed loop rings"),
+    ],
+)
+def test_a_loop_within_its_bounds_is_looked_at_as_an_engineer_would(
+    figures: dict, said: str
+) -> None:
+    good = advice(result_of() | figures)
+    assert good.startswith(f"Build this only if you accept: {said}" if said else "Build this.")
+    assert run_head("", result_of() | figures, "", "").badge == ("warn" if said else "good")
+    alone = advice(figures | {"status": "verified"})  # of `tune`, which has no lines
+    assert alone.startswith(f"Look at the loop before you run it: {said}" if said else "")
+    assert bool(alone) == bool(said)
+    if said:
+        both = advice(result_of(predicted="warned", deployable="unknown") | figures)
+        assert f"predicted warned; {said}" in both
+        assert "Deploy it first" in both
+        assert said not in advice(result_of(survives="failed") | figures)
 
 
 def test_a_peak_is_above_or_below_what_it_is_held_against() -> None:
