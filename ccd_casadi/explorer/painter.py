@@ -124,7 +124,8 @@ class PanelFigure:
         ]
         spots = [(c.x, c.y, colour if c.colour == BLUE else c.colour, c.marker)
                  for c in panel.curves if c.marker]  # fmt: skip
-        spots += [(np.array([m.x]), np.array([m.y]), m.colour, m.marker) for m in panel.marks]
+        spots += [(np.array([m.x]), np.array([m.y]), m.colour, m.marker)
+                  for m in panel.marks if m.marker]  # fmt: skip
         areas = [(a.x, a.y, self._on(a.colour), 0.2) for a in panel.forbidden]
         areas += [(np.append(b.x, b.x[::-1]), np.append(b.low, b.high[::-1]), self._on(b.colour),
                    0.18) for b in panel.bands]  # fmt: skip
