@@ -31,11 +31,12 @@ from ccd_casadi.explorer.message import Change
 from ccd_casadi.support.package_text import package_text
 
 HEIGHT = 230
+FEW = 4  # ticks of a linear axis across: a figure may be 240 px wide
 PADDING = 0.1  # of the data, that a linear axis reaches beyond them
 CENTRE, HALF = -0.8, (2.4, 2.0)  # of a round plot, and what it shows at least to both sides
 DASHES = {"-": "solid", "--": "dashed", ":": "dotted", "-.": "dotdash"}
 MARKERS = {"o": "circle", "x": "x", "^": "triangle", "v": "inverted_triangle", "+": "cross",
-           ".": "circle_dot"}  # fmt: skip
+           ".": "dot"}  # fmt: skip
 SIGNS = {"o": "○", "x": "×", "^": "△", "-": "—", "--": "– –", ":": "···", "-.": "–·"}
 ON_DARK = dict(THEME.values())
 LINE = ("xs", "ys", "colour", "dash", "width", "label")
@@ -76,6 +77,8 @@ class PanelFigure:
         made.toolbar.autohide = True
         for axis in made.axis:
             axis.axis_label_text_font_style = "normal"
+        if not self._log_x:
+            made.xaxis[0].ticker.desired_num_ticks = FEW
         if self._round:
             for tool in made.tools:  # what is zoomed keeps one scale too
                 if isinstance(tool, BoxZoomTool):

@@ -13,7 +13,7 @@ from ccd_casadi.deployment.words import against
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.reporting.facts import conclusion
+from ccd_casadi.reporting.facts import conclusion, theta_table, theta_words
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
@@ -53,6 +53,14 @@ def result_of(**states: str) -> dict:
         "seconds": 1.0, "verification_error": 6.3e-12,
         "certificate": {"passed": True, "norm_bound": 2.0},
     }  # fmt: skip
+
+
+def test_what_varies_is_shown_as_a_range_and_not_as_a_value() -> None:
+    result = {"theta": {"h": 0.12}, "fixed": {"wall": 4.5e-3}, "varies": {"at": [-0.3, 0.3]},
+              "units": {"h": "m", "wall": "m", "at": "m"}}  # fmt: skip
+    assert theta_words(result) == "h = 120 mm, wall = 4.5 mm, every at from -300 to 300 mm"
+    problem = problem_of(load_case("examples/gantry_stroke/case.toml"))
+    assert theta_table(problem, result).rows[-1] == ("at", "mm", "–", -300.0, 300.0, "–", "varies")
 
 
 def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
