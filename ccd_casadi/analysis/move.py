@@ -26,10 +26,10 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.recurrence import states
 
-STEPS = np.array([500.0, 50.0])  # of a continuous loop in a period of the bandwidth, most and least
+STEPS = np.array([500.0, 50.0])  # of a continuous loop in a period of ω_b, most and least
 PER_MOVE = 400  # and in a move
 TAIL = 8.0  # periods of the bandwidth after the move, doubled until it has settled
-DOUBLINGS = 6
+DOUBLINGS = 7
 
 
 @dataclass(frozen=True)
