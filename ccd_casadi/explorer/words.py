@@ -127,7 +127,7 @@ def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
     if plant.drawing is not None:
         drawn = plant.drawing({"this design": look.theta, "the start": start})
         picture = drawing_html(drawn.drawing, "machine")
-        return f'<div style="background:#fff;color:#1a1a1a">{picture}</div>'
+        return f'<div class="drawn" style="background:#fff;color:#1a1a1a">{picture}</div>'
     return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
 
 
