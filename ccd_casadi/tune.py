@@ -23,6 +23,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.lti.hold import tustin
     from ccd_casadi.reporting.facts import loop_lines
     from ccd_casadi.reporting.measured_page import measured_page
+    from ccd_casadi.reporting.verdict import advice
     from ccd_casadi.support.json_files import clean, write_json
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.versions import versions
@@ -56,6 +57,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             write_c(folder, whole, title=case.file, delay=options.delay,
                     verified=found.design.usable)  # fmt: skip
         lines = [
+            *(f"{'decision':14s}{words}" for words in (advice(result),) if words),
             f"{'bandwidth':14s}{result['bandwidth_hz']:.6g} Hz, |S| at most "
             f"{result['sensitivity_peak']:.4g} at {result['sensitivity_peak_hz']:.4g} Hz",
             *loop_lines(result),

@@ -29,6 +29,7 @@ SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
 OCTAVE = 0.1
 LIGHT = 0.1  # damping of a root of K that is worth a word within NEAR of ω_b
 NEAR = 0.2
+RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,15 @@ class LoopFigures:
     """The least margins of all plants, with the crossover of the model; the worst step.
 
     `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
-    `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near ω_b.
+    `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near ω_b; `ringing`: the
+    closed-loop root of least damping within an octave of ω_b, on any plant, where that is small.
     """
 
     margins: ClassicalMargins
     step: StepFigures
     growth: float
     light_roots: tuple[tuple[float, float, str], ...]
+    ringing: tuple[float, float] | None
 
 
 def loop_figures(
@@ -78,6 +81,7 @@ def loop_figures(
         ),
         growth=max(float((size / size[0]).max()) for size in sizes),
         light_roots=light_roots(controller, bandwidth),
+        ringing=ringing(np.concatenate([loop.poles for loop in loops]), bandwidth),
     )
 
 
@@ -97,6 +101,15 @@ def step_figures(loop: Loop, bandwidth: float) -> StepFigures:
     rest = steps.C_y @ np.linalg.solve(np.eye(len(steps.A)) - steps.A, steps.B_d)
     moved = [float(np.abs(constant_drive(steps, drive, count)).max()) for drive in steps.B_d.T]
     return StepFigures(overshoot, settling, max(*moved, float(np.abs(rest).max())))
+
+
+def ringing(poles: Array, bandwidth: float) -> tuple[float, float] | None:
+    """Frequency in rad/s and damping of the least damped of `poles` within an octave of ω_b, if
+    that damping is below 0.05."""
+    size = np.maximum(np.abs(poles), 1e-300)
+    near = (np.abs(np.log2(size / bandwidth)) <= 1.0) & (-poles.real < RINGING * size)
+    found = zip(size[near], -poles.real[near] / size[near], strict=True)
+    return min(((float(w), float(d)) for w, d in found), key=lambda root: root[1], default=None)
 
 
 def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, float, str], ...]:
@@ -143,9 +156,10 @@ def force_step(loop: Loop, times: Array) -> tuple[Array, Array]:
 
 
 def loop_warnings(
-    growth: float, roots: Sequence[tuple[float, float, str]], bandwidth: float
-) -> list[str]:
-    """By name, what an engineer would not build: ω_b that is held by something narrow."""
+    growth: float, roots: Sequence[tuple[float, float, str]], bandwidth: float,
+    rings: tuple[float, float] | None = None,
+) -> list[str]:  # fmt: skip
+    """By name, what an engineer would not build: ω_b that is held by something narrow, or rings."""
     hz = bandwidth / HZ
     words = []
     if growth > SHARP:
@@ -158,6 +172,11 @@ def loop_warnings(
         f"bandwidth"
         for w, d, word in roots
     ]
+    if rings is not None:
+        words.append(
+            f"the closed loop rings at {rings[0] / HZ:.4g} Hz with damping {rings[1]:.3g}, within "
+            "an octave of the bandwidth"
+        )
     return words
 
 
@@ -211,5 +230,5 @@ def loop_entry(
         "step_overshoot": found.step.overshoot,
         "settling_ms": 1e3 * found.step.settling,
         "force_step_max": found.step.by_force,
-        "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth),
+        "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth, found.ringing),
     }

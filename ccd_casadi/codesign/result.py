@@ -55,6 +55,8 @@ def result_dict(
     promised = predicted_value(outcome, verified.point, verified.value)
     error = abs(promised / verified.value - 1.0)
     verdict = verdict_of(outcome, verified, tolerance, error, quality, look)
+    evidence = verified.evidence(promised)
+    held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}
     stationary = optimal_line(outcome, verified, tolerance, look, gap=0.0)
     checks = {
         "certificate": verified.certified,
@@ -76,7 +78,7 @@ def result_dict(
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": problem.parameter_units,
         "cost_unit": problem.cost_unit,
-        **({"fixed": problem.source.held} if problem.source.fixed else {}),
+        **({"fixed": held} if held else {}),
         "objective": verified.objective,
         "hardware_cost": verified.hardware_cost,
         "minimise": problem.figure.key,
@@ -91,7 +93,7 @@ def result_dict(
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         **run_entry(spent, seconds, seed, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
-        **verified.evidence(promised),
+        **evidence,
         **budget_entry(problem, verified.theta, verified.controller),
         **move_entry(problem, verified.theta, verified.controller),
     }

@@ -144,6 +144,8 @@ class VerifiedSections(Verified):
                 f"{entry}_raced": self.raced.value,
                 "error_anchors": [list(kappa) for kappa in sections.error_anchors],
             }
+        if sections.uncertainty.ranges:
+            found["varies"] = {name: ends for name, *ends in sections.uncertainty.ranges}
         if self.told is not None:
             time, drawn = self.told
             found |= {"move_time": time,

@@ -22,6 +22,7 @@ from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.svg import GREY, ORANGE
 from ccd_casadi.explorer.controls import DARK
 from ccd_casadi.explorer.message import Change
+from ccd_casadi.explorer.painter import FEW
 from ccd_casadi.support.units import shown_unit
 
 HEIGHT = 280
@@ -56,6 +57,7 @@ class MapFigure:
             x_range=self._x, y_range=self._y,
         )  # fmt: skip
         made.toolbar.logo = None
+        made.xaxis[0].ticker.desired_num_ticks = FEW
         made.image("image", "x", "y", "dw", "dh", source=self._image, color_mapper=self._colours)
         by_value = {"field": "hz", "transform": self._colours}
         made.scatter("x", "y", source=self._designs, size=3, fill_color="white", line_color=GREY)

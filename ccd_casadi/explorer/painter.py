@@ -31,11 +31,12 @@ from ccd_casadi.explorer.message import Change
 from ccd_casadi.support.package_text import package_text
 
 HEIGHT = 230
+FEW = 4  # ticks of a linear axis across: a figure may be 240 px wide
 PADDING = 0.1  # of the data, that a linear axis reaches beyond them
 CENTRE, HALF = -0.8, (2.4, 2.0)  # of a round plot, and what it shows at least to both sides
 DASHES = {"-": "solid", "--": "dashed", ":": "dotted", "-.": "dotdash"}
 MARKERS = {"o": "circle", "x": "x", "^": "triangle", "v": "inverted_triangle", "+": "cross",
-           ".": "circle_dot"}  # fmt: skip
+           ".": "dot"}  # fmt: skip
 SIGNS = {"o": "○", "x": "×", "^": "△", "-": "—", "--": "– –", ":": "···", "-.": "–·"}
 ON_DARK = dict(THEME.values())
 LINE = ("xs", "ys", "colour", "dash", "width", "label")
@@ -76,6 +77,8 @@ class PanelFigure:
         made.toolbar.autohide = True
         for axis in made.axis:
             axis.axis_label_text_font_style = "normal"
+        if not self._log_x:
+            made.xaxis[0].ticker.desired_num_ticks = FEW
         if self._round:
             for tool in made.tools:  # what is zoomed keeps one scale too
                 if isinstance(tool, BoxZoomTool):
@@ -124,7 +127,8 @@ class PanelFigure:
         ]
         spots = [(c.x, c.y, colour if c.colour == BLUE else c.colour, c.marker)
                  for c in panel.curves if c.marker]  # fmt: skip
-        spots += [(np.array([m.x]), np.array([m.y]), m.colour, m.marker) for m in panel.marks]
+        spots += [(np.array([m.x]), np.array([m.y]), m.colour, m.marker)
+                  for m in panel.marks if m.marker]  # fmt: skip
         areas = [(a.x, a.y, self._on(a.colour), 0.2) for a in panel.forbidden]
         areas += [(np.append(b.x, b.x[::-1]), np.append(b.low, b.high[::-1]), self._on(b.colour),
                    0.18) for b in panel.bands]  # fmt: skip

@@ -68,7 +68,7 @@ def drawn(look: Look, c: Curves | None, sampled: AsSampled | None) -> Drawn:
                   for name, panel in panels.items()}  # fmt: skip
     loci = list(loci_of(view.open[0]).T)
     panels |= {
-        "nyquist": nyquist_panel(loci, view.bounded.S_max, others=BLUE),
+        "nyquist": nyquist_panel(view.hz, loci, view.bounded.S_max, others=BLUE),
         "poles": _poles(c),
         "step": _over_time(c.step_time, c.step, "y after a step of r", Level(1.0, "")),
         "move": _over_time(c.move.time, 1e6 * c.move.error, "error (µm)",

@@ -129,7 +129,7 @@ def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
         drawn = plant.drawing({"this design": look.theta, "the start": start}).drawing
         if isinstance(drawn, Lines):  # the first row alone: it is drawn while one drags
             drawn = replace(drawn, rows=drawn.rows[:1], heights=drawn.heights[:1])
-        return drawing_html(drawn, "machine")
+        return f'<div class="drawn">{drawing_html(drawn, "machine")}</div>'
     return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
 
 

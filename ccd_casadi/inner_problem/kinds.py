@@ -207,7 +207,8 @@ KINDS: dict[type[ControllerProblem], type[InnerKind]] = {
 def bandwidth_gradient(
     optimum: Sensitivities, active: tuple[str, ...], bounded: tuple[str, ...]
 ) -> Array:
-    """dω_b*/dθ (n_θ,) in rad/s per unit of θ; NaN where the optimality conditions do not hold.
+    """dω_b*/dθ (n_θ,) in rad/s per unit of θ, where the plant has slopes (else n_θ is 0); NaN where
+    the optimality conditions do not hold.
 
     `bounded` names the rows 1 to -2 of the optimum's values, as `InnerProblem.bounds` does.
     """
@@ -227,4 +228,4 @@ def bandwidth_gradient(
     mu, residual = non_negative(np.reshape(columns, (-1, 2)), x[0])
     if residual > RESIDUAL:
         return np.full_like(zero, np.nan)
-    return optimum.to_theta[0] - mu @ np.reshape(slopes, (-1, len(zero)))
+    return optimum.to_theta[0] - mu @ np.reshape(slopes, (len(mu), len(zero)))

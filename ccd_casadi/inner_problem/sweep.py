@@ -298,7 +298,7 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
         reasons = sorted({row.outcome.value for row in rows})
         return "no synthesis was certified: " + "; ".join(reasons)
     nearest = min(certified, key=lambda row: _violation(problem, row))
-    missed, kept, least = [], [], []
+    missed, kept, least, elsewhere = [], [], [], []
     for name, (attribute, bound) in problem.bounds.items():
         label = LABELS[name]
         value = float(getattr(nearest, attribute))
@@ -308,9 +308,11 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
             if best > bound:
                 least.append(f"the least {label} of all is {missed_by(best, bound)}")
             else:
-                least.append(f"others keep {name}, and not the rest")
+                elsewhere.append(name)
         else:
             kept.append(f"{name} = {bound:g} is kept there with {value:.4g}")
+    if elsewhere:
+        least.append(f"others keep {' or '.join(elsewhere)}, but not all bounds at once")
     words = f"of {len(certified)} certified controllers the nearest has {' and '.join(missed)}"
     return "; ".join([words, *kept, *least])
 

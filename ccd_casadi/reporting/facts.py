@@ -64,6 +64,9 @@ def theta_words(result: Mapping[str, Any]) -> str:
     for name, value in {**result["theta"], **result.get("fixed", {})}.items():
         unit, factor = shown_unit(units.get(name, ""), value)
         words.append(f"{name} = {number(factor * value)} {unit}".strip())
+    for name, (low, high) in result.get("varies", {}).items():
+        unit, factor = shown_unit(units.get(name, ""), high)
+        words.append(f"every {name} from {factor * low:.5g} to {factor * high:.5g} {unit}".strip())
     return ", ".join(words)
 
 
@@ -81,6 +84,10 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
         unit, factor = shown_unit(problem.parameter_units[name], value)
         place = f"one of {len(lists[name])}" if name in lists else "fixed"
         rows.append((name, unit or "–", factor * value, "–", "–", "–", place))
+    for name, ends in result.get("varies", {}).items():
+        unit, factor = shown_unit(problem.parameter_units[name], ends[1])
+        low, high = (factor * end for end in ends)
+        rows.append((name, unit or "–", "–", low, high, "–", "varies"))
     head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")
     return Table(head, tuple(rows))
 

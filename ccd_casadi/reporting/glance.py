@@ -24,9 +24,10 @@ def glance(
     """Of a design on the plants that it is made for."""
     error, caption, numbers = move
     S_max, several = problem.inner.S_max, len(view.open) > 1
+    names = ("the model", "other plants") if view.scalar else ("an eigenvalue of L", "the others")
     rows: tuple[tuple[Place, ...], ...] = (
         (machine(problem, theta), S_panel(view)),
-        (nyquist_panel(loci(view), S_max, HEIGHT), error.rows[0][-1]),
+        (nyquist_panel(view.hz, loci(view), S_max, HEIGHT, names), error.rows[0][-1]),
     )
     peak = float(view.sizes[0].max())
     on = (

@@ -148,7 +148,8 @@ def lumped_machine(
 
 
 def modes_table(modal: ModalPlant) -> Table:
-    """Of each mode: frequency, damping ratio, how it is driven and measured."""
+    """Of each mode: frequency, damping ratio, and the norms of what drives and measures it, as
+    shares of the largest of all modes."""
     b, c = np.linalg.norm(modal.B, axis=1), np.linalg.norm(modal.C, axis=0)
     rows = []
     for i in np.argsort(modal.natural, kind="stable"):
@@ -156,7 +157,8 @@ def modes_table(modal: ModalPlant) -> Table:
         hz = "rigid" if modal.rigid[i] else f"{number(omega / HZ, 4)} Hz"
         zeta = "" if modal.rigid[i] else f"{100.0 * modal.D[i, i] / (2.0 * omega):.3g} %"
         rows.append((hz, zeta, f"{b[i] / b.max():.2g}", f"{c[i] / c.max():.2g}"))
-    return Table(("mode", "damping", "driven, of the most", "measured, of the most"), tuple(rows))
+    share = "(share of the strongest)"
+    return Table(("mode", "damping", f"driven {share}", f"measured {share}"), tuple(rows))
 
 
 def mode_shape_figure(shapes: ModeShapes) -> Figure:

@@ -28,6 +28,7 @@ from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sens
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.sections_page import controller_blocks
 from ccd_casadi.reporting.tables import over_frequency
+from ccd_casadi.reporting.verdict import advice
 from ccd_casadi.support.units import HZ, number, shown
 
 HEIGHT = 3.0  # inches of a row
@@ -49,7 +50,7 @@ def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[st
     head = Head(
         f"Controller on {case.file}", "good" if good else "bad",
         "verified" if good else "not verified", answer["reason"], f"{case.path.name} · {lines}",
-        lead,
+        lead, decision=advice(answer),
     )  # fmt: skip
     figures = Facts(tuple(_facts(case, answer))), Words(f"What this rests on: {answer['words']}.")
     sections = (
@@ -91,7 +92,7 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",
             y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
-         nyquist_panel(shown, bounds.S_max, HEIGHT)),
+         nyquist_panel(hz, shown, bounds.S_max, HEIGHT, ("the first", "the others"))),
         (over_hz("|G| (m/N)", curves["G"], ends),
          over_hz("|L| (–)", curves["L"], ends, levels=(Level(1.0, "1"), at))),
         (over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),

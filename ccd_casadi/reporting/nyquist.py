@@ -7,32 +7,60 @@ from scipy.optimize import linear_sum_assignment
 
 from ccd_casadi.drawing.content import Area, Curve, Mark, Panel
 from ccd_casadi.drawing.lines import BOTTOM, LEFT, RIGHT, TOP
-from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
+from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE, WIDTH
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import number
 
 SHOWN = (-3.2, 1.6)  # of the real axis
+EVERY, APART = 1.2, 0.3  # of arrows along a locus, and from each other and from the origin
+HEAD = 0.13  # length of an arrow head
 FAR = 30.0  # |L| beyond which a locus leaves the drawing
 
 
 def nyquist_panel(
-    loci: Sequence[np.ndarray], S_max: float, height: float = 3.0, others: str = GREEN
-) -> Panel:
-    """Loci (k,) complex, the first the model's; beside one other panel of this height in inches."""
+    hz: Array, loci: Sequence[np.ndarray], S_max: float, height: float = 3.0,
+    names: tuple[str, str] = ("", ""), others: str = GREEN,
+) -> Panel:  # fmt: skip
+    """Loci (k,) complex over Hz, the first the model's; beside one other panel of this height in
+    inches. `names`: of the first, and of the others. The first has its direction and frequencies.
+    """
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     circle = np.exp(1j * angle)
     curves = [
-        Curve(line.real, line.imag, colour=others if i else BLUE, width=1.0 if i else 1.6)
+        Curve(line.real, line.imag, names[1] * (i == 1), others, width=1.0) if i
+        else Curve(line.real, line.imag, names[0] * (len(loci) > 1), width=1.6)
         for i, line in reversed(list(enumerate(loci)))
-    ]
+    ]  # fmt: skip
     disk = -1.0 + circle / S_max
     curves.append(Curve(disk.real, disk.imag, f"|S| = S_max = {S_max:g}", ORANGE))
     curves.append(Curve(circle.real, circle.imag, "|L| = 1", GREY, ":", width=0.9))
     wide, tall = 0.5 * WIDTH - LEFT - RIGHT, height - BOTTOM - TOP
     half = 0.5 * (SHOWN[1] - SHOWN[0]) * tall / wide  # a circle is round
+    arrows, marks = _along(hz, loci[0], half)
     return Panel(
-        "Re L (–)", "Im L (–)", tuple(curves), marks=(Mark(-1.0, 0.0, marker="+"),),
+        "Re L (–)", "Im L (–)", (*curves, *arrows), marks=(Mark(-1.0, 0.0, marker="+"), *marks),
         x_range=SHOWN, y_range=(-half, half), legend="lower right",
         forbidden=(Area(disk.real, disk.imag),),
     )  # fmt: skip
+
+
+def _along(hz: Array, locus: np.ndarray, half: float) -> tuple[list[Curve], list[Mark]]:
+    """Arrow heads along a locus as far as it is shown, with their frequencies."""
+    arrows: list[Curve] = []
+    marks: list[Mark] = []
+    x, y = locus.real, locus.imag
+    inside = (x > SHOWN[0]) & (x < SHOWN[1]) & (np.abs(y) < half)  # and so known
+    steps = np.where(inside[1:] & inside[:-1], np.abs(np.diff(locus)), 0.0)
+    along = np.append(0.0, np.cumsum(steps))
+    for length in np.arange(0.4 * EVERY, along[-1], EVERY):
+        i = int(np.searchsorted(along, length))
+        place, way = locus[i], (locus[i] - locus[i - 1]) / abs(locus[i] - locus[i - 1])
+        if all(abs(place - other) > APART for other in (0.0, *(complex(m.x, m.y) for m in marks))):
+            back = place - HEAD * way * np.exp(np.array([0.4j, -0.4j]))
+            head = np.array([back[0], place, back[1]])
+            arrows.append(Curve(head.real, head.imag, width=1.6))
+            marks.append(Mark(float(x[i]), float(y[i]), f"{number(hz[i], 3)} Hz", "."))
+    return arrows, marks
 
 
 def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:

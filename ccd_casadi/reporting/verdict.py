@@ -17,7 +17,15 @@ NEXT = {  # what to do about a line that failed
     "predicted": "retrain, or more points in [sampling]",
     "survives": "a [robust] set in the case",
     "deployable": "a higher rate or less delay",
+    "loop": "a smaller S_max; with sections bandwidth_least_hz or least_damping",
 }
+USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.md has the sources
+    ("modulus_margin", 0.5, "the modulus margin is {:.3g} (usual: at least 0.5)"),
+    ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg (usual: at least 30)"),
+    ("gain_margin", 2.0, "the gain margin is {:.3g} (usual: at least 2)"),
+)
+SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
+OVERSHOOT = 0.5  # of a step without feedforward
 NO_SET = "[robust] names no plant"  # as verified_sections says it
 STATUS = {
     "verified": "verified",
@@ -64,7 +72,8 @@ def head_of(
 
     `decision`: what the page answers, where that is not whether to build the design.
     """
-    badge = "bad" if not good else "good" if worst(result) is State.PASSED else "warn"
+    clean = worst(result) is State.PASSED and not doubts(result)
+    badge = "bad" if not good else "good" if clean else "warn"
     decision = decision or advice(result)
     return Head(title, badge, status, reason, meta, lead, lines_of(result), decision)
 
@@ -90,11 +99,14 @@ def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
 
 
 def advice(result: Mapping[str, Any]) -> str:
-    """The decision: build this or not, and what comes next; nothing of a run without a verdict."""
+    """The decision: build this or not, and what comes next; without a verdict only what to look at
+    in the loop."""
     states = {line.name: line.state for line in lines_of(result)}
     failed = [name for name, state in states.items() if state == State.FAILED]
+    looked_at = doubts(result)
     if not states:
-        return ""
+        words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
+        return f"{words} Next: {NEXT['loop']}." if looked_at else ""
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
@@ -103,12 +115,36 @@ def advice(result: Mapping[str, Any]) -> str:
         if str(result["verdict"]["survives"].get("words")).startswith(NO_SET):
             words = "Do not build this yet: it was judged on the model alone."
         return f"{words} Next: {NEXT['survives']}."
-    warned = [name for name, state in states.items() if state == State.WARNED]
-    if warned:
-        return f"Build this if these warnings are acceptable: {', '.join(warned)}."
-    if states.get("deployable") == State.UNKNOWN:
-        return "Build this after deploy: hold and delay are not judged yet."
-    return "Build this."
+    warned = [f"{name} warned" for name, state in states.items() if state == State.WARNED]
+    unjudged = states.get("deployable") == State.UNKNOWN
+    if warned or looked_at:
+        words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
+        after = " Deploy it first: hold and delay are not judged yet." if unjudged else ""
+        return words + (f" Next: {NEXT['loop']}." if looked_at else "") + after
+    return (
+        "Build this after deploy: hold and delay are not judged yet." if unjudged else "Build this."
+    )
+
+
+def doubts(result: Mapping[str, Any]) -> list[str]:
+    """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
+    and what is narrow or rings near the bandwidth, against the usual limits of the field.
+
+    The step does not count where the case names the move that the stage makes.
+    """
+    found = [
+        words.format(result[key])
+        for key, least, words in USUAL
+        if result.get(key) is not None and result[key] < (1.0 - SLACK) * least
+    ]
+    if "step_overshoot" in result and "move" not in result:
+        overshoot = result["step_overshoot"]
+        if overshoot > OVERSHOOT:
+            usual = f"usual: at most {100.0 * OVERSHOOT:g}"
+            found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
+        if result["settling_ms"] is None:
+            found.append("a step does not settle within 160 periods of the bandwidth")
+    return [*found, *result.get("loop_warnings", ())]
 
 
 def head_words(result: Mapping[str, Any]) -> str:
@@ -120,5 +156,5 @@ def head_words(result: Mapping[str, Any]) -> str:
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
-        return "all checks passed"
+        return "all checks passed" + ("; the loop needs a look" if doubts(result) else "")
     return f"with warnings: {', '.join(warned)}"

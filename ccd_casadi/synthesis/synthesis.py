@@ -43,8 +43,9 @@ class Outcome(StrEnum):
     )
     PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
     LOST_IN_ROUNDING = (
-        "the controller in SI is not certified again: the loop hangs on digits that doubles do not "
-        "have; raise gamma_backoff (1.05, 1.2), lower M_K, or narrow omega_S_hz and omega_T_hz"
+        "the controller is lost in rounding: in SI its loop needs more digits than doubles have; "
+        "in the case raise inner.gamma_backoff (1.05, 1.2), lower weights.M_K, or narrow "
+        "inner.omega_S_hz and inner.omega_T_hz"
     )
     NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"

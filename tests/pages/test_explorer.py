@@ -11,13 +11,14 @@ import pytest
 from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.drawing.svg import BLUE
 from ccd_casadi.explorer.background import Solve
 from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.explorer.landscape import landscape_of
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
-from ccd_casadi.explorer.panels import drawn
+from ccd_casadi.explorer.panels import FIGURES, drawn
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import machine_html, move_words, standing_html, survival_words
 from ccd_casadi.lti.closed_loop import closed_loop
@@ -228,6 +229,19 @@ def test_margins_are_drawn_where_the_loop_has_them(session):
     assert abs(gap[0] - gap[1]) == pytest.approx(view.margins.phase_deg, abs=1.0)
     drawn_too = drawn(look, curves_of(look), None).panels
     assert drawn_too["L"].marks == size.marks  # what a page shows is what the explorer shows
+
+
+def test_every_panel_can_be_painted_marks_with_words_alone_too(session, searched_look):
+    painter = pytest.importorskip("ccd_casadi.explorer.painter", reason="bokeh is not installed")
+    panels = drawn(searched_look, curves_of(searched_look), None).panels
+    assert any(mark.text and not mark.marker for p in panels.values() for mark in p.marks)
+    for name, (heading, log_x, log_y) in FIGURES.items():
+        panel = panels[name]
+        figure = painter.PanelFigure(name, heading, False, log_x=log_x, log_y=log_y)
+        sent = [values["data"] for _, values in figure.changes(panel, BLUE, "", True)
+                if "data" in values]  # fmt: skip
+        words = [word for data in sent for word in data.get("text", ())]
+        assert {mark.text for mark in panel.marks} - {""} <= set(words)
 
 
 def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):

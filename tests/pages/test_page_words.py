@@ -13,12 +13,13 @@ from ccd_casadi.deployment.words import against
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.reporting.facts import conclusion
+from ccd_casadi.reporting.facts import conclusion, theta_table, theta_words
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
+from ccd_casadi.reporting.nyquist import nyquist_panel
 from ccd_casadi.reporting.robustness_figures import shown_peak
-from ccd_casadi.reporting.verdict import LINES, advice
+from ccd_casadi.reporting.verdict import LINES, advice, run_head
 from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.support.units import HZ
 
@@ -54,6 +55,14 @@ def result_of(**states: str) -> dict:
     }  # fmt: skip
 
 
+def test_what_varies_is_shown_as_a_range_and_not_as_a_value() -> None:
+    result = {"theta": {"h": 0.12}, "fixed": {"wall": 4.5e-3}, "varies": {"at": [-0.3, 0.3]},
+              "units": {"h": "m", "wall": "m", "at": "m"}}  # fmt: skip
+    assert theta_words(result) == "h = 120 mm, wall = 4.5 mm, every at from -300 to 300 mm"
+    problem = problem_of(load_case("examples/gantry_stroke/case.toml"))
+    assert theta_table(problem, result).rows[-1] == ("at", "mm", "–", -300.0, 300.0, "–", "varies")
+
+
 def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
     result = result_of()
     assert "predicted to 6.3e-12 of the truth" in conclusion(result)
@@ -68,7 +77,7 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
         ({}, "Build this."),
         ({"deployable": "unknown"}, "Build this after deploy"),
         ({"survives": "warned"}, "Do not build this: it does not survive"),
-        ({"predicted": "warned"}, "Build this if these warnings are acceptable: predicted."),
+        ({"predicted": "warned"}, "Build this only if you accept: predicted warned."),
         ({"survives": "warned", "deployable": "failed"}, "Do not build this: deployable failed."),
     ],
 )
@@ -78,6 +87,34 @@ def test_a_page_says_first_whether_to_build_it(states: dict, said: str) -> None:
     alone = result_of(survives="warned")  # nothing was found against it
     alone["verdict"]["survives"]["words"] = "[robust] names no plant but the model; stable for"
     assert advice(alone).startswith("Do not build this yet: it was judged on the model alone.")
+
+
+@pytest.mark.parametrize(
+    ("figures", "said"),
+    [
+        ({"modulus_margin": 0.4999, "phase_margin_deg": 29.9, "gain_margin": 1.999}, ""),
+        ({"modulus_margin": 0.4}, "the modulus margin is 0.4"),
+        ({"phase_margin_deg": 25.0, "gain_margin": None}, "the phase margin is 25 deg"),
+        ({"step_overshoot": 0.62, "settling_ms": 14.0}, "a step overshoots by 62 %"),
+        ({"step_overshoot": 0.62, "settling_ms": 14.0, "move": {}}, ""),
+        ({"step_overshoot": 0.1, "settling_ms": None}, "a step does not settle"),
+        ({"loop_warnings": ["the closed loop rings"]}, "the closed loop rings"),
+    ],
+)
+def test_a_loop_within_its_bounds_is_looked_at_as_an_engineer_would(
+    figures: dict, said: str
+) -> None:
+    good = advice(result_of() | figures)
+    assert good.startswith(f"Build this only if you accept: {said}" if said else "Build this.")
+    assert run_head("", result_of() | figures, "", "").badge == ("warn" if said else "good")
+    alone = advice(figures | {"status": "verified"})  # of `tune`, which has no lines
+    assert alone.startswith(f"Look at the loop before you run it: {said}" if said else "")
+    assert bool(alone) == bool(said)
+    if said:
+        both = advice(result_of(predicted="warned", deployable="unknown") | figures)
+        assert f"predicted warned; {said}" in both
+        assert "Deploy it first" in both
+        assert said not in advice(result_of(survives="failed") | figures)
 
 
 def test_a_peak_is_above_or_below_what_it_is_held_against() -> None:
@@ -132,3 +169,24 @@ def test_insight_and_compare_begin_with_their_answer() -> None:
     said = conclusions(problem, {"lifted": best, "sequential": other})["sentences"]
     assert said[0].endswith("changes the hardware cost by -20.0 % and the bandwidth by +20.0 %.")
     assert conclusions(problem, {"lifted": best})["sentences"][0].startswith("The best J")
+
+
+def test_arrows_of_a_nyquist_plot_point_to_higher_frequencies() -> None:
+    """Each frequency stands where L has it, its arrow along L."""
+
+    def L(hz: np.ndarray | float) -> np.ndarray:
+        s = 1j * HZ * np.asarray(hz)
+        return np.asarray(9.0 / (s * (s + 1.0) * (s * s / 9.0 + 0.02 * s + 1.0)) / 3.0)
+
+    hz = np.geomspace(0.01, 10.0, 20000)
+    panel = nyquist_panel(hz, [L(hz)], 2.0)
+    marks = [mark for mark in panel.marks if mark.text]
+    heads = [curve for curve in panel.curves if len(curve.x) == 3]
+    assert len(marks) == len(heads) > 3
+    for mark, head in zip(marks, heads, strict=True):
+        at, place = float(mark.text.removesuffix(" Hz")), complex(mark.x, mark.y)
+        assert abs(L(at) - place) < 0.05  # three digits of the frequency
+        assert complex(head.x[1], head.y[1]) == place
+        ends = head.x[::2] + 1j * head.y[::2]
+        way = L(at * 1.001) - L(at / 1.001)
+        assert ((place - ends) * np.conj(way)).real.min() > 0.9 * abs(way) * abs(place - ends).max()

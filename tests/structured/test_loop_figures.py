@@ -12,6 +12,7 @@ from ccd_casadi.analysis.loop_figures import (
     loop_figures,
     loop_warnings,
     measured_entry,
+    ringing,
     step_figures,
 )
 from ccd_casadi.fixed_structure import Sampling, Structure
@@ -40,7 +41,7 @@ def is_stable(G: StateSpace, K: StateSpace, sampling: Sampling | None) -> bool:
 
 
 def warnings_of(found: LoopFigures, bandwidth: float) -> list[str]:
-    return loop_warnings(found.growth, found.light_roots, bandwidth)
+    return loop_warnings(found.growth, found.light_roots, bandwidth, found.ringing)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST, LATE])
@@ -151,3 +152,24 @@ def test_margins_on_dense_lines_are_those_of_the_model() -> None:
     assert lines["phase_margin_deg"] == pytest.approx(exact.phase_deg, abs=0.05)
     assert lines["gain_margin"] == pytest.approx(gain_margin(exact), rel=1e-3)
     assert lines["delay_margin_us"] == pytest.approx(1e6 * exact.delay, rel=1e-3)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_a_loop_that_rings_near_its_bandwidth_is_told(sampling: Sampling | None) -> None:
+    """K = ω²m turns a free mass with little damping into an oscillator at ω: damping and place."""
+    w, mass = 20.0 * HZ, 3.0
+
+    def found(damping: float, bandwidth: float) -> tuple[float, float] | None:
+        A = np.array([[0.0, 1.0], [0.0, -2.0 * damping * w]])
+        G = StateSpace(A, np.array([[0.0], [1.0 / mass]]), np.eye(1, 2), np.zeros((1, 1)))
+        gain = np.array([[mass * w**2]])
+        K = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), gain)
+        return ringing(Loop(G, K, sampling).poles, bandwidth)
+
+    lag = 0.0 if sampling is None else w * (sampling.delay + 0.5 * sampling.period) / 2.0
+    at, size = found(0.03 + lag, w) or (np.nan, np.nan)
+    assert at == pytest.approx(w, rel=0.01)
+    assert size == pytest.approx(0.03, rel=0.01 if sampling is None else 0.1)
+    assert found(0.03 + lag, 0.45 * w) is None
+    assert found(0.03 + lag, 2.2 * w) is None
+    assert found(0.06 + lag, w) is None

@@ -4,6 +4,7 @@ import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,3 +139,11 @@ def test_a_store_of_before_gains_its_column(tmp_path: Path) -> None:
 def test_words_tell_an_integrator_from_a_stiff_controller() -> None:
     assert "none at rest" in compliance_words(1e-6, 0.0, 1e-7, 1.0)
     assert "0.5 um/N at rest" in compliance_words(1e-6, 5e-7, 1e-7, 1.0)
+
+
+def test_a_plant_without_slopes_has_a_gradient_of_none() -> None:
+    """The explorer's matrices in modal form: an optimum on a bound was an error there."""
+    optimum = SimpleNamespace(
+        to_break_frequencies=np.array([[1.0, 0.0], [0.5, 0.0]]), to_theta=np.zeros((2, 0))
+    )
+    assert bandwidth_gradient(optimum, ("S_max", "omega_T lower"), ("S_max",)).shape == (0,)
