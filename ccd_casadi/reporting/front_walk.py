@@ -5,7 +5,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.pareto import Front, FrontPoint
-from ccd_casadi.drawing.content import Lines, Picture, Place, Steps
+from ccd_casadi.drawing.content import Landscape, Lines, Place, Steps
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.glance import machine
@@ -47,7 +47,9 @@ def _machine(problem: CoDesignProblem, point: FrontPoint) -> Place:
     if drawing is None:
         return machine(problem, point.theta)
     shown = drawing({"": point.theta}).drawing
-    return shown if isinstance(shown, Picture) else None
+    if isinstance(shown, Lines):
+        return shown.rows[0][0]
+    return None if isinstance(shown, Landscape) else shown
 
 
 def _words(problem: CoDesignProblem, point: FrontPoint) -> str:
