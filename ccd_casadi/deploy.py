@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
-from ccd_casadi.support.errors import UserError, require
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import number, one_line, positive
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
@@ -38,8 +38,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.inner_problem.kinds import kind_of
 
     finished = read_run(options.run)
-    if not kind_of(finished.problem).as_designed:  # what reduces a controller
-        require("slycot", "slicot")
     status = finished.result.get("status")
     if status != "verified" and not options.unverified:
         reason = finished.result.get("reason") or "no reason is given"

@@ -1,10 +1,10 @@
 """A move of the closed loop, simulated exactly: setpoint, feedforward, error, force.
 
 The setpoint is the output of four integrators driven by a snap that is constant between its
-switches, so that a continuous loop and the setpoint together are one linear system with a piecewise
-constant input: its matrix exponential over a step is the solution, with no error but rounding. A
-sampled loop is stepped from instant to instant, where setpoint and feedforward are read too. The
-mass feedforward
+switches, so that a continuous loop and the setpoint together are one linear system: its matrix
+exponential over a step is the solution, from the setpoint's own state at each instant. A sampled
+loop is stepped from instant to instant, where setpoint and feedforward are read too. The mass
+feedforward
 
     u_ff = (Σ_rigid c_i b_iᵀ)⁺ r̈
 
@@ -13,9 +13,9 @@ inverts the rigid-body motion alone.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ccd_casadi.analysis.setpoint import Setpoint
@@ -26,10 +26,10 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.recurrence import states
 
-STEPS = 50  # a period of the bandwidth, at least
-SEGMENT = 40  # and between two switches
+STEPS = np.array([500.0, 50.0])  # of a continuous loop in a period of ω_b, most and least
+PER_MOVE = 400  # and in a move
 TAIL = 8.0  # periods of the bandwidth after the move, doubled until it has settled
-DOUBLINGS = 6
+DOUBLINGS = 7
 
 
 @dataclass(frozen=True)
@@ -169,24 +169,72 @@ def simulate(
     ahead = np.zeros((5, loop.plant.B.shape[1]))
     if forces is not None:
         ahead[2 if forces.ndim == 1 else slice(None)] = forces
-    watch = _sampled if loop.sampling is not None else _continuous
-    signals = watch(loop, profile, axis, ahead, window, TAIL / bandwidth_hz, doublings)
-    return Move(*signals, forces is not None, profile.duration, window)
+    closed, tail = loop.closed, TAIL / bandwidth_hz
+    step = loop.period or float(np.clip(profile.duration / PER_MOVE, *1.0 / STEPS / bandwidth_hz))
+    A, drive = _over(loop, ahead, axis, step)
+    for _ in range(doublings):
+        time = np.arange(np.ceil((profile.duration + tail) / step) + 1) * step
+        r = profile.at(time) if loop.period is None else held_setpoint(profile, time, step)
+        driven = r.T @ drive.T
+        if loop.period is None:
+            _switch(driven, loop, ahead, axis, profile, step)
+        x = states(A, driven)
+        error = r[0] - x @ closed.C_y[axis]
+        if np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window:  # longer than a slow beat
+            break
+        tail *= 2.0
+    force = x @ closed.C_u.T + np.outer(r[0], closed.D_u[:, axis]) + r.T @ ahead
+    return Move(time, r[0], profile.at(time)[2], error, force, forces is not None,
+                profile.duration, window)  # fmt: skip
 
 
-Signals = tuple[Array, Array, Array, Array, Array]
+def _over(loop: Loop, ahead: Array, axis: int, step: float) -> tuple[Array, Array]:
+    """What states, and the setpoint with its derivatives (n, 5), do to the states in a step (s).
+
+    A continuous loop and the four integrators of its setpoint are one linear system.
+    """
+    closed, n = loop.closed, len(loop.closed.A)
+    G = loop.as_run[0]
+    drive = np.zeros((n, 5))
+    drive[: len(G.A)] = G.B @ ahead.T
+    drive[:, 0] += closed.B_r[:, axis]
+    if loop.sampling is not None:
+        return closed.A, drive
+    whole = np.zeros((n + 5, n + 5))
+    whole[:n, :n], whole[:n, n:], whole[n:-1, n + 1 :] = closed.A, drive, np.eye(4)
+    found = expm(step * whole)
+    return found[:n, :n], found[:n, n:]
+
+
+def _switch(
+    driven: Array, loop: Loop, ahead: Array, axis: int, profile: Setpoint, step: float
+) -> None:
+    """Put right what drives a continuous loop in the steps within which snap jumps."""
+    ends = np.cumsum(profile.durations)
+    for k in np.unique((ends // step).astype(int)):
+        inside = ends[(k * step < ends) & (ends < (k + 1) * step)]
+        driven[k] = 0.0
+        for start, end in pairwise([k * step, *inside, (k + 1) * step]):
+            A, drive = _over(loop, ahead, axis, end - start)
+            driven[k] = A @ driven[k] + drive @ profile.at(np.array([start]))[:, 0]
+
+
+def held_setpoint(profile: Setpoint, time: Array, period: float) -> Array:
+    """r and four derivatives (5, N) as a controller that holds them for a period takes them.
+
+    Of each derivative the mean over a period about the instant: a snap that jumps between two
+    instants is felt in its share.
+    """
+    r, half = profile.at(time), 0.5 * period
+    r[1:] = (profile.at(time + half)[:4] - profile.at(time - half)[:4]) / period
+    return r
 
 
 def forward_force(
     profile: Setpoint, forward: Array, time: Array, period: float
 ) -> tuple[Array, Array]:
-    """Setpoint (N,) and Σ_i F_i r^(i) (N, m) at `time`, F (5, m) of `feedforward`.
-
-    Of each derivative the mean over a period about the instant, as it is held that long: a snap
-    that jumps between two instants is felt in its share.
-    """
-    r, half = profile.at(time), 0.5 * period
-    r[1:] = (profile.at(time + half)[:4] - profile.at(time - half)[:4]) / period
+    """Setpoint (N,) and Σ_i F_i r^(i) (N, m) at `time`, F (5, m) of `feedforward`."""
+    r = held_setpoint(profile, time, period)
     return r[0], r.T @ forward
 
 
@@ -197,67 +245,3 @@ def driven_states(
     driven = np.outer(r, closed.B_r[:, axis])
     driven[:, : len(G.A)] += force @ G.B.T
     return states(closed.A, driven)
-
-
-def _sampled(
-    loop: Loop, profile: Setpoint, axis: int, ahead: Array, window: float, tail: float, more: int
-) -> Signals:
-    """Hold and delay exact, at the instants; between them nothing is said."""
-    closed, G = loop.closed, loop.as_run[0]
-    for _ in range(more):
-        time = np.arange(np.ceil((profile.duration + tail) / closed.period) + 1) * closed.period
-        position, forward = forward_force(profile, ahead, time, closed.period)
-        x = driven_states(closed, G, position, forward, axis)
-        error = position - x @ closed.C_y[axis]
-        if np.abs(error[-len(error) // 4 :]).max() <= 0.5 * window:  # longer than a slow beat
-            break
-        tail *= 2.0
-    force = x @ closed.C_u.T + np.outer(position, closed.D_u[:, axis]) + forward
-    return time, position, profile.at(time)[2], error, force
-
-
-def _continuous(
-    loop: Loop, profile: Setpoint, axis: int, ahead: Array, window: float, tail: float, more: int
-) -> Signals:
-    closed = loop.closed
-    n, step = len(closed.A), tail / TAIL / STEPS
-    # states: the loop, then r, ṙ, r̈, r⃛
-    A = np.zeros((n + 4, n + 4))
-    A[:n, :n], A[:n, n:] = closed.A, closed.B_d @ ahead[:4].T
-    A[:n, n] += closed.B_r[:, axis]
-    A[n : n + 3, n + 1 :] = np.eye(3)
-    x = np.zeros(n + 4)
-    times, found = [0.0], [x]
-
-    def run(snap: float, span: float) -> None:
-        nonlocal x
-        count = max(SEGMENT, int(np.ceil(span / step)))
-        extended = np.zeros((n + 5, n + 5))
-        extended[: n + 4, : n + 4], extended[n + 3, n + 4] = A, 1.0
-        extended[:n, n + 4] = closed.B_d @ ahead[4]
-        whole = expm(extended * (span / count))
-        Phi, Gamma = whole[: n + 4, : n + 4], whole[: n + 4, n + 4] * snap
-        start = times[-1]
-        for i in range(1, count + 1):
-            x = Phi @ x + Gamma
-            times.append(start + span * i / count)
-            found.append(x)
-
-    def error_of(X: NDArray) -> Array:
-        return np.asarray(X[:, n] - X[:, :n] @ closed.C_y[axis])
-
-    for span, snap in zip(profile.durations, profile.snaps, strict=True):
-        if span > 0.0:
-            run(float(snap), float(span))
-    stop = x[n : n + 4] * np.array([1.0, 0.0, 0.0, 0.0])  # what rounding left of the derivatives
-    x = np.concatenate([x[:n], stop])
-    for _ in range(more):
-        run(0.0, tail)
-        if np.abs(error_of(np.array(found[-SEGMENT:]))).max() <= 0.5 * window:
-            break
-        tail *= 2.0
-    X = np.array(found)
-    force = X[:, :n] @ closed.C_u.T + np.outer(X[:, n], closed.D_u[:, axis])
-    snaps = profile.at(np.array(times))[4:].T
-    force = force + np.hstack([X[:, n:], snaps]) @ ahead
-    return np.array(times), X[:, n], X[:, n + 2], error_of(X), force

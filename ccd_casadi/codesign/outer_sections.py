@@ -45,6 +45,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     fresh_yield,
     judged_widely,
     proof_of,
+    tolerance_prices,
     worst_members,
 )
 from ccd_casadi.inner_problem.sections_search import (
@@ -228,8 +229,7 @@ class SectionsOuter(ThetaOuter):
         kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
-        whole = proof.proven and not proof.of_S
-        drawn = None if whole else fresh_yield(problem, best.theta, made, asked.workers)
+        drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
         with Progress(1, "what limits it", quiet=asked.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = asked.kept("costs", best.theta, Costs, make)
@@ -258,6 +258,7 @@ class SectionsOuter(ThetaOuter):
             worst=worst,
             rounds=rounds,
             costs=costs,
+            prices=tolerance_prices(problem, best.theta, made),
             gap=gap,
             told=told,
         )

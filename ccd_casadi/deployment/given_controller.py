@@ -26,9 +26,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
-from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 UNSEEN = StateSpace(-np.eye(1), np.zeros((1, 1)), np.zeros((1, 1)), np.eye(1))
 SECTIONS = {
@@ -72,9 +70,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
         sizes = f"{K.B.shape[1]} inputs and {K.C.shape[0]} outputs"
         raise UserError(f"{path}: has {sizes}; this plant needs {p} and {m}")
     if not K.period:
-        figures = measure(
-            run.plant, K, run.weights, gamma=UNBOUNDED, omega_low=run.problem.inner.omega_low
-        )
+        figures = run.measured(run.plant, K)
         if not figures.certificate.stable:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")

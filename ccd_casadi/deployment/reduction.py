@@ -1,27 +1,32 @@
 """Controllers of lower order, the loop measured and certified stable with each of them.
 
-Four ways, because none is the best at every order:
+Three ways, because none is the best at every order. Each balances K, and sets the states at rest
+that matter least (singular perturbation, so that K(0) is kept):
 
-* balanced truncation of K's stable part (SLICOT's AB09MD);
-* the same with singular perturbation, K(0) kept (AB09ND);
-* normalised left coprime factors K = M⁻¹N, the stable [N M] reduced by AB09ND: also the unstable
-  poles of K may go;
+* its stable part (Moore 1981);
+* normalised left coprime factors K = M⁻¹N, the stable [N M] balanced: also the unstable poles of K
+  may go;
 * closed-loop balancing (Enns 1984; Ceton, Wortelboer and Bosgra 1993): balanced are the
   controller's blocks of the loop's Gramians from r to y, that is K weighted by S on its input
-  and by S G on its output, then singular perturbation.
+  and by S G on its output.
 
-Everything happens in the scaled units of the plant. SLICOT is called with job = 'B' only: with
-'N', and in AB09BD, slycot 0.7's wrappers give it too little workspace.
+Everything happens in the scaled units of the plant.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
-from scipy.linalg import LinAlgError, eigh, solve_continuous_are, svd
+from scipy.linalg import (
+    LinAlgError,
+    block_diag,
+    eigh,
+    schur,
+    solve_continuous_are,
+    solve_sylvester,
+    svd,
+)
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
 
 from ccd_casadi.deployment.channels import Channel
@@ -29,7 +34,6 @@ from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import require
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 from ccd_casadi.synthesis.weights import Weights
@@ -40,7 +44,6 @@ NEGLIGIBLE = 1e-9  # of the largest closed-loop Hankel value: a state under it i
 class Reduction(StrEnum):
     """How a controller was reduced."""
 
-    TRUNCATION = "balanced truncation"
     PERTURBATION = "singular perturbation"
     COPRIME = "coprime factors"
     CLOSED_LOOP = "closed-loop balancing"
@@ -85,9 +88,10 @@ def reductions(channel: Channel, weights: Weights, omega_low: float) -> list[Red
     """
     plant = channel.plant
     K = channel.controller.in_units(plant.omega_0, plant.force)
-    _, values = _loop_balanced(plant, K, 0)
+    loop = closed_loop(plant.system, K).T
+    _, values = _balanced(K, loop, 0)
     order = int(np.sum(values > NEGLIGIBLE * values[0]))
-    K, _ = _loop_balanced(plant, K, order)
+    K, _ = _balanced(K, loop, order)
     found = []
     for r in range(order, 0, -1):
         for method, reduce in _METHODS.items():
@@ -114,16 +118,22 @@ def smallest(
     return next((row for row in met if holds(row)), rows[0])
 
 
-def _truncation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
-    n, m, p = _sizes(K)
-    out = _slicot(lambda slycot: slycot.ab09md("C", "B", "S", n, m, p, K.A, K.B, K.C, nr=r))
-    return None if out is None else StateSpace(out[1], out[2], out[3], K.D)
-
-
 def _perturbation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
-    n, m, p = _sizes(K)
-    out = _slicot(lambda slycot: slycot.ab09nd("C", "B", "S", n, m, p, K.A, K.B, K.C, K.D, nr=r))
-    return None if out is None else StateSpace(*out[1:5])
+    S, Q, k = schur(K.A, sort="lhp")
+    if r <= len(S) - k:
+        return None
+    stable, rest = slice(None, k), slice(k, None)
+    apart = np.eye(len(S))
+    apart[stable, rest] = solve_sylvester(S[stable, stable], -S[rest, rest], -S[stable, rest])
+    B, C = np.linalg.solve(apart, Q.T @ K.B), K.C @ Q @ apart
+    part = StateSpace(S[stable, stable], B[stable], C[:, stable], K.D)
+    small = _without_fast(part, part, r - len(S) + k)
+    return StateSpace(
+        block_diag(small.A, S[rest, rest]),
+        np.vstack([small.B, B[rest]]),
+        np.hstack([small.C, C[:, rest]]),
+        small.D,
+    )
 
 
 def _coprime(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
@@ -138,8 +148,8 @@ def _coprime(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
     factors = StateSpace(
         K.A + H @ K.C, np.hstack([K.B + H @ K.D, H]), K.C, np.hstack([K.D, np.eye(p)])
     )
-    small = _perturbation(plant, factors, r)
-    if small is None or abs(np.linalg.det(small.D[:, m:])) < NEGLIGIBLE:
+    small = _without_fast(factors, factors, r)
+    if abs(np.linalg.det(small.D[:, m:])) < NEGLIGIBLE:
         return None
     inverse = np.linalg.inv(small.D[:, m:])
     back = small.B[:, m:] @ inverse
@@ -151,16 +161,20 @@ def _coprime(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
     )
 
 
-def _closed_loop(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
-    n = len(K.A)
-    balanced, _ = _loop_balanced(plant, K, n)
-    return balanced if r == n else _residual(balanced, r)
+def _closed_loop(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace:
+    return _without_fast(K, closed_loop(plant.system, K).T, r)
 
 
-def _loop_balanced(plant: ScaledPlant, K: StateSpace, order: int) -> tuple[StateSpace, Array]:
-    """K truncated to `order` in the coordinates that balance it in the loop, and its values."""
-    n, T = len(plant.A), closed_loop(plant.system, K).T
-    A, B, C = T.A, T.B, T.C
+def _without_fast(K: StateSpace, whole: StateSpace, r: int) -> StateSpace:
+    """K with r states, balanced as in `_balanced`, those of the smallest values at rest."""
+    balanced, _ = _balanced(K, whole, len(K.A))
+    return balanced if r == len(K.A) else _residual(balanced, r)
+
+
+def _balanced(K: StateSpace, whole: StateSpace, order: int) -> tuple[StateSpace, Array]:
+    """K truncated to `order` in the coordinates in which its states, the last of a stable system
+    `whole`, are as much driven as seen there; and the Hankel values."""
+    A, B, C, n = whole.A, whole.B, whole.C, len(whole.A) - len(K.A)
     R = _root(lyapunov(A, -B @ B.T)[n:, n:])
     L = _root(lyapunov(A.T, -C.T @ C)[n:, n:])
     U, s, Vt = svd(L.T @ R)
@@ -182,29 +196,13 @@ def _residual(K: StateSpace, r: int) -> StateSpace:
 
 
 _METHODS: dict[Reduction, Callable[[ScaledPlant, StateSpace, int], StateSpace | None]] = {
-    Reduction.TRUNCATION: _truncation,
     Reduction.PERTURBATION: _perturbation,
     Reduction.COPRIME: _coprime,
     Reduction.CLOSED_LOOP: _closed_loop,
 }
 
 
-def _slicot(call: Callable[[Any], tuple]) -> tuple | None:
-    """What SLICOT returns; None where it fails or warns that the order cannot be had."""
-    slycot = require("slycot", "slicot")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", slycot.exceptions.SlycotResultWarning)
-        try:
-            return call(slycot)
-        except (slycot.exceptions.SlycotError, slycot.exceptions.SlycotResultWarning):
-            return None
-
-
 def _root(gramian: Array) -> Array:
     """R with R Rᵀ = the Gramian, which rounding may have left slightly indefinite."""
     values, vectors = eigh(0.5 * (gramian + gramian.T))
     return vectors * np.sqrt(np.maximum(values, 0.0))
-
-
-def _sizes(K: StateSpace) -> tuple[int, int, int]:
-    return len(K.A), K.B.shape[1], K.C.shape[0]

@@ -11,16 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eig
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import require
 from ccd_casadi.support.units import HZ
 
 NEAR = 1.5  # ratio of zero to pole frequency up to which a pair is a notch
-STEPS = 5  # of Newton's for a zero
-SHORT, LONG = 0.05, 0.3  # the longest relative to it; where no other zero is near
 FAR = 5.0  # ratio beyond which a complex pair of zeros and one of poles are not one section
 RESONANT = 0.3  # damping ratio of a pole pair under which it is no roll-off
 SLOW = 0.02  # share of ω_b under which a pole acts as an integrator
@@ -81,7 +77,7 @@ def sections_of(K: StateSpace, bandwidth: float) -> Sections:
     left over with two real poles, real zeros with real poles; the rest stands alone, far zeros
     (which reduction puts above every frequency of use) among it.
     """
-    poles, zeros = _roots(np.linalg.eigvals(K.A)), _roots(_zeros(K))
+    poles, zeros = _roots(K.poles), _roots(K.zeros(float(np.abs(K.poles).max())))
     gain = float((K.D - K.C @ np.linalg.solve(K.A, K.B))[0, 0])
     pairs = _matched([z for z in zeros if z.damping is not None],
                      [p for p in poles if p.damping is not None], FAR)  # fmt: skip
@@ -101,48 +97,6 @@ def sections_of(K: StateSpace, bandwidth: float) -> Sections:
     found.sort(key=lambda s: abs((s.pole or s.zero or Root(0.0)).hz))
     at = K.response(np.array([bandwidth]))[0]
     return Sections(gain, float(abs(at[0, 0])), tuple(found))
-
-
-def _zeros(K: StateSpace) -> np.ndarray:
-    """Finite zeros: SLICOT's AB08ND takes what is infinite out of the balanced system matrix.
-
-    Far below the poles they come out to a tenth at worst: Newton steps on K(s) follow.
-    """
-    slycot = require("slycot", "slicot")
-    n = len(K.A)
-    parts = (np.array(part, order="F") for part in (K.A, K.B, K.C))
-    _, A, B, C, _ = slycot.tb01id(n, 1, 1, 0.0, *parts)
-    found = slycot.ab08nd(n, 1, 1, A, B, C, K.D, equil="S")
-    count, left, right = found[0], found[8], found[9]
-    zeros = eig(left[:count, :count], right[:count, :count], right=False)
-    return np.array(
-        [_polished(K, complex(zero), np.delete(zeros, i)) for i, zero in enumerate(zeros)], complex
-    )
-
-
-def _polished(K: StateSpace, zero: complex, others: np.ndarray) -> complex:
-    """A zero of K(s) = C (s - A)⁻¹ B + D by Newton's method, steps that help and are short only.
-
-    A longer one is taken where the other zeros are twice as far as it reaches.
-    """
-    free = 0.5 * float(np.abs(others - zero).min(initial=np.inf))
-    most = max(SHORT * abs(zero), min(LONG * abs(zero), free))
-
-    def at(s: complex) -> tuple[complex, complex]:
-        matrix = s * np.eye(len(K.A)) - K.A
-        x = np.linalg.solve(matrix, K.B)  # an inverse would lose digits where A is badly scaled
-        return complex((K.C @ x + K.D)[0, 0]), complex(-(K.C @ np.linalg.solve(matrix, x))[0, 0])
-
-    value, slope = at(zero)
-    for _ in range(STEPS):
-        if slope == 0.0 or not abs(value / slope) < most:
-            break
-        closer = zero - value / slope
-        new, slope = at(closer)
-        if not abs(new) < abs(value):
-            break
-        zero, value = closer, new
-    return zero
 
 
 def _roots(values: np.ndarray) -> list[Root]:

@@ -77,7 +77,7 @@ class Area:
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes. Labels carry the unit; ranges default to the data."""
+    """One pair of axes; `equal`: of one scale. Labels have units; ranges default to the data."""
 
     x_label: str
     y_label: str
@@ -94,6 +94,7 @@ class Panel:
     legend: Corner | None = "best"
     title: str = ""
     forbidden: tuple[Area, ...] = ()
+    equal: bool = False
 
 
 @dataclass(frozen=True)

@@ -148,6 +148,9 @@ def _ranges(axes: "Axes", panel: Panel) -> None:
         axes.yaxis.set_major_locator(MultipleLocator(panel.y_step))
     if not panel.log_y:
         axes.ticklabel_format(axis="y", useOffset=False)
+    if panel.equal:
+        axes.set_aspect("equal")
+        axes.apply_aspect()
 
 
 def positive_range(arrays: Iterable[Any]) -> tuple[float, float]:

@@ -130,10 +130,11 @@ def require_shapes(svg: str) -> None:
 
 def axis_label(name: str, unit: str) -> str:
     """`name (unit)`, on one line and not longer than an axis; no unit shows as a dash."""
-    return f"{_short(name)} ({_short(unit) or '–'})"
+    return f"{short_label(name)} ({short_label(unit) or '–'})"
 
 
-def _short(text: str) -> str:
+def short_label(text: str) -> str:
+    """A name on one line, not longer than an axis."""
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return words if len(words) <= LONGEST_LABEL else words[: LONGEST_LABEL - 1] + "…"
 

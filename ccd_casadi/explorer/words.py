@@ -1,11 +1,12 @@
 """What the explorer says of a design, as text and as HTML, and its machine."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Modes
+from ccd_casadi.drawing.content import Lines, Modes
 from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.paint import block_html, drawing_html
 from ccd_casadi.drawing.turntable import modes_html
@@ -125,9 +126,10 @@ def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
     """Its drawing beside that of the start, masses and springs, or its modes."""
     plant = plant_of(look.problem)
     if plant.drawing is not None:
-        drawn = plant.drawing({"this design": look.theta, "the start": start})
-        picture = drawing_html(drawn.drawing, "machine")
-        return f'<div class="drawn" style="background:#fff;color:#1a1a1a">{picture}</div>'
+        drawn = plant.drawing({"this design": look.theta, "the start": start}).drawing
+        if isinstance(drawn, Lines):  # the first row alone: it is drawn while one drags
+            drawn = replace(drawn, rows=drawn.rows[:1], heights=drawn.heights[:1])
+        return f'<div class="drawn">{drawing_html(drawn, "machine")}</div>'
     return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
 
 

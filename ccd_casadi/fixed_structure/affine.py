@@ -15,7 +15,6 @@ import numpy as np
 from ccd_casadi.support.arrays import Array
 
 ROUND = 2e-15  # relative: eight times what a product of complex numbers loses
-TERMS = 18  # of the series of φ(u) for |u| < 1/2, to rounding
 
 
 @dataclass(frozen=True)
@@ -37,15 +36,6 @@ class Affine:
         return np.asarray(np.abs(self.centre) + self.reach + self.rest)
 
     @property
-    def highest(self) -> Array:
-        """The same, closer: across the centre's direction only squares count."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = self.slope * (self.centre.conj() / np.abs(self.centre))
-        ahead = np.abs(self.centre) + np.abs(along.real).sum(0)
-        found = np.hypot(ahead, np.abs(along.imag).sum(0)) + self.rest
-        return np.asarray(np.fmin(found, self.size) * (1.0 + ROUND))
-
-    @property
     def lowest(self) -> Array:
         """Not above |f| anywhere; 0 where the enclosure touches 0."""
         size = np.abs(self.centre)
@@ -53,11 +43,6 @@ class Affine:
             along = (self.slope * (self.centre.conj() / size)).real
         found = size - np.abs(along).sum(0) - self.rest
         return np.asarray(np.where(found > 0.0, found * (1.0 - ROUND), 0.0))
-
-    @property
-    def at_centre(self) -> Array:
-        """Not above |f(0)|, t in the middle of the box."""
-        return np.asarray(np.maximum(np.abs(self.centre) - self.rest, 0.0))
 
     def __add__(self, other: "Affine | complex | np.ndarray") -> "Affine":
         if isinstance(other, Affine):
@@ -134,30 +119,6 @@ def exponential(f: Affine) -> Affine:
         rest = f.rest + 0.5 * deviation**2 * np.exp(deviation)
         rest = np.abs(value) * (rest + ROUND * (1.0 + np.abs(f.centre) + f.reach))
     return Affine(value, value * f.slope, np.where(np.isnan(rest), np.inf, rest))
-
-
-def phi(f: Affine) -> Affine:
-    """φ(u) = (e^u - 1)/u, entire; |φ''| <= e^{max(Re u, 0)}/3."""
-    u = np.asarray(f.centre, complex)
-    small = np.abs(u) < 0.5
-    series, slope = np.zeros_like(u), np.zeros_like(u)
-    near, factorial = np.where(small, u, 0.0), 1.0
-    power, before = np.ones_like(u), np.zeros_like(u)
-    for k in range(TERMS):
-        factorial *= k + 1.0
-        series += power / factorial
-        slope += k * before / factorial
-        before, power = power, power * near
-    far = np.where(small, 1.0, u)
-    direct = np.expm1(far) / far
-    value = np.where(small, series, direct)
-    slope = np.where(small, slope, (np.exp(far) - direct) / far)
-    with np.errstate(over="ignore", invalid="ignore"):
-        deviation = f.reach + f.rest
-        bound = np.exp(np.maximum(u.real + deviation, 0.0))
-        rest = np.abs(slope) * f.rest + deviation**2 * bound / 6.0
-        rest += 8.0 * ROUND * (bound * (1.0 + np.abs(u)) + np.abs(slope) * f.reach)
-    return Affine(value, slope * f.slope, np.where(np.isnan(rest), np.inf, rest))
 
 
 def root(f: Affine) -> Affine:

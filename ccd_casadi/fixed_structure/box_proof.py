@@ -1,22 +1,21 @@
 """A proof that a controller keeps its bounds on a whole box of plants, by branch and bound.
 
 Frequency and the uncertain parameters are divided until enclosures say on every sub-box that the
-loop has no pole on the axis and every figure stays below 1 + `slack` times its bound: all figures
-of one channel with up to four parameters (`enclosure`), |S| alone of more (`mode_discs`). With the
-model's own loop stable, so are all of them. What the given number of boxes does not close is still
-bounded: the proof then names the factor that is proven.
+loop has no pole on the axis and every figure stays below 1 + `slack` times its bound
+(`enclosure`). With the model's own loop stable, so are all of them. What the given number of boxes
+does not close is still bounded: the proof then names the factor that is proven.
 """
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
-from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
-from ccd_casadi.fixed_structure.mode_discs import ChannelFamily
+from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.hold import Sampling
@@ -24,7 +23,7 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
 
 SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
-SLACK_OF_MANY = 0.05  # of discs of modes
+SLACK_OF_MANY = 0.05  # of several channels or many parameters
 FEW_PARAMETERS = 4
 MOST_BOXES = 500_000  # some twenty seconds
 MOST_OF_MANY = 250_000  # of each option
@@ -50,9 +49,9 @@ class ProofOutcome(StrEnum):
 class Proof:
     """What is proven on the box: every |figure| <= `levels` times its bound, by kind of bound.
 
-    `slack` was asked for; `of_S`: of |S| alone. `boxes` were looked at. Of a refuted box `option`,
-    `point`, the bound and the factor by which it is passed at least; enclosures say so, not a
-    sample.
+    `slack` was asked for; `of_S`: of |S| alone, since for the others the boxes did not suffice.
+    `boxes` were looked at. Of a refuted box `option`, `point`, the bound and the factor by which it
+    is passed at least; enclosures say so, not a sample.
     """
 
     outcome: ProofOutcome
@@ -69,6 +68,11 @@ class Proof:
     def proven(self) -> bool:
         """Whether every bound holds with its slack on the whole box."""
         return self.outcome is ProofOutcome.PROVEN
+
+    @property
+    def close(self) -> bool:
+        """Whether that is all that is asked for, and closely: no plant need be drawn besides."""
+        return self.proven and not self.of_S and self.slack <= SLACK
 
     @property
     def refuted(self) -> bool:
@@ -110,63 +114,75 @@ def prove(
     """Bounds and stability of the SI controller κ with ω_b (rad/s) on the whole box.
 
     Of plants with modal damping. The box is that of `uncertain`, all its options; the plant's
-    modal data and κ count as exact. Of several channels or more than four parameters the bounds on
-    |S| alone, with `SLACK_OF_MANY` by default.
+    modal data and κ count as exact. Of several channels or more than four parameters with
+    `SLACK_OF_MANY` by default, and of several channels the whole's bounds, those on |S| first: they
+    take fewest boxes.
     """
     names = uncertain.names
-    many = isinstance(structure, ChannelStructure) or len(names) > FEW_PARAMETERS
+    several = isinstance(structure, ChannelStructure)
+    many = several or len(names) > FEW_PARAMETERS
     slack = slack or (SLACK_OF_MANY if many else SLACK)
-
-    def without(outcome: ProofOutcome) -> Proof:
-        return Proof(outcome, slack, names)
-
     outputs = inputs = np.eye(1)
     if isinstance(structure, ChannelStructure):
         outputs, inputs = structure.decoupling.outputs, structure.decoupling.inputs
     if len(uncertain.options[0].C) != outputs.shape[1] or outputs.shape[0] != outputs.shape[1]:
-        return without(ProofOutcome.NOT_SQUARE)
+        return Proof(ProofOutcome.NOT_SQUARE, slack, names)
     if uncertain.ranges:
-        return without(ProofOutcome.VARIES)
+        return Proof(ProofOutcome.VARIES, slack, names)
     models = [uncertain.plant(uncertain.nominal, i).plant_si()
               for i in range(len(uncertain.options))]  # fmt: skip
     K = controller_of(structure, kappa)
     if not all(Loop(model, K, sampling).stable for model in models):
-        return without(ProofOutcome.UNSTABLE)
+        return Proof(ProofOutcome.UNSTABLE, slack, names)
     fastest = max(float(np.abs(model.rates).max()) for model in models)
     unit = ABOVE * max(bandwidth, fastest, bounds.omega_low)
-    levels: dict[str, float] = {}
-    looked = 0
+    period = None if sampling is None else sampling.period * unit
+    delay = 0.0 if sampling is None else sampling.delay * unit
+    own = structure.in_units(kappa, 1.0 / unit, 1.0)
+    parts = ((structure, own),) if isinstance(structure, Structure) else (
+        tuple(structure.split(own))
+    )  # fmt: skip
+    families = []
     for option in range(len(models)):
         plant = modal_sum(uncertain, option, unit)
         if plant is None:
-            return without(ProofOutcome.NOT_MODAL)
-        period = None if sampling is None else sampling.period * unit
-        delay = 0.0 if sampling is None else sampling.delay * unit
-        own = structure.in_units(kappa, 1.0 / unit, 1.0)
-        parts = ((structure, own),) if isinstance(structure, Structure) else (
-            tuple(structure.split(own))
-        )  # fmt: skip
-        given = (plant, names, *parts[0], bounds, bandwidth, unit, period, delay)
-        family = ChannelFamily(*given, parts, outputs, inputs) if many else LoopFamily(*given)
-        boxes = _first(family, uncertain.box)
-        share = (most_boxes or MOST_BOXES) // len(models)
-        if many and most_boxes is None:
-            share = MOST_OF_MANY
-        spent = 0
+            return Proof(ProofOutcome.NOT_MODAL, slack, names)
+        families.append(LoopFamily(
+            plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay
+        ))  # fmt: skip
+    share = (most_boxes or MOST_BOXES) // len(models)
+    if many and most_boxes is None:
+        share = MOST_OF_MANY
+    if not several:
+        return _divide(families, uncertain.box, slack, share)
+    bare = replace(bounds, weighted_level=None, compliance_max=None)
+    first = _divide([replace(own, bounds=bare) for own in families], uncertain.box, slack, share)
+    if bare == bounds or not first.proven:
+        return replace(first, of_S=bare != bounds)
+    whole = _divide(families, uncertain.box, slack, share)
+    return whole if whole.proven or whole.refuted else replace(first, of_S=True)
+
+
+def _divide(families: list[LoopFamily], box: Array, slack: float, share: int) -> Proof:
+    """Branch and bound of every option, with so many boxes of each."""
+    levels: dict[str, float] = {}
+    names, looked = families[0].names, 0
+    for option, family in enumerate(families):
+        boxes, spent = _first(family, box), 0
         while len(boxes.chart):
             again: list[Boxes] = []
             for start in range(0, len(boxes.chart), AT_ONCE):
                 part = boxes.only(np.arange(start, min(start + AT_ONCE, len(boxes.chart))))
-                with np.errstate(invalid="ignore", over="ignore"):  # of boxes that enclose nothing
+                with np.errstate(all="ignore"):  # of boxes that enclose nothing
                     found = family.enclose(part)
                 spent += len(part.chart)
                 worst = found.highest.max(axis=0)
-                k, j = np.unravel_index(np.argmax(found.somewhere), found.somewhere.shape)
-                if found.somewhere[k, j] > 1.0 + slack:
+                k, j = np.unravel_index(np.argmax(found.lowest), found.lowest.shape)
+                if found.lowest[k, j] > 1.0 + slack:
                     middle = 0.5 * (part.low + part.high)[1:, j]
-                    passed = (found.names[k], float(found.somewhere[k, j]))
+                    passed = (found.names[k], float(found.lowest[k, j]))
                     return Proof(ProofOutcome.REFUTED, slack, names, {}, looked + spent, option,
-                                 tuple(map(float, middle)), passed, many)  # fmt: skip
+                                 tuple(map(float, middle)), passed)  # fmt: skip
                 closed = worst <= 1.0 + slack
                 if spent >= share:
                     closed[:] = True
@@ -182,7 +198,7 @@ def prove(
         outcome = ProofOutcome.OPEN
     elif highest > 1.0 + slack:
         outcome = ProofOutcome.LOOSER
-    return Proof(outcome, slack, names, levels, looked, of_S=many)
+    return Proof(outcome, slack, names, levels, looked)
 
 
 def _first(family: LoopFamily, box: Array) -> Boxes:

@@ -1,58 +1,40 @@
 """Enclosures of S, KS, T and GS over a range of frequencies and a box of uncertain parameters.
 
-With s = y/x, every factor of K and of a mode is a polynomial of x and y, so that frequencies from 0
-to infinity are no special case: x = 1, y = jω below a unit, x = 1/ω, y = j above it; sampled
-x = cos(ωT/2), y = (2j/T) sin(ωT/2), which is w, and z = e^{jωT}. One pole p of the plant, the
-nearest, is multiplied out, the other modes and their conjugates make up R:
+At one frequency each mode enters the plant once, with a matrix of rank one, so that the set of
+plants is a sum of one region per mode. Each is enclosed by a disc (`mode_discs`); the work grows
+with their number and not with that of the boxes' corners. With K = K̂/y and W = M⁻¹,
 
-    G = R + N/D,   K = U/(y^i P),   d = y^i P D + U (R D + N)
-    S = y^i P D/d,   KS = U D/d,   T = U (R D + N)/d,   GS = y^i P (R D + N)/d
+    S = yW,  KS = K̂W,  T = W GK̂,  GS = yW G,   M = y + GK̂,  G = Σ_i g_i c_i b_iᵀ.
 
-so that nothing is singular at a resonance, where L is large and S is not. All are affine forms
-(`affine`) of frequency and parameters. D = s - p, N the residue; sampled D = z - e^{pT} and N the
-answer of the mode to hold and delay. Where d ≠ 0 on the whole axis for all of a connected set of
-plants, no pole crosses it: they are all stable or none is (zero exclusion).
+The mode with the largest disc is taken as it is (`rank_one`), the others at their centres. These,
+y and K̂ differ by Δ in M and by a factor 1 + E of K̂, so that with M₁ = M + Δ
+
+    S₁ - S = T - T₁ = M₁⁻¹(Δ_y T - Δ_GK S),   S₂ = (1 + T₁E)⁻¹S₁,   T₂ = T₁ + T₁E S₂,
+    ‖Σ δ_i c_i b_iᵀ‖² <= ‖Σ r_i a_i c_i c_iᵀ‖ ‖Σ r_i/a_i b_i b_iᵀ‖   for all |δ_i| <= r_i, a_i > 0.
+
+y is that of `boxes`. Where M is regular on the whole axis for all of a connected set of plants, no
+pole crosses it: they are all stable or none is (zero exclusion).
 """
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, variable
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.boxes import Axis, Boxes, Chart, axis_of, gain_of
+from ccd_casadi.fixed_structure.mode_discs import discs_of
+from ccd_casadi.fixed_structure.rank_one import Range, inverses, norm
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
-from ccd_casadi.kernels.sections import INTEGRATOR, REAL
-from ccd_casadi.lti.hold import INSTANT
 from ccd_casadi.support.arrays import Array
 
-
-class Chart(IntEnum):
-    """What the first coordinate of a box is."""
-
-    LOW = 0  # ω over the unit
-    HIGH = 1  # the unit over ω
-    SAMPLED = 2  # ωT
-    POINT = 3  # as LOW or SAMPLED, at ω_low: only S_low counts there
-
-
-@dataclass(frozen=True)
-class Boxes:
-    """N boxes: chart (N,), ends (1 + n_p, N) of the frequency coordinate and the parameters."""
-
-    chart: np.ndarray
-    low: Array
-    high: Array
-
-    def only(self, chosen: np.ndarray) -> "Boxes":
-        """Some of them, by mask or index."""
-        return Boxes(self.chart[chosen], self.low[:, chosen], self.high[:, chosen])
+FAR = 0.5  # relative: a gain that moves more over a box is bounded, not followed
+ENDLESS = 1e100  # rad/s: where weights are at their ends
 
 
 @dataclass(frozen=True)
 class Enclosures:
-    """Per bound (M, N): not below the figure over its bound on a box, and not above it somewhere.
+    """Per bound (M, N): the figure over its bound lies between `lowest` and `highest` on a box.
 
     `spread` (1 + n_p, N) says how much each coordinate moves the loop over the box. `bounded`
     where the loop has no pole on the axis and the plant none right of it.
@@ -60,22 +42,24 @@ class Enclosures:
 
     names: tuple[str, ...]
     highest: Array
-    somewhere: Array
+    lowest: Array
     spread: Array
     bounded: np.ndarray
 
 
 @dataclass(frozen=True)
 class LoopFamily:
-    """One option's loops with a controller κ over the box of `names`; time in 1/`unit`.
+    """One option's loops with one controller over the box of `names`; time in 1/`unit`.
 
-    `plant`, `kappa`, `period` and `delay` in that time, gain in N/m; `bandwidth` in rad/s.
+    `parts`: structure and κ of each channel, `outputs` (p, p) and `inputs` (m, p) their directions.
+    `plant`, κ, `period` and `delay` in that time, gains in N/m; `bandwidth` in rad/s.
     """
 
     plant: ModalSum
     names: tuple[str, ...]
-    structure: Structure
-    kappa: Array
+    parts: tuple[tuple[Structure, Array], ...]
+    outputs: Array
+    inputs: Array
     bounds: Bounds
     bandwidth: float
     unit: float
@@ -84,161 +68,129 @@ class LoopFamily:
 
     def enclose(self, boxes: Boxes) -> Enclosures:
         """All bounds on all boxes."""
-        b = self.bounds
-        x, y, s, turn = self._axis(boxes)
-        modes, damped = self.plant.poles(self.names, boxes.low[1:], boxes.high[1:])
-        factors = [self._factor(p, r, x, y, turn) for p, r in modes]
-        risk = [np.abs(D.centre) / (1e-3 * np.abs(D.centre) + D.reach) for D, _ in factors]
-        nearest = np.argmin(risk, axis=0)
-        D, N = _picked(factors, nearest)
-        R = _others(factors, nearest)
-        U, P = (part.of(len(boxes.low)) for part in self._controller(x, y))
-        open_ = P * y.of(len(boxes.low)) if self.structure.integrator else P
-        through = R * D + N
-        denominator = open_ * D + U * through
-        over = inverse(denominator)
-        above = open_ * D
-        S = above * over
-        point = boxes.chart == Chart.POINT
-        inside = np.where(point, np.inf, 1.0)
-        low, high = self._omega(boxes)
-        below = np.where(~point & (high <= self.bandwidth * (1.0 + 1e-12)), 1.0, np.inf)
-        found = [
-            ("S_MAX", S, b.S_max * inside),
-            ("S_LOW", S, np.where(point, b.S_low, np.inf)),
-            ("LEVEL", S, np.sqrt(0.5) * below),
-        ]
-        if b.shape is not None:
-            counts = below if self.shape_ends_early else inside
-            counts = np.where(low >= self.corner * (1.0 - 1e-12), np.inf, counts)
-            found.append(("SHAPE", *self._risen(S, P * D * over, x, y, low, high, counts)))
-        if b.weighted_level is not None and b.weights is not None:
-            w, level = b.weights, b.weighted_level * inside
-            a, c = (y, x) if self.period is None else (s, 1.0)
-            u = self.unit
-            W_KS = _weight(a, c, w.omega_K / u, w.c_K * w.omega_K / u).of(len(boxes.low))
-            W_T = _weight(a, c, w.omega_T / w.A_l / u, w.omega_T / w.A_u / u).of(len(boxes.low))
-            found.append(("KS", U * D * over * W_KS, level * w.M_K / w.c_K))
-            found.append(("T", U * through * over * W_T, level * w.A_u))
-        if b.compliance_max is not None:
-            free = through if self.period is None else self._free(modes, nearest, D, s)
-            found.append(("GS", open_ * free * over, b.compliance_max * inside))
-        bounded = damped & (denominator.lowest > 0.0)
-        highest = np.array([form.highest / limit for _, form, limit in found])
-        highest = np.where(bounded & ~np.isnan(highest), highest, np.inf)
-        somewhere = np.array([form.at_centre / limit for _, form, limit in found])
-        somewhere = np.where(bounded & np.isfinite(somewhere), somewhere, 0.0)
-        spread = np.abs(denominator.slope) + np.abs(above.slope)
-        return Enclosures(tuple(name for name, _, _ in found), highest, somewhere, spread, bounded)
-
-    def _omega(self, boxes: Boxes) -> tuple[Array, Array]:
-        """The ends of ω in rad/s."""
-        low, high = boxes.low[0], boxes.high[0]
-        if self.period is not None:
-            return low / self.period * self.unit, high / self.period * self.unit
-        upper = boxes.chart == Chart.HIGH
-        with np.errstate(divide="ignore"):
-            return np.where(upper, 1.0 / high, low) * self.unit, np.where(
-                upper, 1.0 / low, high
-            ) * self.unit
-
-    def _axis(self, boxes: Boxes) -> tuple[Affine, Affine, Affine, Affine]:
-        """x, y, s and e^{-sT}; the last two count in sampled loops only."""
-        f = variable(boxes.low[0], boxes.high[0], 0, 1)
-        if self.period is None:
-            upper = boxes.chart == Chart.HIGH
-            one = Affine(np.ones(len(f.centre)), np.zeros_like(f.slope), np.zeros(len(f.centre)))
-            x, y = _either(upper, f, one), _either(upper, one, f) * 1j
-            return x, y, y, one
-        half = exponential(f * 0.5j)
-        back = exponential(f * -0.5j)
-        x, y = (half + back) * 0.5, (half - back) * (1.0 / self.period)
-        return x, y, f * (1j / self.period), back * back
-
-    def _factor(
-        self, p: Affine, residue: Affine, x: Affine, y: Affine, back: Affine
-    ) -> tuple[Affine, Affine]:
-        """D and N of a pole; both vanish together nowhere."""
-        n = len(p.slope)
-        if self.period is None:
-            return y.of(n) - p * x.of(n), residue * x.of(n)
-        T, turn = self.period, back.of(n)
-        whole = np.floor(self.delay / T + INSTANT)
-        rest = max(self.delay - whole * T, 0.0)
-        h = T - rest
-        N = phi(p * h) * h
-        if rest > 0.0:
-            N = N + exponential(p * h) * phi(p * rest) * rest * turn
-        for _ in range(int(whole)):
-            N = N * turn
-        # both times 1/z, of size one on the axis
-        return -(exponential(p * T) * turn) + 1.0, residue * N * turn
-
-    def _free(
-        self, modes: list[tuple[Affine, Affine]], nearest: np.ndarray, D: Affine, s: Affine
-    ) -> Affine:
-        """G(s) D of the continuous plant with the D of a sampled one: (1 - e^{(p-s)T})/(s - p)."""
-        assert self.period is not None
-        s = s.of(len(D.slope))
-        p, residue = _picked(modes, nearest)
-        own = residue * phi((p - s) * self.period) * self.period
-        return _others([(s - q, r) for q, r in modes], nearest) * D + own
-
-    def _controller(self, x: Affine, y: Affine) -> tuple[Affine, Affine]:
-        """U and P of K = U/(y^i P)."""
-        S, values = self.structure, np.exp(self.kappa)
-        above: list[Affine] = []
-        below: list[Affine] = []
-        for kind, sign, at in S.factors[1:].tolist():
-            u = y * (1.0 / values[at])
-            if kind == INTEGRATOR:
-                part = y + x * values[at]
-            else:
-                part = x + u if kind == REAL else x * x + x * u * (2.0 * values[at + 1]) + u * u
-            (above if sign > 0 else below).append(part)
-        one = Affine(np.ones(len(x.centre)), np.zeros_like(x.slope), np.zeros(len(x.centre)))
-        U, P = one * values[0], one
-        for part in above + [x] * S.roll_off:
-            U = U * part
-        for part in below:
-            P = P * part
-        return U, P
-
-    def _risen(
-        self,
-        S: Affine,
-        without: Affine,
-        x: Affine,
-        y: Affine,
-        low: Array,
-        high: Array,
-        counts: Array,
-    ) -> tuple[Affine, Array]:
-        """|S| x/y and its limit, shape ω/(√2 ω_b v); |S| and the box's lowest limit where ω counts
-        as ω_low, and near half the sampling rate, where x is 0.
-        """
-        assert self.bounds.shape is not None
-        n = len(S.slope)
-        v = np.ones(len(low))
-        if self.period is not None:  # ω/v, the least of the box
-            angle = 0.5 * np.minimum(high, 0.5 * np.pi * self.unit / self.period)
-            angle *= self.period / self.unit
-            v = np.where(angle > 0.0, angle / np.tan(np.maximum(angle, 1e-300)), 1.0)
-        top = self.bounds.shape * np.sqrt(0.5) / self.bandwidth
-        late = v < 0.5
-        if self.structure.integrator:
-            limit = np.where(late, top * low, top * self.unit * v)
-            return _either(late, S, without * x.of(n)), limit * counts
-        omega_low = self.bounds.omega_low
-        level = late | (high <= omega_low * (1.0 + 1e-12))
-        rising = S * x.of(n) * inverse(_either(level, x, y)).of(n)
-        limit = np.where(level, top * np.maximum(low, omega_low), top * self.unit * v)
-        return _either(level, S, rising), limit * counts
+        axis = axis_of(boxes, self.period, self.delay)
+        compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
+        held, free, damped = discs_of(
+            self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
+        )
+        gains, loose, faint = self._gains(axis)
+        known = held.known & free.known
+        good = known.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
+        one = np.ones(len(good))
+        y, moved, most = one, 0.0 * one, one
+        if self._integrator:
+            y, moved, most = axis.y.centre, axis.y.reach + axis.y.rest, axis.y.size
+        K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
+        c, b = self.plant.reading, np.repeat(self.plant.drive[:, None], len(good), axis=1)
+        rows = np.einsum("iNm,Nmp->iNp", b, K)
+        m, r = np.where(good, held.middle, 0.0), np.where(good, held.radius, 0.0)
+        size, at = np.linalg.norm(c, axis=1), np.arange(len(good))
+        weight = size[:, None] * np.linalg.norm(rows, axis=2)
+        strong = np.argmax(r * weight, axis=0)
+        others = np.arange(len(c))[:, None] != strong
+        M = y[:, None, None] * np.eye(len(c.T)) + _total(others * m, c, rows)
+        terms = np.abs(y) + (others * np.abs(m) * weight).sum(axis=0)
+        W = inverses(M, terms, c[strong], rows[strong, at], m[strong, at], r[strong, at])
+        w, T = W.norms(), W.from_one(y).norms()
+        # what is left: Δ, of which `faintly` by gains that are not followed, then E
+        grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
+        faintly = (size * np.linalg.norm(self.plant.drive, axis=1)) @ (np.abs(m) + r) * grain
+        delta = _left(others * r, c, rows) + faintly
+        off = delta + moved
+        good &= damped & W.good & (w[0] * off < 1.0)
+        after = w[0] / np.where(good, 1.0 - w[0] * off, 1.0)  # ‖M₁⁻¹‖
+        more = 1.0 + after * off  # of M₁⁻¹ over W
+        apart = after * (np.abs(y) * w[0] * delta + T[0] * (moved + faintly))
+        loose = loose * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
+        by = loose * (T[0] + apart)  # of T₁E
+        good &= by < 1.0
+        by = np.where(good, by, 0.0)
+        over = after / (1.0 - by)
+        apart = apart + by * most * over
+        S = np.minimum(most * over, np.abs(y) * w[0] + apart), np.abs(y) * w[1] - apart
+        found = self._of_S(boxes, S, over)
+        if level is not None:
+            k = W.behind(K).norms()
+            turned = loose * over * (norm(K) + k[0] * more * (most + faintly))  # of K̂T₁E M₂⁻¹
+            upper = (1.0 + loose) * (k[0] * more + turned) + grain * over
+            lower = (1.0 - loose) * (k[1] - k[0] * after * off - turned) - grain * over
+            found += self._weighted(boxes, level, (upper, lower), (T[0] + apart, T[1] - apart))
+        if compliance is not None:
+            g, e = np.where(good, free.middle, 0.0), np.where(good, free.radius, 0.0)
+            h = W.times(_total(g, c, b)).norms()
+            change = most * after * _left(e, c, b)
+            change += (np.abs(y) * after * off + moved * more) * h[0]
+            inside = compliance * self._inside(boxes)
+            upper = (np.abs(y) * h[0] + change) / (1.0 - by) / inside
+            lower = (np.abs(y) * h[1] - change) / (1.0 + by) / inside
+            found.append(("GS", upper, lower))
+        weight[strong, at] = np.where(
+            W.good, W.reach / (w[0] ** 2 * np.maximum(r[strong, at], 1e-300)), weight[strong, at]
+        )
+        shares = np.where(np.isfinite(held.shares), held.shares, 0.0)
+        spread = np.einsum("iN,ikN->kN", np.where(known, weight, 1.0), shares)
+        spread[0] += moved + most * loose
+        names, most_at, least_at = zip(*found, strict=True)
+        highest, lowest = np.array(most_at), np.array(least_at)
+        highest = np.where(good & ~np.isnan(highest), highest, np.inf)
+        lowest = np.where(good & np.isfinite(lowest), lowest, 0.0)
+        return Enclosures(names, highest, lowest, spread, good)
 
     @property
-    def shape_ends_early(self) -> bool:
-        """Whether the shape counts below ω_b only."""
-        return self.bounds.shape_ends is ShapeEnd.CROSSING
+    def _integrator(self) -> bool:
+        return all(own.integrator for own, _ in self.parts)
+
+    def _gains(self, axis: Axis) -> tuple[np.ndarray, Array, Array]:
+        """K̂ of every channel in the middle (N, c), and how far K̂ lies from it at most, relative
+        (N,); where that is far, as at infinity, the middle is 0 and |K̂| is in the last (N, c)."""
+        found, faint, loose = [], [], np.zeros(len(axis.x.centre))
+        for structure, kappa in self.parts:
+            K = gain_of(structure, kappa, axis, self._integrator)
+            radius = K.reach + K.rest
+            near = radius < FAR * np.abs(K.centre)
+            found.append(np.where(near, K.centre, 0.0))
+            faint.append(np.where(near, 0.0, np.abs(K.centre) + radius))
+            loose = np.maximum(loose, np.where(near, radius / np.abs(K.centre), 0.0))
+        return np.array(found).T, loose, np.array(faint).T
+
+    def _inside(self, boxes: Boxes) -> Array:
+        """1, and infinite at the point that is not part of the axis."""
+        return np.where(boxes.chart == Chart.POINT, np.inf, 1.0)
+
+    def _of_S(self, boxes: Boxes, S: Range, over: Array) -> list[tuple[str, Array, Array]]:
+        """(name, figure over its bound at most, at least) of every bound on S; `over`: ‖S/y‖."""
+        b, inside = self.bounds, self._inside(boxes)
+        low, high = boxes.omega(self.unit, self.period)
+        point = boxes.chart == Chart.POINT
+        below = np.where(~point & (high <= self.bandwidth * (1.0 + 1e-12)), 1.0, np.inf)
+        limits = {
+            "S_MAX": b.S_max * inside,
+            "S_LOW": np.where(point, b.S_low, np.inf),
+            "LEVEL": np.sqrt(0.5) * below,
+        }
+        found = [(name, S[0] / limit, S[1] / limit) for name, limit in limits.items()]
+        if b.shape is not None:
+            until = below if b.shape_ends is ShapeEnd.CROSSING else inside
+            until = np.where(low >= self.corner * (1.0 - 1e-12), np.inf, until)
+            top = b.shape * np.sqrt(0.5) / self.bandwidth
+            # |y| <= ω/unit, so that near 0 |S|/ω is bounded with an integrator
+            rising = over / self.unit if self._integrator else S[0] / np.maximum(low, b.omega_low)
+            rising = np.minimum(rising, S[0] / np.maximum(low, 1e-300))
+            least = S[1] / np.maximum(high, b.omega_low)
+            found.append(("SHAPE", rising / (top * until), least / (top * until)))
+        return found
+
+    def _weighted(
+        self, boxes: Boxes, level: float, KS: Range, T: Range
+    ) -> list[tuple[str, Array, Array]]:
+        """The same of KS and T; |W_KS| and |W_T| are monotone in ω."""
+        assert self.bounds.weights is not None
+        ends = [np.minimum(omega, ENDLESS) for omega in boxes.omega(self.unit, self.period)]
+        weights = np.abs([self.bounds.weights.responses(omega) for omega in ends])[:, 1:]
+        limit = level * self._inside(boxes)
+        return [(name, weights[:, i].max(axis=0) * most / limit,
+                 weights[:, i].min(axis=0) * least / limit)
+                for i, (name, (most, least)) in enumerate((("KS", KS), ("T", T)))]  # fmt: skip
 
     @property
     def corner(self) -> float:
@@ -247,29 +199,15 @@ class LoopFamily:
         return np.inf if b.shape is None else b.S_max * np.sqrt(2.0) / b.shape * self.bandwidth
 
 
-def _weight(y: Affine, x: Affine | float, zero: float, pole: float) -> Affine:
-    """(s + zero)/(s + pole) at s = y/x."""
-    return (y + x * zero) * inverse(y + x * pole)
+def _total(g: np.ndarray, c: Array, rows: np.ndarray) -> np.ndarray:
+    """Σ g_i c_i row_iᵀ (N, p, q) of g (n, N), c (n, p) and rows (n, N, q)."""
+    return np.asarray(np.einsum("iN,ip,iNq->Npq", g, c, rows))
 
 
-def _either(chosen: np.ndarray, first: Affine, second: Affine) -> Affine:
-    return Affine(np.where(chosen, first.centre, second.centre),
-                  np.where(chosen, first.slope, second.slope),
-                  np.where(chosen, first.rest, second.rest))  # fmt: skip
-
-
-def _picked(pairs: list[tuple[Affine, Affine]], which: np.ndarray) -> tuple[Affine, Affine]:
-    first, second = pairs[0]
-    for i, (a, b) in enumerate(pairs[1:], 1):
-        first, second = _either(which == i, a, first), _either(which == i, b, second)
-    return first, second
-
-
-def _others(pairs: list[tuple[Affine, Affine]], which: np.ndarray) -> Affine:
-    """Σ N/D without the pair that is picked."""
-    m = len(which)
-    total = Affine(np.zeros(m), np.zeros_like(pairs[0][0].slope), np.zeros(m))
-    for i, (D, N) in enumerate(pairs):
-        term = N * inverse(D)
-        total = _either(which == i, total, total + term)
-    return total
+def _left(radius: Array, c: Array, rows: np.ndarray) -> Array:
+    """Its norm at most for any |g_i| <= radius_i."""
+    share = np.linalg.norm(rows, axis=2) + 1e-30
+    share /= np.linalg.norm(c, axis=1)[:, None] + 1e-30
+    one = np.einsum("iN,ip,iq->Npq", radius * share, c, c)
+    two = np.einsum("iN,iNp,iNq->Npq", radius / share, rows.conj(), rows)
+    return np.asarray(np.sqrt(norm(one) * norm(two)))

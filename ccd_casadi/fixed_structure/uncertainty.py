@@ -161,11 +161,10 @@ class UncertainPlant:
 
 @dataclass(frozen=True)
 class ModalSum:
-    """One option of an uncertain plant as Σ b_i c_i/(s² + g_i s + k_i), time in 1/`unit`, SI else.
+    """One option of an uncertain plant as Σ c_i b_iᵀ/(s² + g_i s + k_i), time in 1/`unit`, SI else.
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
-    `rigid` ones have their suspension's instead. `drive` (n, m), `reading` (n, p) are b_i and c_i,
-    `strength` the products of the first of each.
+    `rigid` ones have their suspension's instead. `drive` (n, m), `reading` (n, p) are b_i and c_i.
     """
 
     omega: Array
@@ -173,48 +172,41 @@ class ModalSum:
     suspended: tuple[float, float]
     given: Array
     zeta: float
-    strength: Array
     drive: Array
     reading: Array
 
-    def only(self, i: int) -> "ModalSum":
-        """Its mode number i alone, of unit strength."""
-        own = {name: getattr(self, name)[i : i + 1] for name in
-               ("omega", "rigid", "given", "drive", "reading")}  # fmt: skip
-        return replace(self, strength=np.ones(1), **own)
+    def shift_of(self, i: int) -> str:
+        """The parameter that shifts mode i alone; none shifts a rigid one."""
+        return "" if self.rigid[i] else f"mode_shift {int((~self.rigid[: i + 1]).sum())}"
 
     def poles(
-        self, names: tuple[str, ...], low: Array, high: Array
+        self, i: int, names: tuple[str, ...], low: Array, high: Array
     ) -> tuple[list[tuple[Affine, Affine]], np.ndarray]:
-        """(p, residue) of every mode's two poles over boxes (n_p, N) of the parameters `names`;
-        where all modes stay damped. Variable 0 of the forms is left to the frequency.
+        """(p, residue) of mode i's two poles over boxes (n_p, N) of the parameters `names`, of unit
+        strength; where it stays damped. Variable 0 of the forms is left to the frequency.
         """
         n, m = len(low) + 1, low.shape[1]
         one = Affine(np.ones(m), np.zeros((n, m)), np.zeros(m))
-        values = {name: variable(low[i], high[i], i + 1, n) for i, name in enumerate(names)}
-        shift = values["resonance_shift"] + 1.0 if "resonance_shift" in values else one
+        values = {name: variable(low[k], high[k], k + 1, n) for k, name in enumerate(names)}
         factor = values.get("damping", one)
+        if self.rigid[i]:
+            w_r, ratio = self.suspended
+            k, g = one * w_r**2, one * (2.0 * ratio * w_r) + factor * self.given[i]
+            damped = _least(g) > 0.0
+        else:
+            w = one * self.omega[i]
+            for name in ("resonance_shift", self.shift_of(i)):
+                w = w * (values[name] + 1.0) if name in values else w
+            own = w * (2.0 * self.zeta) + self.given[i]
+            k, g = w * w, factor * own
+            damped = (_least(w) > 0.0) & (_least(own) > 0.0) & (_least(factor) > 0.0)
+        half = g * 0.5
+        under = k - half * half
+        light = under.centre.real > 0.0
+        swing = root(under * np.where(light, 1.0, -1.0)) * np.where(light, 1j, 1.0)
         gain = values["gain"] + 1.0 if "gain" in values else one
-        found, damped, flexible = [], np.ones(m, bool), 0
-        for i, omega in enumerate(self.omega):
-            if self.rigid[i]:
-                w_r, ratio = self.suspended
-                k, g = one * w_r**2, one * (2.0 * ratio * w_r) + factor * self.given[i]
-                damped &= _least(g) > 0.0
-            else:
-                flexible += 1
-                own = values.get(f"mode_shift {flexible}")
-                w = shift * omega if own is None else shift * (own + 1.0) * omega
-                own_g = w * (2.0 * self.zeta) + self.given[i]
-                k, g = w * w, factor * own_g
-                damped &= (_least(w) > 0.0) & (_least(own_g) > 0.0) & (_least(factor) > 0.0)
-            half = g * 0.5
-            under = k - half * half
-            light = under.centre.real > 0.0
-            swing = root(under * np.where(light, 1.0, -1.0)) * np.where(light, 1j, 1.0)
-            residue = gain * inverse(swing * 2.0) * self.strength[i]
-            found += [(swing - half, residue), (-swing - half, -residue)]
-        return found, damped
+        residue = gain * inverse(swing * 2.0)
+        return [(swing - half, residue), (-swing - half, -residue)], damped
 
 
 def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum | None:
@@ -234,7 +226,7 @@ def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum |
     return ModalSum(
         modal.natural / unit, modal.rigid,
         (w_r / unit, uncertain.suspension.damping_ratio), diagonal / unit, zeta,
-        modal.B[:, 0] * modal.C[0] / unit**2, modal.B / unit**2, modal.C.T,
+        modal.B / unit**2, modal.C.T,
     )  # fmt: skip
 
 

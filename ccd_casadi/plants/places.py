@@ -191,7 +191,8 @@ class PlacedMechanics:
             for label, at, colour, marker in kinds:
                 curves += [_dots(at, label, colour, marker)] if len(at) else []
                 rows += [(title, label, *(1e3 * p for p in point)) for point in at]
-            panels.append(Panel("x (mm)", "y (mm)", tuple(curves), title=title))
+            flat = self.between.nodes.shape[1] > 1
+            panels.append(Panel("x (mm)", "y (mm)", tuple(curves), title=title, equal=flat))
         axes = ("x (mm)", "y (mm)")[: self.between.nodes.shape[1]]
         return Figure(
             Lines((tuple(panels),), "where forces and sensors stand", (3.6,)),

@@ -88,10 +88,10 @@ def gain_panels(views: Sequence[LoopView], *, bounds: bool = True) -> list[Panel
     return [_gain_panel(views, i, bounds) for i in range(len(NAMES))]
 
 
-def S_panel(view: LoopView, **more: Any) -> Panel:
+def S_panel(view: LoopView) -> Panel:
     """S of one design with what is asked of it, its highest peak alone marked."""
-    marks = _peak_marks(_high_peaks(view)[:1], BLACK)
-    return _gain_panel([view], 0, view.bounded.asked, **{"marks": tuple(marks), **more})
+    marks = tuple(_peak_marks(_high_peaks(view)[:1], BLACK))
+    return _gain_panel([view], 0, view.bounded.asked, marks=marks)
 
 
 def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) -> Panel:

@@ -8,7 +8,6 @@ from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel,
 from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
-from ccd_casadi.reporting.landscape import predicted
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, number
@@ -34,17 +33,17 @@ class Slice:
 
 def slices_data(
     problem: CoDesignProblem,
-    processes: tuple[GaussianProcess, ...],
+    process: GaussianProcess | None,
     truths: Truths,
     theta: tuple[float, ...],
 ) -> list[Slice]:
     """Along every parameter through θ: prediction, deviation, and the truths nearby.
 
-    Without surrogates the feasible designs nearby stand for the truths.
+    Without a surrogate the feasible designs nearby stand for the truths.
     """
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     known, values = truths.theta, truths.bandwidth_hz
-    if not processes:
+    if process is None:
         inside = [s for s in truths.designs if feasible(problem, s)]
         known = np.array([s.theta for s in inside]).reshape(-1, len(lower))
         values = np.array([s.bandwidth / HZ for s in inside])
@@ -55,20 +54,21 @@ def slices_data(
         points[:, k] = axis
         empty = np.full(SLICE, np.nan)
         bandwidth, deviation = (
-            predicted(problem, processes, points, std=True) if processes else (empty, empty)
+            (empty, empty) if process is None else process.predict(points, return_std=True)
         )
         away = np.abs((known - np.array(theta)) / (upper - lower))
         away[:, k] = 0.0
         near = (away.max(axis=1) <= NEARBY) & np.isfinite(values)
         dots = np.column_stack([factor * known[near, k], values[near]])
         at = factor * float(theta[k])
-        found.append(Slice(name, unit, factor * axis, bandwidth, deviation, dots, at))
+        hz = bandwidth / HZ, deviation / HZ
+        found.append(Slice(name, unit, factor * axis, *hz, dots, at))
     return found
 
 
-def slices_figure(slices: list[Slice], best_hz: float, extra: str, *, lifted: bool) -> Figure:
+def slices_figure(slices: list[Slice], best_hz: float, extra: str) -> Figure:
     """One small panel a parameter; `extra` ends the caption."""
-    caption = _caption(slices, best_hz, lifted) + extra
+    caption = _caption(slices, best_hz) + extra
     return Figure(_lines(slices, best_hz), caption, _tables(slices))
 
 
@@ -110,7 +110,7 @@ def _panel(item: Slice, y_range: tuple[float, float], legend: bool) -> Panel:
     )
 
 
-def _caption(slices: list[Slice], best_hz: float, lifted: bool) -> str:
+def _caption(slices: list[Slice], best_hz: float) -> str:
     """Along which parameter the bandwidth changes most, and how sure the surrogate is."""
     spans = [(float(np.nanmax(s.bandwidth_hz) - np.nanmin(s.bandwidth_hz)), s) for s in slices
              if np.isfinite(s.bandwidth_hz).any()]  # fmt: skip
@@ -119,14 +119,12 @@ def _caption(slices: list[Slice], best_hz: float, lifted: bool) -> str:
     words += f" ({number(best_hz)} Hz there, dashed line); dots: true values"
     words += f" within {100 * NEARBY:.0f} % of the box." if many else "."
     if not spans:
-        return words + " The direct formulation makes no surrogate: the dots are its own designs."
+        return words + " No surrogate is of ω_b*(θ) alone: the dots are the run's own designs."
     largest, item = max(spans, key=lambda pair: pair[0])
     widest = max(float(np.max(1.96 * s.deviation_hz)) for _, s in spans)
     most = "changes most along" if many else "changes along"
     words += f" It {most} {item.name}, by {number(largest, 3)} Hz over the range"
     words += f"; the 95 % band is at most ±{number(widest, 2)} Hz"
-    if lifted:  # the other two surrogates decide where S_max and S_low bind
-        words += " (of ω_b at the maximising design; errors of the bounds on S are not in it)"
     return words + "."
 
 

@@ -42,6 +42,7 @@ from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.landscape import (
+    bandwidth_process,
     caption_disagreement,
     caption_landscape,
     landscape_data,
@@ -206,28 +207,24 @@ def design_section(problem: CoDesignProblem, result: Mapping[str, Any]) -> Secti
 def _theta(
     problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign", truths: Truths
 ) -> Section:
-    outcome = solution.outcome
-    processes, iterates = outcome.surrogates, outcome.iterates
+    iterates = solution.outcome.iterates
+    process = bandwidth_process(solution.outcome.surrogates)
     best = float(solution.result["bandwidth_hz"])
     missed = solution.quality[0].missed if solution.quality else None
-    extra = caption_disagreement(problem, processes, truths, verified.theta, missed)
+    extra = caption_disagreement(problem, process, truths, verified.theta, missed)
     if len(problem.names) == 2:
         radius = iterates[-1].radius if iterates else 1.0
-        land = landscape_data(problem, processes, truths, radius, verified.theta)
+        land = landscape_data(problem, process, truths, radius, verified.theta)
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
         paths = (ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
-        error_hz = 0.0 if missed is None else abs(missed.error)
-        lifted = len(processes) > 1
-        caption = caption_landscape(land, best, lifted=lifted, error_hz=error_hz) + extra
-        figure = Figure(land, caption, tables_landscape(land))
+        figure = Figure(land, caption_landscape(land, best) + extra, tables_landscape(land))
         return Section("Bandwidth over the hardware", (figure,))
-    slices = slices_data(problem, processes, truths, verified.theta)
+    slices = slices_data(problem, process, truths, verified.theta)
     if not any(len(s.near) or np.isfinite(s.bandwidth_hz).any() for s in slices):
         words = "There is no surrogate, and no design near the optimum to show in its place."
         return Section("Bandwidth over the hardware", (Words(words),))
-    figure = slices_figure(slices, best, extra, lifted=len(processes) > 1)
-    return Section("Bandwidth over the hardware", (figure,))
+    return Section("Bandwidth over the hardware", (slices_figure(slices, best, extra),))
 
 
 def stage_sections(

@@ -254,7 +254,7 @@ def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searc
     known = dict(zip(map(tuple, truths.theta.tolist()), truths.bandwidth_hz, strict=True))
     assert known[searched_look.theta] == pytest.approx(searched_look.bandwidth_hz, rel=EQUAL)
     assert np.isnan(known.get(live.theta, np.nan))  # one synthesis is no ω_b*(θ)
-    drawn, _ = landscape_of(problem, searched_look.theta, None, (), session.store.path, (0, 1))
+    drawn, _ = landscape_of(problem, searched_look.theta, None, None, session.store.path, (0, 1))
     assert searched_look.theta in {(x, y) for x, y, _ in drawn.truths.tolist()}
 
 

@@ -8,10 +8,11 @@ from fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
 from helpers import HZ, SUSPENSION, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
-from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, root, variable
+from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, root, variable
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
+from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
+from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
@@ -90,8 +91,9 @@ def test_enclosures_hold_at_the_corners_of_small_boxes(sampling, structure) -> N
     box = replace(BOX, resonance_shift=0.0, damping=(1.0, 1.0))
     plant, bandwidth = modal_sum(box, 0, unit), 20.0 * HZ
     assert plant is not None
-    family = LoopFamily(plant, box.names, structure, structure.in_units(kappa, 1.0 / unit, 1.0),
-                        BOUNDS, bandwidth, unit, period, delay)  # fmt: skip
+    parts = ((structure, structure.in_units(kappa, 1.0 / unit, 1.0)),)
+    family = LoopFamily(plant, box.names, parts, np.eye(1), np.eye(1), BOUNDS, bandwidth, unit,
+                        period, delay)  # fmt: skip
     omega, gain = np.exp(rng.uniform(*np.log([2.0 * HZ, 400.0 * HZ]), count)), np.zeros(count)
     middle = np.vstack([omega, gain])
     half = 10.0 ** rng.uniform(-5.0, -3.0, (2, count)) * np.vstack([omega, np.ones(count)])
@@ -116,7 +118,8 @@ def test_enclosures_hold_at_the_corners_of_small_boxes(sampling, structure) -> N
         if curve is Curve.SHAPE:  # beyond it S_max says more
             highest, value = highest[rising], value[rising]
         assert (value <= highest * (1.0 + 1e-9)).all()
-        assert np.median(1.0 - value / highest) < 1e-4
+        lost, size = 1.0 - value / highest, (half / np.vstack([omega, np.ones(count)])).max(axis=0)
+        assert np.median(lost / (size[rising] if curve is Curve.SHAPE else size)) < 10.0
 
 
 def test_an_unstable_corner_is_never_proven() -> None:
@@ -168,7 +171,7 @@ def encloses(form: Affine, t: Array, value: np.ndarray) -> bool:
     """The value lies within the form at t, and its size within the form's bounds."""
     near = np.abs(value - form.centre - (form.slope * t).sum(0)) <= form.rest
     size = np.abs(value)
-    return bool((near & (size <= form.highest) & (size >= form.lowest)).all())
+    return bool((near & (size <= form.size) & (size >= form.lowest)).all())
 
 
 def test_affine_forms_enclose_what_they_say() -> None:
@@ -181,9 +184,6 @@ def test_affine_forms_enclose_what_they_say() -> None:
     assert encloses(f * f * g, t, a * a * b)
     assert encloses(inverse(f), t, 1.0 / a)
     assert encloses(exponential(f), t, np.exp(a))
-    assert encloses(phi(f), t, np.expm1(a) / a)
-    small = f * 1e-6
-    assert encloses(phi(small), t, 1.0 + 0.5e-6 * a + a**2 * 1e-12 / 6.0)
     x = variable(np.array([1.0]), np.array([2.0]), 1, 3)
     here = np.array([[0.0], [0.7], [0.0]])
     assert encloses(root(x * x), here, np.array([1.85]))

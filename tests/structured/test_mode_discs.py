@@ -10,11 +10,13 @@ from helpers import HZ, SUSPENSION
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
+from ccd_casadi.fixed_structure.boxes import Boxes, Chart
+from ccd_casadi.fixed_structure.certificate_responses import Responses
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
-from ccd_casadi.fixed_structure.enclosure import Boxes, Chart
-from ccd_casadi.fixed_structure.mode_discs import ChannelFamily, quotient
+from ccd_casadi.fixed_structure.enclosure import LoopFamily
+from ccd_casadi.fixed_structure.mode_discs import quotient
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.plants.plant import Mechanics
 
 # two carts of two masses, a weak spring and unlike places of drive and reading between them
@@ -103,8 +105,9 @@ def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
     assert plant is not None
     parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
     period, delay = (sampling.period * unit, sampling.delay * unit) if sampling else (None, 0.0)
-    family = ChannelFamily(plant, BOX.names, *parts[0], replace(BOUNDS, shape=None), 1.0, unit,
-                           period, delay, parts, np.eye(2), np.eye(2))  # fmt: skip
+    bounds = replace(BOUNDS, shape=None)
+    family = LoopFamily(plant, BOX.names, parts, np.eye(2), np.eye(2), bounds, 1.0, unit, period,
+                        delay)  # fmt: skip
     middle = np.vstack([np.exp(rng.uniform(*np.log([1.0, 2500.0]), count)),
                         BOX.box[0][:, None] + rng.random((len(BOX.names), count))
                         * (BOX.box[1] - BOX.box[0])[:, None]])  # fmt: skip
@@ -118,18 +121,33 @@ def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
     scale[0] = (period or 1.0) / unit
     chart = np.full(count, Chart.LOW if sampling is None else Chart.SAMPLED)
     found = family.enclose(Boxes(chart, low * scale, high * scale))
-    k = found.names.index("S_MAX")
     assert found.bounded.mean() > 0.5
+    assert bounds.weighted_level is not None
+    assert bounds.compliance_max is not None
+    limits = {
+        "S_MAX": ("S", bounds.S_max),
+        "KS": ("weighted KS", bounds.weighted_level),
+        "T": ("weighted T", bounds.weighted_level),
+        "GS": ("GS", bounds.compliance_max),
+    }
     for i in range(count):
         for _ in range(3):
             share = rng.random(len(low)) if rng.random() < 0.5 else rng.integers(0, 2, len(low))
             at = low[:, i] + share * (high[:, i] - low[:, i])
-            loop = Loop(BOX.plant(at[1:]).plant_si(), K, sampling)
-            S = np.linalg.norm(loop.sensitivity(at[:1])[0], 2) / BOUNDS.S_max
-            assert found.somewhere[k, i] * (1.0 - 1e-9) <= S <= found.highest[k, i] * (1.0 + 1e-9)
+            free = BOX.plant(at[1:]).plant_si()
+            G, own = free, K
+            if sampling is not None:
+                G, own = sampled(free, sampling.period, sampling.delay), tustin(K, sampling.period)
+            table = Responses([free], [G], own, sampling, bounds).at(np.array([0]), at[None, :1])
+            for name, (figure, limit) in limits.items():
+                k, value = found.names.index(name), table[figure][0, 0] / limit
+                assert found.lowest[k, i] * (1.0 - 1e-9) <= value
+                assert value <= found.highest[k, i] * (1.0 + 1e-9)
     small = (half / wide).max(axis=0) < 1e-3
-    spread = found.highest[k] / np.maximum(found.somewhere[k], 1e-9)
-    assert not small.any() or np.median(spread[small]) < 1.5
+    for name in limits:
+        k = found.names.index(name)
+        spread = found.highest[k] / np.maximum(found.lowest[k], 1e-9)
+        assert not small.any() or np.median(spread[small]) < 1.5
 
 
 def test_a_disc_holds_a_quotient_even_where_its_denominator_may_be_nought() -> None:
@@ -151,3 +169,27 @@ def test_a_disc_holds_a_quotient_even_where_its_denominator_may_be_nought() -> N
         )
         value = (N.centre + (N.slope * t).sum(0)) / (D.centre + (D.slope * t).sum(0))
         assert (np.abs(value - centre) <= radius * (1.0 + 1e-9)).all()
+
+
+def test_every_figure_of_several_channels_is_proven_where_the_boxes_suffice() -> None:
+    box = replace(BOX, mode_shift=0.0, damping=(1.0, 1.0), gain=0.01)
+    judged = certify(box.plants(box.corners()), BOTH.state_space(KAPPA), BOUNDS, LATE).worst
+    assert BOUNDS.weighted_level is not None
+    assert BOUNDS.compliance_max is not None
+    bounds = replace(
+        BARE,
+        S_max=BOUNDS.S_max * judged["S_max"],
+        weighted_level=BOUNDS.weighted_level * max(judged["KS"], judged["T"]),
+        weights=WEIGHTS,
+        compliance_max=BOUNDS.compliance_max * judged["GS"],
+    )
+    proof = prove(box, BOTH, KAPPA, 1.0, bounds, LATE)
+    assert proof.proven
+    assert not proof.of_S
+    assert {"S_MAX", "KS", "T", "GS"} <= set(proof.levels)
+    few = prove(box, BOTH, KAPPA, 1.0, bounds, LATE, most_boxes=proof.boxes // 3)
+    assert few.of_S or not few.proven
+    tight = replace(bounds, compliance_max=0.9 * bounds.compliance_max)
+    refuted = prove(box, BOTH, KAPPA, 1.0, tight, LATE, slack=1e-3)
+    assert refuted.outcome is ProofOutcome.REFUTED
+    assert refuted.passed[0] == "GS"

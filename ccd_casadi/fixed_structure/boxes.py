@@ -1,0 +1,118 @@
+"""Boxes of frequency and uncertain parameters, and what a loop is made of as forms on them.
+
+s = y/x, so that frequencies from 0 to infinity are no special case: x = 1, y = jω below a unit,
+x = 1/ω, y = j above it; sampled x = cos(ωT/2), y = (2j/T) sin(ωT/2), z = e^{jωT}.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, variable
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.kernels.sections import INTEGRATOR, REAL
+from ccd_casadi.lti.hold import parts
+from ccd_casadi.support.arrays import Array
+
+Pair = tuple[Affine, Affine]  # D and N of N/D, or a pole and its residue
+
+
+class Chart(IntEnum):
+    """What the first coordinate of a box is."""
+
+    LOW = 0  # ω over the unit
+    HIGH = 1  # the unit over ω
+    SAMPLED = 2  # ωT
+    POINT = 3  # as LOW or SAMPLED, at ω_low: only S_low counts there
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """N boxes: chart (N,), ends (1 + n_p, N) of the frequency coordinate and the parameters."""
+
+    chart: np.ndarray
+    low: Array
+    high: Array
+
+    def only(self, chosen: np.ndarray) -> "Boxes":
+        """Some of them, by mask or index."""
+        return Boxes(self.chart[chosen], self.low[:, chosen], self.high[:, chosen])
+
+    def omega(self, unit: float, period: float | None) -> tuple[Array, Array]:
+        """The ends of ω in rad/s."""
+        if period is not None:
+            return self.low[0] / period * unit, self.high[0] / period * unit
+        upper = self.chart == Chart.HIGH
+        with np.errstate(divide="ignore"):
+            first = np.where(upper, 1.0 / self.high[0], self.low[0])
+            last = np.where(upper, 1.0 / self.low[0], self.high[0])
+        return first * unit, last * unit
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Frequencies as forms of variable 0: s = y/x, e^{-sT}; period (None: continuous) and delay."""
+
+    x: Affine
+    y: Affine
+    s: Affine
+    turn: Affine
+    period: float | None
+    delay: float
+
+    def factor(self, p: Affine, residue: Affine) -> Pair:
+        """D and N of a pole, both times x; they vanish together nowhere."""
+        n = len(p.slope)
+        if self.period is None:
+            return self.y.of(n) - p * self.x.of(n), residue * self.x.of(n)
+        T, turn = self.period, self.turn.of(n)
+        whole, rest = parts(T, self.delay)
+        all_of, early = exponential(p * T), exponential(p * (T - rest))
+        N = early - 1.0 + (all_of - early) * turn
+        for _ in range(whole):
+            N = N * turn
+        # both times 1/z, of size one on the axis
+        return -(all_of * turn) + 1.0, residue * N * inverse(p) * turn
+
+
+def axis_of(boxes: Boxes, period: float | None, delay: float) -> Axis:
+    """The frequencies of boxes."""
+    f = variable(boxes.low[0], boxes.high[0], 0, 1)
+    if period is None:
+        upper = boxes.chart == Chart.HIGH
+        one = Affine(np.ones(len(f.centre)), np.zeros_like(f.slope), np.zeros(len(f.centre)))
+        x, y = _either(upper, f, one), _either(upper, one, f) * 1j
+        return Axis(x, y, y, one, None, 0.0)
+    half = exponential(f * 0.5j)
+    back = exponential(f * -0.5j)
+    x, y = (half + back) * 0.5, (half - back) * (1.0 / period)
+    return Axis(x, y, f * (1j / period), back * back, period, delay)
+
+
+def gain_of(structure: Structure, kappa: Array, axis: Axis, integrator: bool) -> Affine:
+    """K of a structure, where all channels have an `integrator` y K."""
+    values, x, y = np.exp(kappa), axis.x, axis.y
+    one = Affine(np.ones(len(x.centre)), np.zeros_like(x.slope), np.zeros(len(x.centre)))
+    above, below = one * values[0], one
+    for kind, sign, at in structure.factors[1:].tolist():
+        u = y * (1.0 / values[at])
+        if kind == INTEGRATOR:
+            part = y + x * values[at]
+        else:
+            part = x + u if kind == REAL else x * x + x * u * (2.0 * values[at + 1]) + u * u
+        if sign > 0:
+            above = above * part
+        else:
+            below = below * part
+    for _ in range(structure.roll_off):
+        above = above * x
+    if structure.integrator and not integrator:
+        below = below * y
+    return above * inverse(below)
+
+
+def _either(chosen: np.ndarray, first: Affine, second: Affine) -> Affine:
+    return Affine(np.where(chosen, first.centre, second.centre),
+                  np.where(chosen, first.slope, second.slope),
+                  np.where(chosen, first.rest, second.rest))  # fmt: skip
