@@ -68,7 +68,7 @@ def standing_html(
 
 def survival_words(curves: Curves) -> str:
     """The margins of the loop that is drawn, and whether its controller is stable by itself."""
-    m, unstable = curves.view.margins, curves.controller_poles
+    m, unstable = curves.view.margins, curves.poles[1]
     unstable = unstable[(unstable.real > 1e-9 * np.abs(unstable)) & (unstable.imag >= 0.0)]
     gain = f"gain × {number(m.gain_down, 3)} to {number(m.gain_up, 3)}"
     margins = "the loop drawn is unstable: no margins" if curves.unstable else (
