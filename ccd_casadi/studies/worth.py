@@ -1,4 +1,9 @@
-"""What co-design gains over the sequential way, from a few true designs and their derivatives."""
+"""What co-design gains over the sequential way, from a few true designs and their derivatives.
+
+Both designs are true, so the gain is one that can be had. What a full solve would find besides is
+not bounded: where the global check was left out, the gain on a table of modes was 35 points of
+hardware cost too small, and the model, a few per cent wrong where it was tried, did not show it.
+"""
 
 from collections.abc import Mapping
 from time import perf_counter
@@ -16,13 +21,14 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
-from ccd_casadi.studies.sequential import design_hardware
+from ccd_casadi.studies.sequential import design_hardware, first_resonance
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ, number
 from surrogates import design
 
 SECONDS = 20.0  # after which no further round begins
 STARTS = 8  # of IPOPT, on the hardware and on the surrogates
+EVALUATIONS = 20  # of the plant, that one of these on the hardware takes at least
 LOOKS = 8  # true inner problems over the box for each parameter
 SETTLED = 1e-3  # of |J|: a round that gains less, as expected, is the last
 SIGMAS = 2.0  # of the surrogate's error at left-out samples
@@ -34,8 +40,10 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     Raises UserError where too few designs are certified to learn from, or none is feasible.
     """
     began, rule = perf_counter(), HZ * case.baseline.first_resonance_hz
+    first_resonance(sampler.problem, np.array(sampler.problem.start))
+    slow = (perf_counter() - began) * EVALUATIONS > SECONDS  # finite elements: the start alone
     hardware = design_hardware(
-        sampler.problem, rule, starts=STARTS, seed=seed, workers=sampler.workers
+        sampler.problem, rule, starts=0 if slow else STARTS, seed=seed, workers=sampler.workers
     )
     outer = outer_of(sampler).prepared(seed)
     sampler, problem = outer.sampler, outer.problem
@@ -44,11 +52,12 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     known = sampler.bandwidths(np.array([hardware.theta, problem.start]), "first designs")
     for i in range(0, len(spread), 2 * count):
         if perf_counter() - began < 0.5 * SECONDS:
-            known += sampler.bandwidths(spread[i : i + 2 * count], "a look over the box")
+            known += sampler.bandwidths(spread[i : i + 2 * count], "global check")
     best = min(known, key=lambda sample: _value(problem, sample))
     learner = outer.learner(LOOKS // 2 * len(outer.bounds[0]), seed)
     learner.begin(None)
     feasible = [sample for sample in known if sample.feasible]
+    missed = [learner.predicted(learner.point(sample)) - sample.value for sample in feasible]
     learner.learn(np.array([learner.point(sample) for sample in feasible]), feasible)
     while True:
         before, starts = _value(problem, best), design("sobol", *learner.bounds, STARTS, seed)
@@ -59,6 +68,7 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         except OuterFailure:  # the surrogates expect a feasible design nowhere
             break
         new = sampler.bandwidths(outer.theta_of(expected.x), "the best expected")[0]
+        missed += [learner.predicted(learner.point(new)) - new.value] if new.feasible else []
         best = min(best, new, key=lambda sample: _value(problem, sample))
         level = SETTLED * abs(_value(problem, best))
         true = abs(_value(problem, new) - expected.objective) <= level
@@ -79,7 +89,8 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         for sample in (known[0], best)
     ]
     old, co = entries
-    error = SIGMAS * learner.processes[0].loo.rms / HZ  # what the surrogate misses, left out
+    # True designs that the model had not learnt, and those that it is fitted without in turn.
+    error = max(np.abs(missed).max(initial=0.0), SIGMAS * learner.processes[0].loo.rms) / HZ
     return {
         "sequential": old,
         "co_design": co,
@@ -103,10 +114,11 @@ def worth_words(found: Mapping[str, Any]) -> list[str]:
     """The answer first, then both designs and what it has cost."""
     answer = "The sequential hardware has no feasible controller; co-design has one."
     if np.isfinite(found["bandwidth_percent"]):
+        more, wrong = found["bandwidth_percent"], found["uncertainty_percent"]
         answer = (
             f"Co-design changes the hardware cost by {found['hardware_cost_percent']:+.1f} % and "
-            f"the bandwidth by {found['bandwidth_percent']:+.1f} % (uncertain by "
-            f"{found['uncertainty_percent']:.1f} %)."
+            f"the bandwidth by {more:+.1f} %, or better. Both designs are true; the model that led "
+            f"to them misses others by up to {wrong:.2g} % and does not exclude a better one."
         )
     lines = [f"answer        {answer}"]
     for label, each in (("sequential", found["sequential"]), ("co-design", found["co_design"])):
