@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
-from ccd_casadi.support.options import positive
+from ccd_casadi.support.options import add_break_frequencies, break_frequencies, positive
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
@@ -28,15 +28,12 @@ def _problem(
     from ccd_casadi.cases.run_folder import read_run, refuse_sections
     from ccd_casadi.inner_problem.problem import true_inner
 
-    asked = (options.omega_S_hz, options.omega_T_hz)
-    if (asked[0] is None) != (asked[1] is None):
-        words = "give both --omega-s-hz and --omega-t-hz, or neither"
-        raise CaseError(f"{options.case}: {words}")
+    point = break_frequencies(options)
     if options.case.is_dir():
         done = read_run(options.case)
         if options.theta is not None:
             raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
-        point = (done.weights.omega_S, done.weights.omega_T)
+        point = point or (done.weights.omega_S, done.weights.omega_T)
         refuse_sections(done, "cross_check", "result.json holds the judge's own figures")
         problem, theta = done.problem, done.theta
     else:
@@ -44,10 +41,7 @@ def _problem(
         if options.theta is None:
             raise CaseError(f"{options.case}: give --theta, or a run folder in place of the case")
         problem, theta = problem_of(case), parse_theta(case, options.theta)
-        point = (math.nan, math.nan)
-    if asked[0] is not None:
-        point = (HZ * asked[0], HZ * asked[1])
-    if math.isnan(point[0]):
+    if point is None:
         found = true_inner(problem, theta)
         if found.optimum is None:
             raise CaseError(f"{options.case}: {found.shortfall}; give --omega-s-hz, --omega-t-hz")
@@ -138,11 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         without_effect=["--seed"],
     )
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file")
-    for name in ("S", "T"):
-        arguments.add_argument(
-            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
-            help="a pair (default: the best at theta, or the run's)",
-        )  # fmt: skip
+    add_break_frequencies(arguments, "a pair (default: the best at theta, or the run's)")
     arguments.add_argument(
         "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="time limit of each optional back end (default: 60)",
