@@ -40,7 +40,9 @@ from ccd_casadi.support.arrays import Array
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 CYCLES = 10  # times at most that the plants are made anew before worse ones are looked for
-PENALTY = 6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
+PENALTY = (
+    6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
+)
 STEPS, ADAPTING = 30, 15  # of a search, and of the controller alone at its end
 FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-6  # of w2 ω_b
@@ -73,18 +75,23 @@ def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample, 
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
     best, J = Place(first.theta, first.kappa, first.bandwidth), objective_of(problem, first)
-    reach, settled = REACH, False
+    reach, stretch, settled = REACH, 1.0, False
     for _ in range(CYCLES):
         make = partial(proposed, problem, best, reach)
         found = sampler.kept("together", (*best.theta, reach), Proposal, make)
         settled = found.gain <= SETTLED * abs(J) or reach < LEAST
         if settled:
             break
-        end, there = JointModel(problem, found.end, reach).adapted()
+        further = stretched(problem, best, found.end, stretch)
+        end, there = JointModel(problem, further, reach).adapted()
         gained = J - there
         if gained > 0.0:
             best, J = end, there
-        if gained > GOOD * found.gain:
+        if gained <= 0.0 and stretch > 1.0:
+            stretch = max(0.25 * stretch, 1.0)
+        elif gained > found.gain:  # the true plants bend J less than those of first order
+            stretch, reach = 2.0 * stretch, min(2.0 * reach, LARGEST)
+        elif gained > GOOD * found.gain:
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
@@ -95,6 +102,15 @@ def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample, 
     if objective_of(problem, last) < objective_of(problem, first):
         return other, last, settled
     return sampler, first, True
+
+
+def stretched(problem: CoDesignProblem, here: Place, there: Place, factor: float) -> Place:
+    """The place that lies `factor` times as far from here, within the box of θ."""
+    theta = np.array(here.theta) + factor * (np.array(there.theta) - np.array(here.theta))
+    kappa = np.array(here.kappa) + factor * (np.array(there.kappa) - np.array(here.kappa))
+    omega_b = here.bandwidth * (there.bandwidth / here.bandwidth) ** factor
+    theta = np.clip(theta, *box(problem))
+    return Place(tuple(map(float, theta)), tuple(map(float, kappa)), float(omega_b))
 
 
 def proposed(problem: CoDesignProblem, at: Place, reach: float) -> Proposal:
@@ -155,7 +171,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         point = ascend(self.first_loops, Point(kappa, tau, found), iterations=ADAPTING,
                        radius=FIRST).point  # fmt: skip
         x = np.concatenate([z, point.kappa, [point.tau]])
-        worth = np.exp(point.tau - self.tau) - PENALTY * point.assessment.violation
+        unmet = float(hardware_at(self.problem, self.middle).constraints.max(initial=0.0))
+        worth = np.exp(point.tau - self.tau)
+        worth -= PENALTY * max(point.assessment.violation, unmet)
         cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.middle)
         return self.place(x), float(cost - self.unit * worth)
 
