@@ -20,7 +20,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 UNDAMPED = 1e-12  # of the largest modal damping: what is below is rounding of none
-UNSEEN = 1e-9  # of the largest singular value of outputs
+ALIKE = 1e-9  # relative: singular values of outputs
 RIGID_RATIO = 1e-5  # a mode below this fraction of the highest frequency counts as rigid
 
 
@@ -167,7 +167,7 @@ def numbered(modes: Array, rigid: np.ndarray) -> np.ndarray:
     differences hold as they do for one, where eigenvalues are apart.
     """
     flexible = np.flatnonzero(~rigid)
-    if np.count_nonzero(modes) == len(modes):
+    if np.count_nonzero(modes[:, flexible]) == len(flexible):
         flexible = flexible[np.argsort(np.abs(modes).argmax(0)[flexible])]
     return flexible
 
@@ -177,8 +177,8 @@ def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
 
     Any orthogonal basis of an eigenspace is one of modes. In the singular vectors of its outputs
     a direction that is not measured has c = 0 exactly; spread over several modes it would leave
-    the Riccati solution singular in a direction that rounding makes up. Where all are measured
-    there is nothing to part, and they stay.
+    the Riccati solution singular in a direction that rounding makes up. Where all are
+    measured alike, as tip and tilt of a square stage, there is nothing to part, and they stay.
     """
     modes = modes.copy()
     n = lam.size
@@ -192,7 +192,7 @@ def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
             end += 1
         if end - start > 1:
             seen, Vh = np.linalg.svd(C @ modes[:, start:end])[1:]
-            if len(seen) < end - start or seen[-1] <= UNSEEN * seen[0]:
+            if len(seen) < end - start or seen[0] - seen[-1] > ALIKE * seen[0]:
                 modes[:, start:end] = modes[:, start:end] @ Vh.T
         start = end
     return modes
