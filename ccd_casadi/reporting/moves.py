@@ -31,6 +31,7 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import counted, number, shown, shown_unit
@@ -135,7 +136,8 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
-    panel = over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
+    curves, bands = of_plants(1e3 * t, y)
+    panel = Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
     head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
     on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
         "the stage, until it rests"
@@ -143,14 +145,6 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     words = f"A force of 1 N at the actuator moves {on}."
     lines = Lines(((panel,),), "A step of force", (3.2,))
     return Figure(lines, words, (over_time(head, 1e3 * t, *_columns(y)),))
-
-
-def over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:
-    """The model's in a band of all."""
-    several = len(values) > 1
-    curve = Curve(ms, values[0], "the model" if several else "")
-    band = Band(ms, values.min(axis=0), values.max(axis=0), "all plants")
-    return Panel("time (ms)", label, (curve,), (band,) if several else (), **more)  # type: ignore[arg-type]
 
 
 def _columns(values: Array) -> list[Array]:
@@ -191,7 +185,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
                 bands.append(Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
         if curves:
             panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
-                                levels=(end,), legend="upper right"))  # fmt: skip
+                                levels=(end,)))  # fmt: skip
     heights = (*[2.6] * len(panels), 2.2)
     panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
     lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
