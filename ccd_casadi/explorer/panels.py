@@ -84,10 +84,8 @@ def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -
 def _poles(c: Curves) -> Panel:
     """Of the plant, of K and of the loop: frequency and damping."""
     curves = []
-    for roots, label, colour, marker in (
-        (c.plant_poles, "plant", GREY, "o"), (c.controller_poles, "controller", GREEN, "^"),
-        (c.poles, "closed loop", BLUE, "x"),
-    ):  # fmt: skip
+    looks = (("plant", GREY, "o"), ("controller", GREEN, "^"), ("closed loop", BLUE, "x"))
+    for roots, (label, colour, marker) in zip(c.poles, looks, strict=True):
         hz, damping = frequency_and_damping(roots)
         hz = np.maximum(hz, SLOWEST * c.view.ends[0])  # an integrator's has no place there
         curves.append(Curve(hz, damping, label, colour, "", marker))

@@ -226,8 +226,8 @@ def ways_figure(ways: Mapping[str, Move], words: str) -> Figure:
     )  # fmt: skip
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
-        f"{ends}. Settled is what stays within {shown(first.window, 'm')}; the last error of the "
-        f"table is the largest over the last quarter. {words}"
+        f"{ends}. Settled is what stays within {shown(first.window, 'm')}; the last error in the "
+        f"data below is the largest over the last quarter. {words}"
     )
     return Figure(lines, caption, (Table(head, rows),))
 

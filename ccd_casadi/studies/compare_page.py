@@ -21,7 +21,7 @@ from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.conclusions import LABELS
-from ccd_casadi.studies.methods import cost_figure, descent_figure, theta_paths
+from ccd_casadi.studies.methods import cost_figure, theta_paths
 from ccd_casadi.support.units import number
 
 
@@ -48,11 +48,6 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
                 if comparison.method(name).figures.get("theta")
             },
         )
-    sections += [
-        Section(f"History: {LABELS[item.name]}", (descent_figure(problem, item.descent),))
-        for item in comparison.methods
-        if item.descent is not None and item.descent.iterates
-    ]
     sections += [
         Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
         for method in comparison.methods

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.plants.cad.elements import Material as Material
 from ccd_casadi.support.arrays import Array
 
 NAMES = ("h", "t_o", "t_i", "t_c", "H", "x_i")
@@ -26,15 +27,6 @@ UPPER = (4e-3, 8e-3, 8e-3, 8e-3, 20e-3, 95e-3)
 IS_RIB = (True, False, True, False, True)  # t_c/2, b_2, t_i, b_1, t_o: from the centre
 
 Point = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Material:
-    """Isotropic linear elasticity: E in Pa, Poisson's ratio, density in kg/m³; 6061-T6."""
-
-    young: float = 68.9e9
-    poisson: float = 0.33
-    density: float = 2700.0
 
 
 @dataclass(frozen=True)
