@@ -81,10 +81,6 @@ class Outer(ABC):
         """Lower and upper bounds of x."""
         return box(self.problem)
 
-    def point_at(self, theta: Array) -> Array:
-        """x where a polish at θ begins."""
-        return theta
-
     def prepared(self, seed: int) -> "Outer":
         """With what every search needs before it begins."""
         return self

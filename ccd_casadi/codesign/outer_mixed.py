@@ -70,13 +70,6 @@ class MixedOuter(Outer):
     def bounds(self) -> tuple[Array, Array]:
         return lifted_bounds(self.problem)
 
-    def point_at(self, theta: Array) -> Array:
-        inner = self.sampler.bandwidths(theta, "verifying")[0]
-        if inner.feasible:
-            return inner.joint
-        lower, upper = self.bounds
-        return np.array([*theta, *(0.5 * (lower + upper))[-2:]])
-
     def formulated(
         self, formulation: Formulation, seed: int, given: Surrogates | None = None
     ) -> FormulationResult:

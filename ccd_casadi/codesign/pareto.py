@@ -26,6 +26,7 @@ from surrogates import design
 
 STARTS = 6  # of IPOPT at every point, besides its neighbours' optima
 FLAT = 1e-9  # relative: a hardware cost that moves less over the box is constant
+ROUNDS = 8
 DOMINATED = 1e-3  # of the costs' range: closer to the lightest, the fastest is the same design
 
 
@@ -63,7 +64,6 @@ def pareto_front(
     *,
     points: int = 20,
     tolerance: float = 1e-3,
-    max_rounds: int = 8,
     seed: int = 0,
     own: Array | None = None,
 ) -> Front:
@@ -131,7 +131,7 @@ def pareto_front(
                 result[k] = new
 
     rounds = 0
-    while todo and rounds < max_rounds:
+    while todo and rounds < ROUNDS:
         rounds += 1
         if rounds > 1:
             move_ends([k for k in todo if k != through])
@@ -141,7 +141,7 @@ def pareto_front(
             result[k] = front_point(problem, sample, learner.predicted(x[k]), tolerance)
         missed = [i for i, k in enumerate(todo) if not result[k].verified]
         rows, todo = x[todo][missed], [todo[i] for i in missed]
-        if todo and rounds < max_rounds:
+        if todo and rounds < ROUNDS:
             learner.learn(rows, [inner[i] for i in missed])
     if through is not None:
         assert own is not None

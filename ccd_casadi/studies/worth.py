@@ -40,7 +40,8 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     Raises UserError where too few designs are certified to learn from, or none is feasible.
     """
     began, rule = perf_counter(), HZ * case.baseline.first_resonance_hz
-    first_resonance(sampler.problem, np.array(sampler.problem.start))
+    beside = np.array(sampler.problem.start) + 1e-3 * np.subtract(*box(sampler.problem)[::-1])
+    first_resonance(sampler.problem, np.clip(beside, *box(sampler.problem)))  # not the start: known
     slow = (perf_counter() - began) * EVALUATIONS > SECONDS  # finite elements: the start alone
     hardware = design_hardware(
         sampler.problem, rule, starts=0 if slow else STARTS, seed=seed, workers=sampler.workers
