@@ -189,11 +189,6 @@ def assembled(
     return result
 
 
-def rigid_part(stage: RibStage, theta: Array) -> Array:
-    """(3, points) u_z of z, tip and tilt."""
-    return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)[0]
-
-
 def _displacements(
     stage: RibStage, found: ModeSet, theta: Array, points: tuple[Point, ...], derivatives: bool
 ) -> tuple[Array, Array, Array]:
