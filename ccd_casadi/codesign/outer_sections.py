@@ -45,6 +45,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     fresh_yield,
     judged_widely,
     proof_of,
+    tolerance_prices,
     worst_members,
 )
 from ccd_casadi.inner_problem.sections_search import (
@@ -257,6 +258,7 @@ class SectionsOuter(ThetaOuter):
             worst=worst,
             rounds=rounds,
             costs=costs,
+            prices=tolerance_prices(problem, best.theta, made),
             gap=gap,
             told=told,
         )

@@ -66,8 +66,8 @@ class VerifiedSections(Verified):
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
     the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
     `worst` the worst plant that was found. `raced` is a multi-start search at θ,
-    `costs` what easier problems have there, and `gap`, of ω_b, what no controller reaches; `told`
-    the time of its move, where that counts.
+    `costs` what easier problems have there, `prices` dω_b/d ln t (rad/s) of every tolerance t, and
+    `gap`, of ω_b, what no controller reaches; `told` the time of its move, where that counts.
     """
 
     design: SectionsDesign
@@ -79,6 +79,7 @@ class VerifiedSections(Verified):
     worst: Excess
     rounds: int
     costs: Costs
+    prices: Mapping[str, float]
     gap: Gap | None
     told: tuple[float, Yield | None] | None = None
 
@@ -133,7 +134,8 @@ class VerifiedSections(Verified):
             "anchors": [list(kappa) for kappa in sections.anchors],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
-            "costs": clean({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()}),
+            "costs": clean({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
+            | {"tolerances_hz": {name: 0.01 * w / HZ for name, w in self.prices.items()}},
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
         if sections.figure is not BANDWIDTH:

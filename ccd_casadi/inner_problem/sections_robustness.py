@@ -5,16 +5,18 @@ the box beside them, branch and bound at all of it.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign, certify
+from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
-from ccd_casadi.inner_problem.figure import MOVE_TIME
+from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import goal_of
@@ -132,6 +134,29 @@ def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDes
         uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
         bounds_of(problem), sections.sampling,
     )  # fmt: skip
+
+
+def tolerance_prices(
+    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+) -> dict[str, float]:
+    """dω_b*/d ln t in rad/s of every tolerance t of [robust], at an optimal design.
+
+    Where t grows by 1 % every plant p of the set goes (p - model)/100 further off the model, so
+    that with the multipliers μ of its rows c, dω_b*/d ln t = -Σ μ_j ∂c_j/∂p (p - model). None are
+    known at a design that is not stationary or where J counts another figure.
+    """
+    uncertain, plants = uncertain_plant(problem, theta), []
+    if problem.figure is not BANDWIDTH or not uncertain.names:
+        return {}
+    for option, point in sections_of_problem(problem).members or uncertain.corners():
+        plant = uncertain.sloped(np.array(point), option)
+        further = (np.array(point) - uncertain.nominal)[:, None, None]
+        slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
+        plants.append(replace(plant, **slopes))
+    sampling = sections_of_problem(problem).sampling
+    found = bandwidth_envelope(plants, bounds_of(problem), made, sampling)
+    gradient = [] if found is None else found.gradient.tolist()
+    return dict(zip(uncertain.names, gradient, strict=False))
 
 
 def judged_corners(

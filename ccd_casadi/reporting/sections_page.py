@@ -24,6 +24,8 @@ from ccd_casadi.support.units import HZ, counted, number, shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
+MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing
+
 
 def conclusion_of(result: Mapping[str, Any]) -> str:
     """One sentence with the key numbers, for every kind of controller."""
@@ -115,7 +117,18 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
         "The first row is a certified bound under the same bounds on S, KS, T and GS. The others "
         "are ends of climbs from the design, without other starts: at least that is reached."
     )
-    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), Words(words)
+    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), Words(
+        f"{words}{tolerance_words(costs.get('tolerances_hz', {}))}"
+    )
+
+
+def tolerance_words(hz: Mapping[str, float]) -> str:
+    """Which tolerances cost most, by the change of ω_b in Hz where each grows by 1 %."""
+    most = sorted(hz.items(), key=lambda item: item[1])[:MOST_TOLERANCES]
+    gains = [f"{name} {number(-10.0 * value, 3)} Hz" for name, value in most if value < -LEAST_HZ]
+    if not gains:
+        return ""
+    return f" A tolerance narrower by a tenth would gain, to first order: {', '.join(gains)}."
 
 
 def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:

@@ -19,8 +19,6 @@ from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 
 SEARCH = 120  # measurements of a search for the worst plant
 Figure = Callable[[Loop], float]
@@ -63,9 +61,7 @@ def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Judg
         f = sampled_figures(loop)
         height, growth = f.sensitivity_peak if f.stable else np.inf, float(loop.rates.real.max())
         return Judged(place, f.stable, f.bandwidth, height, growth)
-    figures: DesignFigures = measure(
-        plant, run.controller, run.weights, gamma=UNBOUNDED, omega_low=run.problem.inner.omega_low
-    )
+    figures = run.measured(plant, run.controller)
     stable = figures.certificate.stable
     peak = figures.sensitivity_peak if stable else np.inf
     return Judged(place, stable, figures.bandwidth, peak, figures.certificate.max_real_pole)

@@ -25,6 +25,7 @@ from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertain
 from ccd_casadi.inner_problem.sections_robustness import (
     judged_corners,
     judged_widely,
+    tolerance_prices,
     worst_members,
 )
 from ccd_casadi.inner_problem.sections_search import prepared, with_range
@@ -68,6 +69,32 @@ def test_envelope_gradient_is_the_slope_of_the_true_function(
         ends = [sections_value(case, theta + sign * h * np.eye(2)[i]) for sign in (1.0, -1.0)]
         numeric = (ends[0].bandwidth - ends[1].bandwidth) / (2.0 * h)
         assert value.gradient[i] == pytest.approx(numeric, rel=1e-4)
+
+
+def test_the_price_of_a_tolerance_is_what_another_solve_finds(anchored: CoDesignProblem) -> None:
+    """Of a set solved again with each tolerance a little wider and narrower."""
+    theta, h = anchored.start, 1e-3
+
+    def wider(shift: float = 1.0, damping: float = 1.0, gain: float = 1.0) -> CoDesignProblem:
+        own = Uncertainty(
+            resonance_shift=0.03 * shift,
+            damping=(1.0 - 0.4 * damping, 1.0 + 0.5 * damping),
+            gain=0.05 * gain,
+        )
+        return with_sections(anchored, uncertainty=own, members=())
+
+    here = sections_value(wider(), theta)
+    prices = tolerance_prices(wider(), theta, here.design)
+    assert list(prices) == ["resonance_shift", "damping", "gain"]
+    for name, key in zip(prices, ("shift", "damping", "gain"), strict=True):
+        ends = [sections_value(wider(**{key: 1.0 + sign * h}), theta) for sign in (1.0, -1.0)]
+        numeric = (ends[0].bandwidth - ends[1].bandwidth) / (2.0 * h)
+        assert prices[name] == pytest.approx(numeric, rel=1e-2, abs=1e-4 * here.bandwidth)
+    assert min(prices.values()) < -1e-2 * here.bandwidth
+    assert (
+        tolerance_prices(with_sections(anchored, uncertainty=Uncertainty()), theta, here.design)
+        == {}
+    )
 
 
 def test_a_theta_has_one_value_whoever_asks(anchored: CoDesignProblem, tmp_path: Path) -> None:

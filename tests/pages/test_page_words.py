@@ -132,9 +132,9 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
     rest, error = np.zeros(801), 1e-4 * np.exp(-time)
     move = Move(time, rest, rest, error, rest[:, None], False, 0.18, window=1e-6)
     assert shown_until(move) == pytest.approx(0.54)
-    assert "of 57.7 µm after the figure's end" in ways_figure({"one": move}, "").caption
+    assert "of 57.7 µm after the figure's end" in ways_figure({"one": [move]}, "").caption
     soon = replace(move, error=1e-6 * np.exp(-time))
-    assert "after the figure's end" not in ways_figure({"one": soon}, "").caption
+    assert "after the figure's end" not in ways_figure({"one": [soon]}, "").caption
 
 
 def test_insight_and_compare_begin_with_their_answer() -> None:
