@@ -47,12 +47,12 @@ def main(masses: str = "40", stages: str = "40") -> None:
                 for name in TITLES
             ]
             for item in verdicts(results):
-                key = (problem.name, item.result.backend)
+                key = (problem.name, item.backend)
                 words = item.words.split(" % ")[-1]
                 outcomes.setdefault(key, Counter())[words.split(" (")[0]] += 1
-                seconds.setdefault(key, []).append(item.result.seconds)
-                if item.result.certified:
-                    distance = abs(item.result.gamma_opt / results[0].gamma_opt - 1.0)
+                seconds.setdefault(key, []).append(item.seconds)
+                if item.certified:
+                    distance = abs(item.gamma_opt / results[0].gamma_opt - 1.0)
                     apart.setdefault(key, []).append(distance)
     for key, counts in outcomes.items():
         far = max(apart.get(key, [np.nan]))

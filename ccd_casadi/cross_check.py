@@ -7,16 +7,16 @@ design that is not certified does not count, and among those that are the lowest
 import argparse
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
-from ccd_casadi.support.options import positive
+from ccd_casadi.support.options import add_break_frequencies, break_frequencies, positive
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.inner_problem.problem import CoDesignProblem
-    from ccd_casadi.synthesis.backends.mixed import Verdict
+    from ccd_casadi.synthesis.backends.mixed import BackendResult
 
 
 def _problem(
@@ -28,15 +28,12 @@ def _problem(
     from ccd_casadi.cases.run_folder import read_run, refuse_sections
     from ccd_casadi.inner_problem.problem import true_inner
 
-    asked = (options.omega_S_hz, options.omega_T_hz)
-    if (asked[0] is None) != (asked[1] is None):
-        words = "give both --omega-s-hz and --omega-t-hz, or neither"
-        raise CaseError(f"{options.case}: {words}")
+    point = break_frequencies(options)
     if options.case.is_dir():
         done = read_run(options.case)
         if options.theta is not None:
             raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
-        point = (done.weights.omega_S, done.weights.omega_T)
+        point = point or (done.weights.omega_S, done.weights.omega_T)
         refuse_sections(done, "cross_check", "result.json holds the judge's own figures")
         problem, theta = done.problem, done.theta
     else:
@@ -44,10 +41,7 @@ def _problem(
         if options.theta is None:
             raise CaseError(f"{options.case}: give --theta, or a run folder in place of the case")
         problem, theta = problem_of(case), parse_theta(case, options.theta)
-        point = (math.nan, math.nan)
-    if asked[0] is not None:
-        point = (HZ * asked[0], HZ * asked[1])
-    if math.isnan(point[0]):
+    if point is None:
         found = true_inner(problem, theta)
         if found.optimum is None:
             raise CaseError(f"{options.case}: {found.shortfall}; give --omega-s-hz, --omega-t-hz")
@@ -57,19 +51,21 @@ def _problem(
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
+    from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
-    from ccd_casadi.support.json_files import write_json
-    from ccd_casadi.synthesis.backends.mixed import RICCATI, every_backend, verdicts
+    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.versions import versions
+    from ccd_casadi.support.worker_process import Runner
+    from ccd_casadi.synthesis.backends.mixed import RICCATI, TITLES, synthesise_with, verdicts
 
     problem, theta, point = _problem(options)
-    results = every_backend(
-        scaled_plant(problem, theta),
-        problem.weights.at(*point),
-        omega_low=problem.inner.omega_low,
-        gamma_backoff=problem.inner.gamma_backoff,
-        limit=options.limit,
-    )
-    found = verdicts(results)
+    plant, weights, inner = scaled_plant(problem, theta), problem.weights.at(*point), problem.inner
+    with Runner() as runner:
+        found = verdicts([
+            synthesise_with(name, plant, weights, omega_low=inner.omega_low, runner=runner,
+                            gamma_backoff=inner.gamma_backoff, limit=options.limit)
+            for name in TITLES
+        ])  # fmt: skip
     if not options.quiet:
         names = ", ".join(f"{k} = {v:.6g}" for k, v in zip(problem.names, theta, strict=True))
         print(f"{names}; omega_S {point[0] / HZ:.6g} Hz, omega_T {point[1] / HZ:.6g} Hz")
@@ -77,12 +73,27 @@ def command(options: argparse.Namespace) -> ExitCode:
         say(_conclusion(found))
     if options.out is not None:
         folder = run_folder(options.case, options.out)
-        write_json(folder / "cross_check.json", _json(problem, theta, point, found))
-    own = next(item for item in found if item.result.backend == RICCATI)
+        backends = {
+            item.backend: {
+                "gamma_claimed": item.gamma_opt, "holds": item.holds, "verdict": item.words,
+                "seconds": item.seconds,
+                "figures": item.design and figures_dict(item.design.figures),
+            }
+            for item in found
+        }  # fmt: skip
+        answer = {
+            "theta": dict(zip(problem.names, theta, strict=True)),
+            "omega_S_hz": point[0] / HZ,
+            "omega_T_hz": point[1] / HZ,
+            "backends": backends,
+            "versions": versions(),
+        }
+        write_json(folder / "cross_check.json", clean(answer))
+    own = next(item for item in found if item.backend == RICCATI)
     return ExitCode.DONE if own.holds else ExitCode.NOT_VERIFIED
 
 
-def _table(found: "Sequence[Verdict]") -> str:
+def _table(found: "Sequence[BackendResult]") -> str:
     from ccd_casadi.synthesis.backends.mixed import TITLES
 
     lines = [
@@ -90,58 +101,27 @@ def _table(found: "Sequence[Verdict]") -> str:
         f"{'peak of S':>9s} {'seconds':>8s}  verdict"
     ]
     for item in found:
-        result, figures = item.result, item.result.design and item.result.design.figures
-        norm = figures.certificate.norm if figures and figures.certificate.passed else math.nan
-        bandwidth = figures.bandwidth / HZ if figures else math.nan
-        peak = figures.sensitivity_peak if figures else math.nan
-        lines.append(
-            f"{TITLES[result.backend]:18s} {_cell(result.gamma_opt, '.7g'):>13s} "
-            f"{_cell(norm, '.7g'):>11s} {_cell(bandwidth, '.5f', ' Hz'):>12s} "
-            f"{_cell(peak, '.5f'):>9s} {result.seconds:8.3f}  {item.words}"
-        )
+        norm = bandwidth = peak = math.nan
+        if item.design is not None:
+            figures = item.design.figures
+            norm = figures.certificate.norm if figures.certificate.passed else math.nan
+            bandwidth, peak = figures.bandwidth / HZ, figures.sensitivity_peak
+        cells = (f"{item.gamma_opt:13.7g}", f"{norm:11.7g}", f"{bandwidth:9.5f} Hz", f"{peak:9.5f}")
+        shown = " ".join(f"{'-':>{len(c)}s}" if "nan" in c else c for c in cells)
+        lines.append(f"{TITLES[item.backend]:18s} {shown} {item.seconds:8.3f}  {item.words}")
     return "\n".join(lines)
 
 
-def _cell(value: float, form: str, unit: str = "") -> str:
-    return "-" if math.isnan(value) else f"{value:{form}}{unit}"
-
-
-def _conclusion(found: "Sequence[Verdict]") -> str:
+def _conclusion(found: "Sequence[BackendResult]") -> str:
     from ccd_casadi.synthesis.backends.mixed import AGREE, TITLES
 
-    right = [TITLES[item.result.backend] for item in found if item.holds]
-    wrong = [TITLES[item.result.backend] for item in found if item.holds is False]
+    right = [TITLES[item.backend] for item in found if item.holds]
+    wrong = [TITLES[item.backend] for item in found if item.holds is False]
     if not right:
         return "no back end has a certified design"
     if not wrong:
         return f"agree to {100 * AGREE:g} %: {', '.join(right)}"
     return f"disagree; the certificate is with {', '.join(right)}, not with {', '.join(wrong)}"
-
-
-def _json(
-    problem: "CoDesignProblem",
-    theta: tuple[float, ...],
-    point: tuple[float, float],
-    found: "Sequence[Verdict]",
-) -> dict[str, Any]:
-    from ccd_casadi.codesign.design_entries import figures_dict
-    from ccd_casadi.support.json_files import clean
-    from ccd_casadi.support.versions import versions
-
-    return {
-        "theta": dict(zip(problem.names, theta, strict=True)),
-        "omega_S_hz": point[0] / HZ,
-        "omega_T_hz": point[1] / HZ,
-        "backends": {
-            item.result.backend: {
-                "gamma_claimed": clean(item.result.gamma_opt), "holds": item.holds,
-                "verdict": item.words, "seconds": item.result.seconds,
-                "figures": item.result.design and clean(figures_dict(item.result.design.figures)),
-            }
-            for item in found
-        },
-        "versions": versions(),
-    }  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -152,11 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         without_effect=["--seed"],
     )
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file")
-    for name in ("S", "T"):
-        arguments.add_argument(
-            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
-            help="a pair (default: the best at theta, or the run's)",
-        )  # fmt: skip
+    add_break_frequencies(arguments, "a pair (default: the best at theta, or the run's)")
     arguments.add_argument(
         "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="time limit of each optional back end (default: 60)",

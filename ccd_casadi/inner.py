@@ -9,9 +9,8 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
-from ccd_casadi.support.options import positive
+from ccd_casadi.support.options import add_break_frequencies, break_frequencies
 from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.measured_case import MeasuredCase
@@ -39,10 +38,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         raise CaseError(f"{case.path}: --theta is missing; give the hardware, --theta {start}")
     problem = problem_of(case)
     theta = parse_theta(case, options.theta)
-    omega_S_hz, omega_T_hz = options.omega_S_hz, options.omega_T_hz
-    if (omega_S_hz is None) != (omega_T_hz is None):
-        raise CaseError(f"{case.path}: give both --omega-s-hz and --omega-t-hz, or neither")
-    point = None if omega_S_hz is None else (HZ * omega_S_hz, HZ * omega_T_hz)
+    point = break_frequencies(options)
     answer = {MixedSensitivityProblem: mixed_answer, SectionsProblem: sections_answer}
     with Workers(options.workers) as workers:
         how = InnerOptions(options.seed, workers, _progress(options), point, options.begin_at)
@@ -118,14 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         type=Path,
         help="sections: search from the controller.json of a run alone, not from many starts",
     )
-    for name in ("S", "T"):
-        arguments.add_argument(
-            f"--omega-{name.lower()}-hz",
-            dest=f"omega_{name}_hz",
-            type=positive,
-            metavar="X",
-            help=f"with the other one: a single synthesis at this omega_{name}",
-        )
+    add_break_frequencies(arguments, "with the other one: a single synthesis there")
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 

@@ -79,25 +79,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
     )  # fmt: skip
     for name, metavar, kind, default, words in (
-        (
-            "--rate-hz",
-            "X",
-            positive,
-            None,
-            "sampling rate of the controller; responses include the hold",
-        ),
+        ("--rate-hz", "X", positive, None, "sampling rate; responses include the hold"),
         ("--delay", "SECONDS", number(), 0.0, "delay in s besides that in DATA"),
         ("--s-max", "X", number(1.0, strict=True), 1.8, "bound of |S|"),
         ("--shape", "X", number(1.0), 1.1, "bound of |S| over ω/(√2 ω_b)"),
         ("--effort", "X", positive, 20.0, "bound of |KS| over 1/|G| about ω_b"),
         ("--lead", "N", whole(0), 1, "number of leads, with --biquads"),
-        (
-            "--biquads",
-            "N",
-            whole(0),
-            None,
-            "number of notches (default: one for each resonance, up to 3)",
-        ),
+        ("--biquads", "N", whole(0), None, "number of notches (default: by the resonances)"),
     ):
         shown = words if default is None else f"{words} (default: {default:g})"
         arguments.add_argument(name, metavar=metavar, type=kind, default=default, help=shown)

@@ -68,6 +68,11 @@ class FinishedRun(Shown):
         """The loop on a plant in SI, as it runs."""
         return Loop(plant, self.controller, self.sampling)
 
+    def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
+        """The figures of a continuous loop, its norm not judged."""
+        low = self.problem.inner.omega_low
+        return measure(plant, controller, self.weights, gamma=UNBOUNDED, omega_low=low)
+
     def to_control(self) -> "tuple[control.StateSpace, control.StateSpace]":
         """G (N to m) and K (e = r - y to N) in continuous time, SI, for python-control.
 

@@ -159,7 +159,6 @@ def _design(
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
         **budget_entry(problem, theta, made.controller),
         **move_entry(problem, theta, made.controller),
-        **move_entry(problem, theta, made.controller),
     }
     return figures.certified, answer, controller_dict(made.controller)
 

@@ -178,7 +178,7 @@ def predicted(
     what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
     if not surrogate:
-        return Line(State.PASSED, "nothing was predicted: IPOPT worked on the truth", figures)
+        return Line(State.PASSED, "nothing was predicted: the search used true values", figures)
     if left_out is not None:
         size = f"left_out_{unit.lower()}"
         figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}

@@ -12,7 +12,12 @@ import numpy as np
 
 from ccd_casadi.analysis.feedforward import ORDER
 from ccd_casadi.deployment.anti_windup import takeover
-from ccd_casadi.deployment.realisation import Realisation, difference_equation
+from ccd_casadi.deployment.realisation import (
+    Realisation,
+    difference_equation,
+    literals,
+    plain_title,
+)
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.package_text import filled
 
@@ -50,10 +55,9 @@ def c_files(
     K, limit, L = realisation.system, realisation.saturation, realisation.back_calculation
     n, p, m = len(K.A), K.B.shape[1], len(K.C)
     errors, forwards, first, forces = vectors(realisation)
-    plain = "".join(c if c.isalnum() or c in " ._-" else "_" for c in title)
     header = _part(
         FILES[0],
-        title=plain, period=f"{K.period:.17g}", rate=f"{1.0 / K.period:.10g}",
+        title=plain_title(title), period=f"{K.period:.17g}", rate=f"{1.0 / K.period:.10g}",
         delay=f"{delay:.10g}",
         limits="v[k]" if limit is None else f"v[k] within +-{limit:.17g} N",
         back="" if L is None else " + L (u[k] - v[k])",
@@ -104,8 +108,5 @@ def _part(name: str, **values: object) -> str:
 
 
 def _numbers(values: Array) -> str:
-    """An initialiser; 17 digits give every double back exactly."""
-    texts = [f"{value:.17g}" for value in np.ravel(values)] or ["0.0"]
-    texts = [text if any(c in text for c in ".en") else f"{text}.0" for text in texts]
-    lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
-    return "{\n    " + ",\n    ".join(lines) + "\n}"
+    """An initialiser."""
+    return f"{{\n    {literals(values, 4)}\n}}"

@@ -31,17 +31,22 @@ class Channel:
     controller: StateSpace
 
 
+def whole(plant: ScaledPlant, controller: StateSpace) -> tuple[Channel, ...]:
+    """The loop as one channel."""
+    p, m = plant.C.shape[0], plant.B.shape[1]
+    return (Channel("all", np.eye(p), np.eye(m), plant, controller),)
+
+
 def split(plant: ScaledPlant, controller: StateSpace) -> tuple[Channel, ...]:
     """The scalar channels of the loop, or the whole loop as one channel."""
     p, m = plant.C.shape[0], plant.B.shape[1]
-    whole = (Channel("all", np.eye(p), np.eye(m), plant, controller),)
     U = np.hstack([c.outputs for c in plant.channels] or [np.eye(p)])
     V = np.hstack([c.inputs for c in plant.channels] or [np.eye(m)])
     if not (U.shape == (p, p) and V.shape == (m, m) and p == m > 1):
-        return whole
+        return whole(plant, controller)
     G, K, _ = responses(plant, controller, plant.grid * plant.omega_0)
     if not (_diagonal(U.T @ G @ V) and _diagonal(V.T @ K @ U)):
-        return whole
+        return whole(plant, controller)
     found = []
     for i in range(p):
         u, v = U[:, [i]], V[:, [i]]

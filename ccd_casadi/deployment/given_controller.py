@@ -12,7 +12,6 @@ A table (TOML, or JSON of the same form) is what one enters in a drive:
 """
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,15 +19,14 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.cases.case import read_toml
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.lti.hold import Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
-from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 UNSEEN = StateSpace(-np.eye(1), np.zeros((1, 1)), np.zeros((1, 1)), np.eye(1))
 SECTIONS = {
@@ -72,9 +70,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
         sizes = f"{K.B.shape[1]} inputs and {K.C.shape[0]} outputs"
         raise UserError(f"{path}: has {sizes}; this plant needs {p} and {m}")
     if not K.period:
-        figures = measure(
-            run.plant, K, run.weights, gamma=UNBOUNDED, omega_low=run.problem.inner.omega_low
-        )
+        figures = run.measured(run.plant, K)
         if not figures.certificate.stable:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
@@ -97,29 +93,19 @@ def _measured(run: FinishedRun) -> FinishedRun:
 
 def read_controller(path: Path) -> Given:
     """The controller in a .json, .toml or .mat file. Raises UserError where there is none."""
+    if path.suffix not in (".json", ".toml", ".mat"):
+        raise UserError(f"{path}: name a controller as .json, .toml or .mat")
+    if not path.exists():
+        raise UserError(f"{path}: there is no such file; name a controller")
     if path.suffix == ".mat":
         return _from_mat(path)
-    if path.suffix == ".toml":
-        try:
-            table: Mapping[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise UserError(f"{path}: there is no such file; name a controller") from None
-        except (OSError, ValueError) as error:
-            raise UserError(f"{path}: is not valid TOML: {error}") from None
-    elif path.suffix == ".json":
-        if not path.exists():
-            raise UserError(f"{path}: there is no such file; name a controller")
-        table = read_json(path)
-    else:
-        raise UserError(f"{path}: name a controller as .json, .toml or .mat")
+    table = read_json(path) if path.suffix == ".json" else read_toml(path)
     if "A" in table:
         return _from_matrices(path, table)
     return Given(_from_sections(path, table))
 
 
 def _from_mat(path: Path) -> Given:
-    if not path.exists():
-        raise UserError(f"{path}: there is no such file; name a controller")
     systems = read_mat(path).systems
     for name in ("controller_discrete", "controller", ""):
         if name in systems:
@@ -181,25 +167,17 @@ def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:
 
 
 def _section(v: Mapping[str, float]) -> StateSpace:
-    """(b₂s² + b₁s + 1)/(a₂s² + a₁s + 1) of a row, in observer form."""
-    zeros, poles = np.array(_polynomial(v, "zero")), np.array(_polynomial(v, "pole"))
-    order = 2 if poles[0] else 1
-    b, a = (part[2 - order :] / poles[2 - order] for part in (zeros, poles))
-    D = b[0]
-    rest = b[1:] - a[1:] * D
-    A = np.zeros((order, order))
-    A[:, 0] = -a[1:]
-    A[:-1, 1:] = np.eye(order - 1)
-    C = np.zeros((1, order))
-    C[0, 0] = 1.0
-    return StateSpace(A, rest[:, None], C, np.array([[D]]))
+    """(b₂s² + b₁s + 1)/(a₂s² + a₁s + 1) of a row."""
+    from scipy.signal import tf2ss  # slow to import
+
+    return StateSpace(*tf2ss(_polynomial(v, "zero"), _polynomial(v, "pole")))
 
 
-def _polynomial(v: Mapping[str, float], root: str) -> tuple[float, float, float]:
-    """Coefficients of s², s and 1; the constant 1 where there is no such root."""
+def _polynomial(v: Mapping[str, float], root: str) -> list[float]:
+    """Coefficients of falling powers of s, from the first that is not zero; 1 without a root."""
     if f"{root}_hz" not in v:
-        return 0.0, 0.0, 1.0
+        return [1.0]
     w = HZ * v[f"{root}_hz"]
     if f"{root}_damping" not in v:
-        return 0.0, 1.0 / w, 1.0
-    return 1.0 / w**2, 2.0 * v[f"{root}_damping"] / w, 1.0
+        return [1.0 / w, 1.0]
+    return [1.0 / w**2, 2.0 * v[f"{root}_damping"] / w, 1.0]

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.as_designed import deploy_as_designed
-from ccd_casadi.deployment.channels import Channel, assemble, split
+from ccd_casadi.deployment.as_designed import at_its_rate, designed_channels, require_own_bounds
+from ccd_casadi.deployment.channels import Channel, assemble, split, whole
 from ccd_casadi.deployment.discretise import Target
-from ccd_casadi.deployment.judgement import SampledSet
+from ccd_casadi.deployment.judgement import judged
 from ccd_casadi.deployment.outcome import (
     SAMPLED_BANDWIDTH,
     SAMPLED_EXCESS,
@@ -22,9 +25,7 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.statics import compliance_of
-from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 # A reduced controller keeps S_max and a bound on the compliance to 0.5 % (they bind at most optima,
 # where any change passes them a little), S_low, 99 % of ω_b, and no gain more than twice the bound
@@ -32,6 +33,8 @@ from ccd_casadi.synthesis.synthesis import UNBOUNDED
 REDUCED_PEAK, REDUCED_NORM, REDUCED_BANDWIDTH = 1.005, 2.0, 0.99
 STRICT = 1e-6  # relative: S_max kept as the design itself keeps it
 LEAST_RATE = 4.0  # samples in a period of ω_b
+SHORTEN_IT = "shorten it"
+DESIGN_FOR_IT = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
 ADDED = 5  # plants between those of the case's set that may be added to it for the rate
 
 
@@ -44,45 +47,59 @@ def deploy(
 ) -> Deployment:
     """Reduce, discretise and verify the controller of a run; `progress` is called at each step.
 
-    All of it on the nominal plant and on every plant of the run's [robust] set. Raises UserError
-    where no sampling rate is enough, or the given one is no rate for this loop.
+    All of it on the nominal plant and on every plant of the run's [robust] set. Sections are
+    deployed as they are: nothing is reduced, and where the case gives a rate it is that, by
+    Tustin's rule. Raises UserError where no sampling rate is enough, or the given one is no rate
+    for this loop.
     """
-    if kind_of(run.problem).as_designed:
-        return deploy_as_designed(run, timing, saturation, progress)
-    inner, full = run.problem.inner, run.figures
-    bandwidth_hz = full.bandwidth / HZ
-    if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:
-        words = f"is less than {LEAST_RATE:g} times the bandwidth, {bandwidth_hz:.4g} Hz"
-        raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
-    limits = Limits(
-        REDUCED_PEAK * inner.S_max, inner.S_low * (1.0 + STRICT), REDUCED_NORM * full.gamma,
-        REDUCED_BANDWIDTH * full.bandwidth,
-    )  # fmt: skip
-    family, dense = members(run), members(run, dense=True)
-    orders = tuple(
-        _orders(run, c, family, limits, progress) for c in split(run.plant, run.controller)
-    )
-    channels = [item.channel for item in orders]
-    small = [item.chosen.controller for item in orders]
-    reduced = assemble(channels, small)
-    reduced_figures = measure(
-        run.plant, reduced, run.weights, gamma=UNBOUNDED, omega_low=inner.omega_low
-    )
+    inner, full, K = run.problem.inner, run.figures, run.controller
+    designed, family, dense = run.problem.sampling, members(run), members(run, dense=True)
     target = Target(inner.S_max, SAMPLED_EXCESS, full.bandwidth, SAMPLED_BANDWIDTH)
-    conversions = conversions_of(timing)
-    loops = ChannelLoops(channels, small, target)
+    if kind_of(run.problem).as_designed:
+        require_own_bounds(run, designed, timing)
+        limits, remedy = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth), DESIGN_FOR_IT
+        orders, channels, small = designed_channels(run), whole(run.plant, K), [K]
+        reduced, figures = K, full
+    else:
+        _require_fast(timing, full.bandwidth / HZ)
+        remedy = SHORTEN_IT
+        limits = Limits(
+            REDUCED_PEAK * inner.S_max, inner.S_low * (1.0 + STRICT), REDUCED_NORM * full.gamma,
+            REDUCED_BANDWIDTH * full.bandwidth,
+        )  # fmt: skip
+        orders = tuple(_orders(run, c, family, limits, progress) for c in split(run.plant, K))
+        channels = tuple(item.channel for item in orders)
+        small = [item.chosen.controller for item in orders]
+        reduced = assemble(channels, small)
+        figures = run.measured(run.plant, reduced)
+    way: dict[str, Any] = {"limits": limits, "reduced": reduced, "reduced_figures": figures}
+    if designed is not None:
+        progress("the rate of the case")
+        target, best, rate, delay = at_its_rate(run, channels, family, designed, timing)
+        way |= {"trials": (best,), "target": target}
+        return judged(run, dense, orders, best.conversion, rate, delay, saturation, way)
+    loops, conversions = ChannelLoops(channels, small, target), conversions_of(timing)
     for attempt in range(1 + ADDED):
-        trials, best, rate = choose(run, timing, loops, family, conversions, progress, attempt)
-        plants = SampledSet(
-            run, dense, orders, best.conversion, rate, timing.delay_at(rate), saturation
+        trials, best, rate = choose(
+            run, timing, loops, family, conversions, progress, attempt, remedy
         )
-        outside = max((m for m in plants.checked if not target.held(m.figures)),
+        way |= {"trials": trials, "target": target}
+        found = judged(
+            run, dense, orders, best.conversion, rate, timing.delay_at(rate), saturation, way
+        )
+        outside = max((m for m in found.members if not target.held(m.figures)),
                       default=None, key=lambda m: m.badness)  # fmt: skip
         if timing.rate_hz is not None or outside is None:
             break
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
-    return plants.deployment(limits, reduced, reduced_figures, trials, target, inner.compliance_max)
+    return found
+
+
+def _require_fast(timing: Timing, bandwidth_hz: float) -> None:
+    if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:
+        words = f"is less than {LEAST_RATE:g} times the bandwidth, {bandwidth_hz:.4g} Hz"
+        raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
 
 
 def _orders(
@@ -104,9 +121,7 @@ def _orders(
     def holds(peak: float) -> Callable[[Reduced], bool]:
         def on(member: Member, row: Reduced) -> bool:
             plant = member.seen_by(channel)
-            figures = measure(
-                plant, row.controller, run.weights, gamma=UNBOUNDED, omega_low=inner.omega_low
-            )
+            figures = run.measured(plant, row.controller)
             kept = figures.certificate.stable and figures.sensitivity_peak <= peak
             return kept and compliant(plant, row)
 

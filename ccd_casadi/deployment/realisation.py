@@ -145,3 +145,25 @@ def difference_equation(
         x = following
         answers.append(u)
     return np.array(answers).reshape(len(answers), len(C))
+
+
+def literal(value: float) -> str:
+    """17 digits give every double back; a point before the exponent, as IEC's literals want it.
+
+    >>> literal(1e-5), literal(3.0), literal(0.1)
+    ('1.0000000000000001e-05', '3.0', '0.10000000000000001')
+    """
+    mantissa, e, exponent = f"{value:.17g}".partition("e")
+    return (mantissa if "." in mantissa else mantissa + ".0") + e + exponent
+
+
+def literals(values: Array, indent: int) -> str:
+    """Four in a line, the lines after the first indented."""
+    texts = [literal(value) for value in np.ravel(values)] or ["0.0"]
+    lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
+    return (",\n" + " " * indent).join(lines)
+
+
+def plain_title(title: str) -> str:
+    """Of letters that no comment of a program ends at."""
+    return "".join(c if c.isalnum() or c in " ._-" else "_" for c in title)

@@ -13,6 +13,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.robust_check import DENSE
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.fixed_structure.worst_plant import lattice
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, uncertain_plant
 from ccd_casadi.plants.modal import Perturbation, modal_plant
@@ -78,6 +79,8 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
 
     `dense`: on as many shifts as a design is verified on.
     """
+    if kind_of(run.problem).as_designed:
+        return _of_sections(run, dense)
     robust = run.problem.robust
     if robust is None:
         return ()
@@ -90,8 +93,8 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
     )
 
 
-def section_members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
-    """The same of a run with sections: corners of its box, its own set, `dense`: a lattice too."""
+def _of_sections(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
+    """Of a run with sections: corners of its box, its own set, `dense`: a lattice too."""
     sections = sections_of_problem(run.problem)
     uncertain = uncertain_plant(run.problem, run.theta)
     points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.members)]

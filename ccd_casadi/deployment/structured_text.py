@@ -8,7 +8,7 @@ the forces U_BEFORE, otherwise a call is one sample.
 import numpy as np
 
 from ccd_casadi.deployment.anti_windup import takeover
-from ccd_casadi.deployment.realisation import Realisation
+from ccd_casadi.deployment.realisation import Realisation, literal, literals, plain_title
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.package_text import filled
 
@@ -29,12 +29,11 @@ def structured_text(realisation: Realisation, *, title: str, delay: float, verif
     L = realisation.back_calculation
     starts = np.repeat(np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes).astype(int)
     ends = starts + np.repeat(sizes, sizes) - 1
-    plain = "".join(c if c.isalnum() or c in " ._-" else "_" for c in title)
     limit, words = realisation.saturation, "verified" if verified else "NOT verified"
     return filled(
         TEMPLATE,
-        title=plain, period=f"{K.period:.17g}", delay=f"{delay:.10g}", verified=words,
-        limit=_number(1e308 if limit is None else limit),
+        title=plain_title(title), period=f"{K.period:.17g}", delay=f"{delay:.10g}", verified=words,
+        limit=literal(1e308 if limit is None else limit),
         n=n, m=m, p=p, q=p + m, n1=n - 1, m1=m - 1, p1=p - 1, nn1=n * n - 1, np1=n * p - 1,
         mn1=m * n - 1, mp1=m * p - 1, nm1=n * m - 1, nq1=n * (p + m) - 1,
         first=", ".join(map(str, starts)), last=", ".join(map(str, ends)),
@@ -44,13 +43,4 @@ def structured_text(realisation: Realisation, *, title: str, delay: float, verif
 
 
 def _numbers(values: Array) -> str:
-    texts = [_number(value) for value in np.ravel(values)]
-    lines = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
-    return ("," + "\n        ").join(lines)
-
-
-def _number(value: float) -> str:
-    """17 digits give every double back; IEC's literals want a point before the exponent."""
-    text = f"{value:.17g}"
-    mantissa, e, exponent = text.partition("e")
-    return (mantissa if "." in mantissa else mantissa + ".0") + e + exponent
+    return literals(values, 8)

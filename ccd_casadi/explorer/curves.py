@@ -1,6 +1,7 @@
 """What is drawn of one design: gains, Nyquist, poles, a step and a move; pure functions of it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -35,22 +36,25 @@ AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, WINDOW)
 class Curves:
     """Of one design: its loop on the plant looked at, over frequency and over time.
 
-    Poles of the loop (of a sampled one ln(z)/T), of K and of G: complex, Hz. `step`: y of the first
-    output (s) after a step of its reference. An unstable loop has no step and no move (`AT_REST`).
+    `step`: y of the first output (s) after a step of its reference. An unstable loop has no step
+    and no move (`AT_REST`).
     """
 
     view: LoopView
-    controller_poles: np.ndarray
-    plant_poles: np.ndarray
-    poles: np.ndarray
     step_time: Array
     step: Array
     move: Move
 
+    @cached_property
+    def poles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the plant, of K and of the loop (of a sampled one ln(z)/T): complex, Hz."""
+        loop = self.view.loop
+        return loop.plant.poles / HZ, loop.controller.poles / HZ, loop.poles / HZ
+
     @property
     def unstable(self) -> bool:
         """Of the loop: it has no step, no move and no margins."""
-        return not self.poles.real.max() < 0.0
+        return not self.poles[2].real.max() < 0.0
 
 
 @dataclass(frozen=True)
@@ -84,15 +88,7 @@ def curves_of(look: Look) -> Curves | None:
         first = np.eye(len(loop.plant.C))[0]
         time, y = step_response(loop, first, STEP_PERIODS / bandwidth, STEP_POINTS)
         step, move = y[:, 0], _move(look, loop, bandwidth)
-    return Curves(
-        view=view,
-        controller_poles=K.poles / HZ,
-        plant_poles=loop.plant.poles / HZ,
-        poles=loop.poles / HZ,
-        step_time=time,
-        step=step,
-        move=move,
-    )
+    return Curves(view, time, step, move)
 
 
 def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:

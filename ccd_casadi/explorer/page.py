@@ -63,7 +63,7 @@ class Page:
         self.pins = Pins(parameters, self.figures, kept, dark, session.case.objective.cost_unit)
         self.map = MapFigure(parameters, self.draw_map, dark)
         run = session.run
-        self._surrogate = () if run is None else run_surrogate(run.folder)
+        self._surrogate = None if run is None else run_surrogate(run.folder)
         self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
         self._of_search = False
         self._first: tuple[str, float] | None = None  # the design at the start, and its ω_b in Hz

@@ -1,9 +1,10 @@
 """The designs that were pinned: a table of them, and their curves beside the present one's."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from bokeh.models import ColumnDataSource
 from bokeh.models.widgets.tables import (
     CellEditor,
@@ -16,16 +17,25 @@ from bokeh.models.widgets.tables import (
 
 from ccd_casadi.cases.sections import Parameter
 from ccd_casadi.drawing.svg import AMBER, BROWN, GREEN, ORANGE, PURPLE
+from ccd_casadi.explorer.designs import Look
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure
 from ccd_casadi.explorer.panels import EMPTY, Drawn
-from ccd_casadi.explorer.words import pin_columns
 from ccd_casadi.support.units import shown_unit
 
 HEIGHT = 150
 COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
 DARK = """.slick-cell, .slick-header-column { background: #20262b !important; color: #e0e0e0; }
 .slick-cell.selected { background: #2f4a5e !important; }"""
+# Of a pinned design: field, title, format, width in px, and what it reads.
+FIGURES: tuple[tuple[str, str, str, int, Callable[[Look], Any]], ...] = (
+    ("S_max", "S_max", "0.000", 70, lambda look: look.knobs.S_max),
+    ("bandwidth", "ω_b (Hz)", "0.0000", 90, lambda look: look.bandwidth_hz),
+    ("peak", "‖S‖∞", "0.0000", 80, lambda look: look.figures.sensitivity_peak),
+    ("cost", "hardware cost", "0.0000", 130, lambda look: look.cost),
+    ("objective", "J", "0.0000", 110, lambda look: look.objective),
+    ("standing", "standing", "", 260, lambda look: look.standing.value),
+)
 LINE = '<span style="color:<%= value %>">▬▬</span>'
 
 
@@ -50,17 +60,16 @@ class Pins:
         )  # fmt: skip
         units = [shown_unit(p.unit, p.upper) for p in parameters]
         self._scales = [scale for _, scale in units]
-        self.source = ColumnDataSource(pin_columns(self.names, self._scales, [], []))
+        self.source = ColumnDataSource(self._columns([]))
         self.source.on_change("data", lambda attr, old, new: self._renamed(new["design"]))
         thetas = [
             (f"theta_{name}", f"{name} ({unit})" if unit else name, "0.0000", 90)
             for name, (unit, _) in zip(self.names, units, strict=True)
         ]
-        cost = f"hardware cost ({cost_unit})" if cost_unit else "hardware cost"
-        heads = [("colour", "", LINE, 40), ("design", "design", "", 90), *thetas,
-                 ("S_max", "S_max", "0.000", 70), ("bandwidth", "ω_b (Hz)", "0.0000", 90),
-                 ("peak", "‖S‖∞", "0.0000", 80), ("cost", cost, "0.0000", 130),
-                 ("objective", "J", "0.0000", 110), ("standing", "standing", "", 260)]  # fmt: skip
+        cost = f" ({cost_unit})" if cost_unit else ""
+        heads = [("colour", "", LINE, 40), ("design", "design", "", 90), *thetas]
+        heads += [(name, title + cost * (name == "cost"), form, width)
+                  for name, title, form, width, _ in FIGURES]  # fmt: skip
         self.table = DataTable(
             name="pins", source=self.source, height=HEIGHT, index_position=None, editable=True,
             sizing_mode="stretch_width", reorderable=False, stylesheets=[DARK] if dark else [],
@@ -98,15 +107,28 @@ class Pins:
             pairs = zip(names, self.pinned, strict=True)
             self.pinned[:] = [(str(name), drawn) for name, (_, drawn) in pairs]
 
+    def _columns(self, colours: Sequence[str]) -> dict[str, list[Any]]:
+        """The table, a list a column; θ in the units of the sliders."""
+        looks = [drawn.look for _, drawn in self.pinned[: len(colours)]]
+        found: dict[str, list[Any]] = {
+            "colour": [*colours], "design": [name for name, _ in self.pinned[: len(colours)]]
+        }  # fmt: skip
+        for i, (name, scale) in enumerate(zip(self.names, self._scales, strict=True)):
+            found[f"theta_{name}"] = [scale * look.theta[i] for look in looks]
+        return found | {name: [_plain(read(look)) for look in looks] for name, *_, read in FIGURES}
+
     def _show(self) -> None:
         self.source.selected.indices = []
         colours = [COLOURS[i % len(COLOURS)] for i in range(len(self.pinned))]
         shown = [ON_DARK[colour] if self._dark else colour for colour in colours]
-        looks = [(name, drawn.look) for name, drawn in self.pinned]
-        self.source.data = pin_columns(self.names, self._scales, looks, shown)
+        self.source.data = self._columns(shown)
         pinned = list(zip(colours, (drawn.panels for _, drawn in self.pinned), strict=True))
         for made in self.figures:
             made.pin([(colour, panels.get(made.name, EMPTY)) for colour, panels in pinned])
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _column(name: str, title: str, form: str, width: int) -> TableColumn:

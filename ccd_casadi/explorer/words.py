@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -68,7 +67,7 @@ def standing_html(
 
 def survival_words(curves: Curves) -> str:
     """The margins of the loop that is drawn, and whether its controller is stable by itself."""
-    m, unstable = curves.view.margins, curves.controller_poles
+    m, unstable = curves.view.margins, curves.poles[1]
     unstable = unstable[(unstable.real > 1e-9 * np.abs(unstable)) & (unstable.imag >= 0.0)]
     gain = f"gain × {number(m.gain_down, 3)} to {number(m.gain_up, 3)}"
     margins = "the loop drawn is unstable: no margins" if curves.unstable else (
@@ -98,28 +97,6 @@ def sampled_words(sampled: AsSampled, S_max: float) -> str:
         f"{number(sampled.bandwidth_hz, 4)} Hz, ‖S‖∞ = {number(sampled.peak, 4)}, {over:+.2g} % of "
         "S_max."
     )
-
-
-def pin_columns(
-    names: Sequence[str], scales: Sequence[float], pins: Sequence[tuple[str, Look]],
-    colours: Sequence[str],
-) -> dict[str, list[Any]]:  # fmt: skip
-    """The table of pinned designs, a list a column; θ times `scales`, as the sliders show it."""
-    looks = [look for _, look in pins]
-    found: dict[str, list[Any]] = {"colour": [*colours], "design": [name for name, _ in pins]}
-    for i, name in enumerate(names):
-        found[f"theta_{name}"] = [scales[i] * look.theta[i] for look in looks]
-    found["S_max"] = [look.knobs.S_max for look in looks]
-    found["bandwidth"] = [look.bandwidth_hz for look in looks]
-    found["peak"] = [look.figures.sensitivity_peak for look in looks]
-    found["cost"] = [look.cost for look in looks]
-    found["objective"] = [look.objective for look in looks]
-    found["standing"] = [look.standing.value for look in looks]
-    return {key: [_plain(v) for v in column] for key, column in found.items()}
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def machine_html(look: Look, start: Sequence[float], reference: float) -> str:

@@ -42,7 +42,7 @@ class ProofOutcome(StrEnum):
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has not as many channels as outputs"
     NOT_MODAL = "a given damping matrix couples the modes"
-    VARIES = "a theta varies, and moves the modes: its range was searched"
+    VARIES = "a theta that varies moves the modes, so its range was searched"
 
 
 @dataclass(frozen=True)

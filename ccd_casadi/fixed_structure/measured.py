@@ -155,8 +155,8 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as file:
             return _named(dict(file))
     except (OSError, ValueError) as error:
-        words = f"cannot be read as a frequency response: {described(error)}"
-        raise UserError(f"{path}: {words}") from None
+        reason = getattr(error, "strerror", None) or described(error)
+        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
 
 
 def _named(variables: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -41,9 +41,9 @@ def sampled_figures(S: StateSpace) -> SampledFigures:
     radius = float(np.abs(poles).max())
     if not radius < 1.0:
         return SampledFigures(False, radius, np.nan, np.nan, np.nan)
-    levels = _Levels(S)
-    peak, at = hinf_norm(levels.w)
-    return SampledFigures(True, radius, peak, float(levels.from_w(at)), levels.bandwidth())
+    over_w = in_w(S)
+    peak, at = hinf_norm(over_w)
+    return SampledFigures(True, radius, peak, float(_from_w(S, at)), _bandwidth(S, over_w))
 
 
 def together(parts: Sequence[SampledFigures]) -> SampledFigures:
@@ -71,41 +71,28 @@ def sampled_compliance(plant: StateSpace, S: StateSpace) -> float:
     return highest(lambda at: largest(S.response(at) @ plant.response(at))[None], grid)[0][0]
 
 
-class _Levels:
-    """Where σ_max(S) crosses a level: over w (`in_w`) the circle is the axis.
+def _from_w(S: StateSpace, v: Array | float) -> Array:
+    """ω at which z = e^{jωT} is where w = jv (`in_w`)."""
+    return np.asarray(2.0 / S.period * np.arctan(0.5 * S.period * v))
 
-    There a Hamiltonian matrix has imaginary eigenvalues at the crossings. They are candidates,
-    and the response itself decides. (SLICOT's AB13DD in discrete time missed peaks of these
-    loops: 1.737 instead of 1.877 in one.)
+
+def _bandwidth(S: StateSpace, over_w: StateSpace) -> float:
+    """The first ω at which σ_max(S) passes 1/√2 from below; NaN where there is none.
+
+    Over w the circle is the axis, where a Hamiltonian matrix has imaginary eigenvalues at the
+    crossings. They are candidates, and the response itself decides. (SLICOT's AB13DD in discrete
+    time missed peaks of these loops: 1.737 instead of 1.877 in one.)
     """
-
-    def __init__(self, S: StateSpace) -> None:
-        self.S, self.w = S, in_w(S)
-
-    def gains(self, omega: Array) -> Array:
-        """σ_max(S) at frequencies in rad/s."""
-        return largest(self.S.response(omega))
-
-    def crossings(self, level: float) -> Array:
-        """Candidates in rad/s, ascending."""
-        parts = (np.ascontiguousarray(getattr(self.w, name)) for name in "ABCD")
-        found, info = axis_frequencies(*parts, level)
-        return self.from_w(found) if info == 0 else np.zeros(0)
-
-    def from_w(self, v: Array | float) -> Array:
-        """ω at which z = e^{jωT} is where w = jv."""
-        return np.asarray(2.0 / self.S.period * np.arctan(0.5 * self.S.period * v))
-
-    def bandwidth(self) -> float:
-        """The first ω at which the gain passes 1/√2 from below; NaN where there is none."""
-        crossings = self.crossings(HALF_POWER)
-        if not len(crossings):
-            return np.nan
-        last = min(2.0 * crossings[-1], np.pi / self.S.period)
-        ends = np.array([0.5 * crossings[0], *np.sqrt(crossings[1:] * crossings[:-1]), last])
-        above = self.gains(ends) > HALF_POWER
-        if above[0] or not above.any():
-            return np.nan
-        first = int(np.argmax(above))
-        excess = lambda omega: float(self.gains(np.array([omega]))[0] - HALF_POWER)  # noqa: E731
-        return float(brentq(excess, ends[first - 1], ends[first], (), 1e-12 * ends[first], 1e-14))
+    parts = (np.ascontiguousarray(getattr(over_w, name)) for name in "ABCD")
+    found, info = axis_frequencies(*parts, HALF_POWER)
+    crossings = _from_w(S, found)
+    if info or not len(crossings):
+        return np.nan
+    last = min(2.0 * crossings[-1], np.pi / S.period)
+    ends = np.array([0.5 * crossings[0], *np.sqrt(crossings[1:] * crossings[:-1]), last])
+    above = largest(S.response(ends)) > HALF_POWER
+    if above[0] or not above.any():
+        return np.nan
+    first = int(np.argmax(above))
+    excess = lambda omega: float(largest(S.response(np.array([omega])))[0] - HALF_POWER)  # noqa: E731
+    return float(brentq(excess, ends[first - 1], ends[first], (), 1e-12 * ends[first], 1e-14))

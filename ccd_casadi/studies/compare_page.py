@@ -13,7 +13,7 @@ from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
-from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
+from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, table_gains
 from ccd_casadi.reporting.solve_page import stage_sections
 from ccd_casadi.reporting.true_samples import read_truths
@@ -21,7 +21,7 @@ from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.conclusions import LABELS
-from ccd_casadi.studies.methods import cost_figure, descent_figure, theta_paths
+from ccd_casadi.studies.methods import cost_figure, theta_paths
 from ccd_casadi.support.units import number
 
 
@@ -48,11 +48,6 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
                 if comparison.method(name).figures.get("theta")
             },
         )
-    sections += [
-        Section(f"History: {LABELS[item.name]}", (descent_figure(problem, item.descent),))
-        for item in comparison.methods
-        if item.descent is not None and item.descent.iterates
-    ]
     sections += [
         Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
         for method in comparison.methods
@@ -129,23 +124,23 @@ def _row(figures: Mapping[str, Any], factors: Mapping[str, float]) -> tuple[str,
 
 
 def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
-    """The landscape from the lifted surrogates, the way of each iterative method over it."""
-    problem = comparison.problem
-    lifted = comparison.method("lifted")
-    processes = () if lifted.solution is None else lifted.solution.outcome.surrogates
+    """The landscape from the nested surrogate, the way of each iterative method over it."""
+    problem, process = comparison.problem, None
     nested = comparison.method("nested").solution
+    if nested is not None:
+        process = bandwidth_process(nested.outcome.surrogates)
     if nested is not None and nested.verified is not None:  # its samples may be of its own anchors
         problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
-    land = landscape_data(problem, processes, truths)
+    land = landscape_data(problem, process, truths)
     walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]
     optimum = None
     if best is not None:
         theta = comparison.method(best).figures["theta"]
         optimum = (theta[problem.names[0]], theta[problem.names[1]])
     caption = (
-        "Colours: ω_b*(θ) predicted by the lifted surrogates; dots: the nested formulation's true "
-        "samples in the same colours."
+        "Colours: ω_b*(θ) predicted by the nested formulation's surrogate; dots: its true samples "
+        "in the same colours."
     )
     land = replace(land, paths=theta_paths(walked), optimum=optimum)
     return Figure(land, caption, tables_landscape(land))

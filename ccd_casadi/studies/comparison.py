@@ -162,12 +162,7 @@ def _best_descent(
     runs = [descent for descent in descents if descent.gradient is gradient]
     best = min(runs, key=lambda d: (round(d.objective, 9), d.syntheses))
     name = "steepest_descent" if gradient is Gradient.FIXED else "steepest_descent_total"
-    extra = {
-        "gradient": gradient.value,
-        "start": best.start,
-        "first_step": best.first_step,
-        "stop": best.stop.value,
-        "iterations": len(best.iterates),
+    extra = _run_dict(best) | {
         "runs": len(runs),
         "syntheses_of_all_runs": sum(run.syntheses for run in runs),
         "history": [asdict(iterate) for iterate in best.iterates],
@@ -186,6 +181,17 @@ def _best_descent(
     path = tuple(item.theta for item in best.iterates)
     made = baseline_of(problem).controller(theta, best.design)
     return Method(name, clean(figures), path, trace, descent=best, controller=made)
+
+
+def _run_dict(descent: Descent) -> dict[str, Any]:
+    """How a descent began, and how it ended."""
+    return {
+        "gradient": descent.gradient.value,
+        "start": descent.start,
+        "first_step": descent.first_step,
+        "stop": descent.stop.value,
+        "iterations": len(descent.iterates),
+    }
 
 
 def _sequential(
@@ -261,14 +267,10 @@ def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
                 for method in comparison.methods
             },
             "descents": [
-                {
-                    "gradient": descent.gradient.value,
-                    "start": descent.start,
-                    "first_step": descent.first_step,
+                _run_dict(descent)
+                | {
                     "objective": descent.objective,
                     "theta": descent.iterates[-1].theta if descent.iterates else None,
-                    "stop": descent.stop.value,
-                    "iterations": len(descent.iterates),
                     "syntheses": descent.syntheses,
                 }
                 for descent in comparison.descents

@@ -6,6 +6,7 @@ with exact eigenvalue derivatives dλ_1 = φᵀ(dK - λ_1 dM)φ, and then the in
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -43,31 +44,6 @@ def first_resonance(problem: CoDesignProblem, theta: Array) -> tuple[float, Arra
     return omega, slope / (2.0 * omega)
 
 
-class FirstResonance(VectorCallback):
-    """ln(ω_1/ω_ref) of θ with its Jacobian; repeated points cost nothing."""
-
-    def __init__(self, problem: CoDesignProblem, reference: float) -> None:
-        self.problem, self.reference = problem, reference
-        self._known: dict[bytes, tuple[float, Array]] = {}
-        super().__init__("first_resonance", len(problem.names), 1, self.values, self.jacobian_at)
-
-    def at(self, theta: Array) -> tuple[float, Array]:
-        """ω_1 in rad/s and its gradient."""
-        key = theta.tobytes()
-        if key not in self._known:
-            self._known[key] = first_resonance(self.problem, theta)
-        return self._known[key]
-
-    def values(self, x: Array) -> Array:
-        """(1,) ln(ω_1/ω_ref)."""
-        return np.array([np.log(self.at(x)[0] / self.reference)])
-
-    def jacobian_at(self, x: Array) -> Array:
-        """(1, n_θ) derivatives."""
-        omega, slope = self.at(x)
-        return slope[None, :] / omega
-
-
 def design_hardware(
     problem: CoDesignProblem,
     resonance: float,
@@ -100,7 +76,12 @@ def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> Hardw
     plant = plant_of(problem)
     theta = ca.MX.sym("theta", len(lower))
     cost, lam = plant.hardware(theta)
-    callback = FirstResonance(problem, resonance)
+    at = lru_cache(maxsize=None)(lambda point: first_resonance(problem, np.array(point)))
+    callback = VectorCallback(
+        "first_resonance", len(lower), 1,
+        lambda x: np.array([np.log(at(tuple(x))[0] / resonance)]),
+        lambda x: at(tuple(x))[1][None] / at(tuple(x))[0],
+    )  # fmt: skip
     program = NonlinearProgram(
         x=theta,
         f=cost / (abs(hardware_cost(plant, start)) or 1.0),
@@ -113,7 +94,7 @@ def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> Hardw
         point = solve_program(program, np.array([start])).best.x
     except OuterFailure:
         point = np.array(start)
-    omega = callback.at(point)[0]
+    omega = at(tuple(point))[0]
     met = bool(omega >= resonance * (1.0 - 1e-6)) and not unmet(problem, point)
     value = hardware_cost(plant, point)
     return HardwareDesign(tuple(float(v) for v in point), value, omega, met)

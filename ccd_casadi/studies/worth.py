@@ -1,4 +1,9 @@
-"""What co-design gains over the sequential way, from a few true designs and their derivatives."""
+"""What co-design gains over the sequential way, from a few true designs and their derivatives.
+
+Both designs are true, so the gain is one that can be had. What a full solve would find besides is
+not bounded: where the global check was left out, the gain on a table of modes was 35 points of
+hardware cost too small, and the model, a few per cent wrong where it was tried, did not show it.
+"""
 
 from collections.abc import Mapping
 from time import perf_counter
@@ -7,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.case import Case
-from ccd_casadi.codesign.outer_problem import OuterFailure, solve_program
+from ccd_casadi.codesign.nested import fit_bandwidth
+from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
@@ -16,13 +22,14 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
-from ccd_casadi.studies.sequential import design_hardware
+from ccd_casadi.studies.sequential import design_hardware, first_resonance
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ, number
-from surrogates import design
+from surrogates import design, to_casadi
 
 SECONDS = 20.0  # after which no further round begins
 STARTS = 8  # of IPOPT, on the hardware and on the surrogates
+EVALUATIONS = 20  # of the plant, that one of these on the hardware takes at least
 LOOKS = 8  # true inner problems over the box for each parameter
 SETTLED = 1e-3  # of |J|: a round that gains less, as expected, is the last
 SIGMAS = 2.0  # of the surrogate's error at left-out samples
@@ -34,8 +41,11 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     Raises UserError where too few designs are certified to learn from, or none is feasible.
     """
     began, rule = perf_counter(), HZ * case.baseline.first_resonance_hz
+    beside = np.array(sampler.problem.start) + 1e-3 * np.subtract(*box(sampler.problem)[::-1])
+    first_resonance(sampler.problem, np.clip(beside, *box(sampler.problem)))  # not the start: known
+    slow = (perf_counter() - began) * EVALUATIONS > SECONDS  # finite elements: the start alone
     hardware = design_hardware(
-        sampler.problem, rule, starts=STARTS, seed=seed, workers=sampler.workers
+        sampler.problem, rule, starts=0 if slow else STARTS, seed=seed, workers=sampler.workers
     )
     outer = outer_of(sampler).prepared(seed)
     sampler, problem = outer.sampler, outer.problem
@@ -43,29 +53,31 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     spread = design("sobol", *box(problem), LOOKS * count, seed)
     known = sampler.bandwidths(np.array([hardware.theta, problem.start]), "first designs")
     for i in range(0, len(spread), 2 * count):
-        if perf_counter() - began < 0.5 * SECONDS:
-            known += sampler.bandwidths(spread[i : i + 2 * count], "a look over the box")
+        if i == 0 or perf_counter() - began < 0.5 * SECONDS:
+            known += sampler.bandwidths(spread[i : i + 2 * count], "global check")
     best = min(known, key=lambda sample: _value(problem, sample))
-    learner = outer.learner(LOOKS // 2 * len(outer.bounds[0]), seed)
-    learner.begin(None)
-    feasible = [sample for sample in known if sample.feasible]
-    learner.learn(np.array([learner.point(sample) for sample in feasible]), feasible)
+    missed: list[float] = []
     while True:
-        before, starts = _value(problem, best), design("sobol", *learner.bounds, STARTS, seed)
-        if np.isfinite(before):
-            starts = np.vstack([starts, learner.point(best)])
+        before, learnt = _value(problem, best), [sample for sample in known if sample.feasible]
+        if len(learnt) <= count:
+            words = f"only {len(learnt)} of {len(known)} designs in the box were certified"
+            raise UserError(f"no trade-off can be learnt: {words}; widen the bounds")
+        process = fit_bandwidth(problem, learnt, seed, gradients=True)
+        program = nested_program(problem, to_casadi(process, std=False))
+        starts = np.vstack([best.theta, design("sobol", *box(problem), STARTS, seed)])
         try:
-            expected = solve_program(learner.program(), starts).best
-        except OuterFailure:  # the surrogates expect a feasible design nowhere
+            expected = solve_program(program, starts).best
+        except OuterFailure:  # the surrogate expects a feasible design nowhere
             break
-        new = sampler.bandwidths(outer.theta_of(expected.x), "the best expected")[0]
+        new = sampler.bandwidths(expected.x, "the best expected")[0]
+        missed += [process.predict(expected.x[None])[0] - new.value] if new.feasible else []
         best = min(best, new, key=lambda sample: _value(problem, sample))
         level = SETTLED * abs(_value(problem, best))
         true = abs(_value(problem, new) - expected.objective) <= level
-        if (true and before - _value(problem, best) <= level) or perf_counter() - began > SECONDS:
+        settled = true and before - _value(problem, best) <= level
+        if settled or new in known or perf_counter() - began > SECONDS:
             break
-        rows = [expected.x, learner.point(new)] if new.feasible else [expected.x]
-        learner.learn(np.array(rows), [new] * len(rows))
+        known.append(new)
     if not np.isfinite(_value(problem, best)):
         raise UserError(f"no feasible design was found: {known[0].shortfall}")
     entries: list[dict[str, Any]] = [
@@ -79,7 +91,8 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         for sample in (known[0], best)
     ]
     old, co = entries
-    error = SIGMAS * learner.processes[0].loo.rms / HZ  # what the surrogate misses, left out
+    # True designs that the model had not learnt, and those that it is fitted without in turn.
+    error = max(np.abs(missed).max(initial=0.0), SIGMAS * process.loo.rms) / HZ
     return {
         "sequential": old,
         "co_design": co,
@@ -103,10 +116,11 @@ def worth_words(found: Mapping[str, Any]) -> list[str]:
     """The answer first, then both designs and what it has cost."""
     answer = "The sequential hardware has no feasible controller; co-design has one."
     if np.isfinite(found["bandwidth_percent"]):
+        more, wrong = found["bandwidth_percent"], found["uncertainty_percent"]
         answer = (
             f"Co-design changes the hardware cost by {found['hardware_cost_percent']:+.1f} % and "
-            f"the bandwidth by {found['bandwidth_percent']:+.1f} % (uncertain by "
-            f"{found['uncertainty_percent']:.1f} %)."
+            f"the bandwidth by {more:+.1f} %, or better. Both designs are true; the model that led "
+            f"to them misses others by up to {wrong:.2g} % and does not exclude a better one."
         )
     lines = [f"answer        {answer}"]
     for label, each in (("sequential", found["sequential"]), ("co-design", found["co_design"])):

@@ -7,6 +7,9 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import NoReturn
 
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+
 LONGEST = 1000  # characters of a line: somebody else's message in it may have millions
 
 
@@ -108,3 +111,22 @@ def number(
 
 
 positive = number(strict=True)
+
+
+def add_break_frequencies(arguments: argparse.ArgumentParser, words: str) -> None:
+    """Add --omega-s-hz and --omega-t-hz, which `break_frequencies` reads."""
+    for name in ("S", "T"):
+        arguments.add_argument(
+            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
+            help=words,
+        )  # fmt: skip
+
+
+def break_frequencies(options: argparse.Namespace) -> tuple[float, float] | None:
+    """(ω_S, ω_T) in rad/s; None where neither is given. Raises UserError where one is missing."""
+    given = options.omega_S_hz, options.omega_T_hz
+    if None not in given:
+        return HZ * given[0], HZ * given[1]
+    if given != (None, None):
+        raise UserError(f"{options.case}: give both --omega-s-hz and --omega-t-hz, or neither")
+    return None

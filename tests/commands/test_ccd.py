@@ -45,6 +45,8 @@ def options_read(module: ModuleType) -> set[str]:
     found = set(re.findall(r"\boptions\.(\w+)", text + shared.read_text()))
     if "move_limits(options)" in text:
         found |= {name for name, _, _ in demands._MOVE}
+    if "break_frequencies(options)" in text:
+        found |= {"omega_S_hz", "omega_T_hz"}
     return found
 
 

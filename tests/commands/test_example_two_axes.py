@@ -14,7 +14,7 @@ from ccd_casadi.cases.case import parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.codesign.theta_kkt import theta_kkt
-from ccd_casadi.deployment.as_designed import _require_own_bounds
+from ccd_casadi.deployment.as_designed import require_own_bounds
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign
 from ccd_casadi.fixed_structure.optimality import Envelope
@@ -114,12 +114,12 @@ def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
 def test_what_is_judged_as_designed_is_deployed_as_designed() -> None:
     run: Any = SimpleNamespace(folder=CASE.parent, problem=problem_of(parse_case(case(), CASE)))
     designed = Sampling(8000.0, 100.0)
-    _require_own_bounds(run, designed, Timing())
-    _require_own_bounds(run, designed, Timing(rate_hz=8000.0, delay=designed.delay))
+    require_own_bounds(run, designed, Timing())
+    require_own_bounds(run, designed, Timing(rate_hz=8000.0, delay=designed.delay))
     for loop, timing in ((None, Timing()), (designed, Timing(rate_hz=4000.0)),
                          (designed, Timing(delay=2e-4))):  # fmt: skip
         with pytest.raises(UserError, match="bounds of their own"):
-            _require_own_bounds(run, loop, timing)
+            require_own_bounds(run, loop, timing)
     plain = parse_case(case({}), CASE)
-    _require_own_bounds(SimpleNamespace(folder=CASE.parent, problem=problem_of(plain)), None,
+    require_own_bounds(SimpleNamespace(folder=CASE.parent, problem=problem_of(plain)), None,
                         Timing())  # fmt: skip

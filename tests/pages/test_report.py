@@ -42,19 +42,16 @@ from ccd_casadi.drawing.maps import figure_landscape
 from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.paint import block_html, painted
 from ccd_casadi.inner_problem.design_loops import design_view
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.report import main as report_command
 from ccd_casadi.reporting.bode import bode
-from ccd_casadi.reporting.landscape import caption_landscape
-from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.solve_page import solve_page, write_report
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.units import number
-from surrogates.gaussian_process import mean_at_many
 
 HZ = 2.0 * np.pi
 VOID = {"meta", "br", "img", "link", "input", "hr"}
@@ -338,7 +335,7 @@ def test_a_run_without_one_gets_a_report_of_its_design(
     def refused(*given: object, **named: object) -> None:
         raise AssertionError("nothing is designed")
 
-    for place in ("synthesis.synthesis", "reporting.loops", "reporting.start"):
+    for place in ("synthesis.synthesis", "reporting.loops"):
         monkeypatch.setattr(f"ccd_casadi.{place}.synthesise", refused)
     assert report_command([str(folder), "--quiet"]) == 0
     text = (folder / "report.html").read_text(encoding="utf-8")
@@ -396,22 +393,6 @@ def test_other_problems_in_the_store_are_left_out() -> None:
     assert len(others.designs) == len(others.theta) == 0
 
 
-def test_lifted_maximum_is_the_surrogates_and_near_the_truth() -> None:
-    _, _, problem, solution, _ = run("two_mass")
-    processes = solution.outcome.surrogates
-    rng = np.random.default_rng(0)
-    X = rng.uniform(processes[0].lower, processes[0].upper, (200, 4))
-    for process in processes:
-        off = np.abs(mean_at_many(process, X) - process.predict(X)).max()
-        assert off <= 1e-7 * process.output_scale
-    thetas = rng.uniform(problem.lower, problem.upper, (6, 2))
-    best = inner_maximum(problem, processes, thetas)
-    assert best.bandwidth == pytest.approx(processes[0].predict(best.x), rel=1e-4)
-    assert (processes[1].predict(best.x) <= np.log(problem.inner.S_max) + 1e-3).all()
-    truth = [true_inner(problem, tuple(theta)).bandwidth for theta in thetas]
-    assert best.bandwidth == pytest.approx(np.array(truth), rel=0.03)
-
-
 def test_figures_are_deterministic_and_keep_the_callers_style() -> None:
     import matplotlib
 
@@ -438,16 +419,6 @@ def test_landscape_takes_several_paths_and_unknown_letters() -> None:
     svg = figure_landscape(land, "two")
     Document(svg)
     assert all(word in svg for word in ("ours", "theirs", "天", "…"))
-
-
-def test_a_slope_that_the_surrogate_may_err_by_is_not_told() -> None:
-    """It was told as a fact, eight times the true one, at an optimum that the samples missed."""
-    axis = np.linspace(0.0, 1.0, 5)
-    field = axis[:, None] ** 2 + 0.0 * axis  # the steepest step is 7/16 Hz
-    land = Landscape(("a", "b"), ("", ""), axis, axis, field, np.empty((0, 3)), np.empty((0, 2)))
-    for error, told in ((0.2, True), (0.25, False)):
-        words = caption_landscape(land, 1.0, lifted=False, error_hz=error)
-        assert ("steepest" in words) is told
 
 
 def test_tables_round_and_escape() -> None:

@@ -23,7 +23,8 @@ def best_at(case: CoDesignProblem, theta: tuple[float, ...]) -> SimpleNamespace:
     f = best.figures
     made = synthesise(scaled_plant(case, theta), case.weights.at(f.omega_S, f.omega_T),
                       omega_low=case.inner.omega_low)  # fmt: skip
-    return SimpleNamespace(theta=theta, design=made)
+    return SimpleNamespace(theta=theta, design=made, problem=case, controller=made.controller,
+                           bandwidth=f.bandwidth)  # fmt: skip
 
 
 def html(section: Section) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.plants.cad.elements import Material as Material
 from ccd_casadi.support.arrays import Array
 
 NAMES = ("h", "t_o", "t_i", "t_c", "H", "x_i")
@@ -26,15 +27,6 @@ UPPER = (4e-3, 8e-3, 8e-3, 8e-3, 20e-3, 95e-3)
 IS_RIB = (True, False, True, False, True)  # t_c/2, b_2, t_i, b_1, t_o: from the centre
 
 Point = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Material:
-    """Isotropic linear elasticity: E in Pa, Poisson's ratio, density in kg/m³; 6061-T6."""
-
-    young: float = 68.9e9
-    poisson: float = 0.33
-    density: float = 2700.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +88,7 @@ def height_lengths() -> tuple[Array, Array]:
 
 def bays(geometry: Geometry, theta: Sequence[Any]) -> tuple[Any, Any]:
     """Widths (b_1, b_2) of the outer and the inner bay in m; floats or CasADi symbols."""
-    _, t_o, t_i, t_c, _, x_i = _six(theta)
+    _, t_o, t_i, t_c, _, x_i = theta
     return 0.5 * geometry.side - x_i - t_o - 0.5 * t_i, x_i - 0.5 * t_i - 0.5 * t_c
 
 
@@ -118,7 +110,7 @@ def mass(geometry: Geometry, theta: Sequence[Any]) -> Any:
 
 def mass_properties(geometry: Geometry, theta: Sequence[Any]) -> MassProperties:
     """Mass, centre of gravity and inertia in closed form, exact for the stage as drawn."""
-    h, _, t_i, t_c, H, x_i = _six(theta)
+    h, _, t_i, t_c, H, x_i = theta
     L, rho = geometry.side, geometry.material.density
     outer, inner = bays(geometry, theta)
     W = 2.0 * (outer + inner)
@@ -154,7 +146,3 @@ def has_square_symmetry(geometry: Geometry) -> bool:
     mirrored = [(-x, y, m) for x, y, m in here]
     swapped = [(y, x, m) for x, y, m in here]
     return table(here) == table(mirrored) == table(swapped)
-
-
-def _six(theta: Sequence[Any]) -> tuple[Any, ...]:
-    return tuple(theta[i] for i in range(len(NAMES)))

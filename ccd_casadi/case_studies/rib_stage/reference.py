@@ -55,8 +55,7 @@ def cube_stiffness(orders: tuple[int, int, int], material: Material) -> Array:
     K_pq collects C_ikjl ∂_k N_a ∂_l N_b for {k, l} = {p, q}, with
     C_ikjl = λ δ_ik δ_jl + μ (δ_ij δ_kl + δ_il δ_kj).
     """
-    E, nu = material.young, material.poisson
-    lame, mu = E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)), 0.5 * E / (1.0 + nu)
+    lame, mu = material.lame
     lines = [line_matrices(p) for p in orders]
     n = int(np.prod([p + 1 for p in orders]))
     unit = np.eye(3)

@@ -25,11 +25,11 @@ AXES = range(3)
 
 @dataclass(frozen=True)
 class Material:
-    """Isotropic linear elasticity: E in Pa, Poisson's ratio, density in kg/m³."""
+    """Isotropic linear elasticity: E in Pa, Poisson's ratio, density in kg/m³; 6061-T6."""
 
-    young: float
-    poisson: float
-    density: float
+    young: float = 68.9e9
+    poisson: float = 0.33
+    density: float = 2700.0
 
     @property
     def lame(self) -> tuple[float, float]:

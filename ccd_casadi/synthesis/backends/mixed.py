@@ -72,14 +72,16 @@ TITLES = {RICCATI: "one Riccati (ours)", SLICOT: "SB10AD (slycot)"}
 class BackendResult:
     """γ_opt as the back end claims it, and its design, measured; None where it made none.
 
-    `reason` says why there is no design, or how the certificate judged the one there is.
+    `words` say why there is no design, or how the certificate judged the one there is; `holds`
+    (`verdicts`) whether claim and design do: None where there is no claim.
     """
 
     backend: str
     gamma_opt: float
     design: Design | None
-    reason: str
+    words: str
     seconds: float
+    holds: bool | None = None
 
     @property
     def certified(self) -> bool:
@@ -99,19 +101,19 @@ def synthesise_with(
 ) -> BackendResult:
     """One synthesis by "riccati" or one of `SOLVERS`, certified; ω_low in rad/s.
 
-    With a `runner` those run in its process and are killed after `limit`
-    seconds. Raises MissingPackage where a package is not installed.
+    With a `runner` those run in its process and are killed after `limit` seconds. Of a missing
+    package the words are what to install.
     """
     began = time.perf_counter()
     if backend == RICCATI:
         design = synthesise(plant, weights, omega_low=omega_low, gamma_backoff=gamma_backoff)
-        gamma_opt, reason = design.figures.gamma_opt, design.figures.outcome.value
-        return BackendResult(backend, gamma_opt, design, reason, time.perf_counter() - began)
+        gamma_opt, words = design.figures.gamma_opt, design.figures.outcome.value
+        return BackendResult(backend, gamma_opt, design, words, time.perf_counter() - began)
     task = (SOLVERS[backend], mixed_sensitivity(plant, weights), gamma_backoff)
     try:
         attempt, seconds = _timed(*task) if runner is None else runner.call(limit, _timed, *task)
-    except Overrun as overrun:
-        attempt, seconds = Attempt(np.nan, np.nan, None, str(overrun)), limit
+    except (Overrun, MissingPackage) as error:
+        attempt, seconds = Attempt(np.nan, np.nan, None, str(error)), time.perf_counter() - began
     K = attempt.controller
     if K is None:
         return BackendResult(backend, attempt.gamma_opt, None, attempt.reason, seconds)
@@ -132,63 +134,30 @@ def _timed(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[A
     return attempt, time.perf_counter() - began
 
 
-def every_backend(
-    plant: ScaledPlant,
-    weights: Weights,
-    *,
-    omega_low: float,
-    gamma_backoff: float = 1.02,
-    limit: float = 60.0,
-) -> list[BackendResult]:
-    """All back ends on one problem, a missing one as a result that says what is missing."""
-    found = []
-    with Runner() as runner:
-        for backend in TITLES:
-            try:
-                result = synthesise_with(
-                    backend, plant, weights, omega_low=omega_low, gamma_backoff=gamma_backoff,
-                    runner=runner, limit=limit,
-                )  # fmt: skip
-            except MissingPackage as missing:
-                result = BackendResult(backend, np.nan, None, str(missing), 0.0)
-            found.append(result)
-    return found
-
-
 AGREE = 1e-3  # relative: what an interior-point method is good for
 BELOW = 1e-6  # relative: a claim this far below the bound is wrong
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What the certificate says of one back end, and whether its claim and design hold."""
-
-    result: BackendResult
-    holds: bool | None  # None: it made no claim
-    words: str
-
-
-def verdicts(results: Sequence[BackendResult]) -> list[Verdict]:
-    """Judge every claim by the certificates and by the bound γ_jω of the package's own design."""
+def verdicts(results: Sequence[BackendResult]) -> list[BackendResult]:
+    """Each claim judged by the certificates and by γ_jω of the package's own design."""
     ours = next(item for item in results if item.backend == RICCATI)
     bound = ours.design.figures.gamma_lower_bound if ours.design is not None else math.nan
     proven = [item.gamma_opt for item in results if item.certified and item.gamma_opt > 0.0]
-    lowest = min(
-        (g for g in proven if not g < bound * (1.0 - BELOW)), default=math.nan
-    )  # fmt: skip
-    found = []
-    for item in results:
+    lowest = min((g for g in proven if not g < bound * (1.0 - BELOW)), default=math.nan)
+
+    def judged(item: BackendResult) -> BackendResult:
         if item.design is None:
-            found.append(Verdict(item, None, item.reason))
-        elif item.gamma_opt < bound * (1.0 - BELOW):
+            return item
+        if item.gamma_opt < bound * (1.0 - BELOW):
             short = 100.0 * (1.0 - item.gamma_opt / bound)
             words = f"wrong: claims {short:.2g} % less than any controller reaches ({bound:.6g})"
-            found.append(Verdict(item, False, words))
         elif not item.certified:
-            found.append(Verdict(item, False, f"not certified: {item.reason}"))
+            words = f"not certified: {item.words}"
         elif item.gamma_opt > lowest * (1.0 + AGREE):
             over = 100.0 * (item.gamma_opt / lowest - 1.0)
-            found.append(Verdict(item, False, f"certified, but {over:.2g} % above the least"))
+            words = f"certified, but {over:.2g} % above the least"
         else:
-            found.append(Verdict(item, True, "certified"))
-    return found
+            return replace(item, holds=True, words="certified")
+        return replace(item, holds=False, words=words)
+
+    return [judged(item) for item in results]
