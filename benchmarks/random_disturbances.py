@@ -20,6 +20,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import control
 import numpy as np
 from random_syntheses import SLACK, Case, draw_case, draw_weights
 from slycot import ab13dd
@@ -32,7 +33,7 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.backends.mixed import solve_slicot
-from ccd_casadi.synthesis.backends.standard_plant import balance, close, mixed_sensitivity
+from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, balance, mixed_sensitivity
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 SB10AD_STATES = 30  # of the generalized plant; larger ones take it seconds
@@ -53,6 +54,13 @@ def gains(case: Case, design: Design, omega: np.ndarray) -> np.ndarray:
     W3 = W3 / w.disturbance  # `responses` has the weight of T there
     stack = np.concatenate([W1 * right, W2 * (k @ right), W3 * (k @ right)], axis=1)
     return np.linalg.norm(stack, 2, axis=(1, 2))
+
+
+def close(plant: StandardPlant, K: StateSpace) -> StateSpace:
+    """The loop from w to z."""
+    P, controller = (control.ss(*vars(part).values()) for part in (plant.whole(), K))
+    loop = P.lft(controller)
+    return StateSpace(*(np.asarray(M) for M in (loop.A, loop.B, loop.C, loop.D)))
 
 
 def check(case: Case, design: Design) -> tuple[str, float]:

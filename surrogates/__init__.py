@@ -12,7 +12,7 @@ Sample (`design`), fit (`fit`), judge (`quality_of`, `extrapolation`), export (`
 True
 
 The package knows nothing of what the function means. Names are imported when they are first
-used: this module alone loads nothing, and scikit-learn comes when something is fitted.
+used: this module alone loads nothing.
 """
 
 from surrogates.lazy_names import from_stub as _from_stub

@@ -36,7 +36,6 @@ def fit(
     upper: ArrayLike | None = ...,
     kernel: Kernel | str = ...,
     noise: Noise = ...,
-    gradient_noise: float | None = ...,
     seed: int = ...,
     starts: int = ...,
 ) -> GaussianProcess: ...
@@ -61,7 +60,6 @@ def fit(
     upper: ArrayLike | None = None,
     kernel: Kernel | str = Kernel.MATERN52,
     noise: Noise = None,
-    gradient_noise: float | None = None,
     seed: int = 0,
     starts: int = 5,
 ) -> GaussianProcess | Polynomial:
@@ -69,11 +67,10 @@ def fit(
 
     X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X, which processes
     and polynomials take. `lower`, `upper` (d,) scale the inputs; left out, they are the
-    range of X. `kernel`, `gradient_noise`, `seed` and `starts` are those of the processes.
+    range of X. `kernel`, `seed` and `starts` are those of the processes.
 
     `noise` is the standard deviation of Y in output units, one for all or one to each
-    sample (n,); 0 interpolates, None estimates it where the kind can. `gradient_noise`
-    is that of dY (upper - lower).
+    sample (n,); 0 interpolates, None estimates it where the kind can.
 
     Raises:
         SurrogateFitError: wrong shapes, values that are not finite, negative noise,
@@ -81,12 +78,12 @@ def fit(
             what to do.
     """
     samples = checked(X, Y, lower, upper, dY, noise)
-    if (gradient_noise or 0.0) < 0.0 or starts < 1:
-        raise SurrogateFitError("noise must not be negative and there must be a start")
+    if starts < 1:
+        raise SurrogateFitError("there must be a start")
     match _named(Kind, kind, "kind"):
         case Kind.GAUSSIAN_PROCESS:
             family = _named(Kernel, kernel, "kernel")
-            return fit_process(samples, family, gradient_noise, seed, starts)
+            return fit_process(samples, family, seed, starts)
         case Kind.POLYNOMIAL:
             return fit_polynomial(samples)
 

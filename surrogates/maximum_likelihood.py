@@ -1,15 +1,8 @@
-"""Hyperparameters of a process by maximum marginal likelihood.
+"""Hyperparameters of a process by maximum marginal likelihood, of values and gradients alike."""
 
-Values alone go through scikit-learn's regressor; values with gradients, which it
-does not know, through `likelihood.log_likelihood` and L-BFGS-B.
-"""
-
-import warnings
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
 from surrogates.covariance import Hyperparameters, Kernel
@@ -31,25 +24,19 @@ from surrogates.validation import errors
 START_ORDER = 200
 POLISH_ORDER = 600
 # Relative jitter during the search, so that no trial point is lost to rounding.
-SEARCH_JITTER = 1e-13
-# Scaled variances added in the search, until the covariance at its end is definite.
-NUGGETS = (0.0, 1e-10, 1e-8, 1e-6)
+SEARCH_JITTER = 1e-15
 # Observations that an exact process holds: 200 MB and some ten seconds to factorise.
 EXACT_LIMIT = 5000
 
 
 def fit_process(
-    samples: Samples,
-    kernel: Kernel = Kernel.MATERN52,
-    gradient_noise: float | None = None,
-    seed: int = 0,
-    starts: int = 5,
+    samples: Samples, kernel: Kernel = Kernel.MATERN52, seed: int = 0, starts: int = 5
 ) -> GaussianProcess:
     """Return the process that maximises log p(Y, dY | X) (R & W eq. 5.8).
 
     Over length scales, signal and, where it is not given, noise variance, from
-    `starts` seeded starts; then `centred` and its bands `calibrated`. `gradient_noise` is
-    the deviation of dY (upper - lower), in output units, estimated if None.
+    `starts` seeded starts; then `centred` and its bands `calibrated`. That of gradients
+    is estimated always.
 
     Raises:
         SurrogateFitError: more observations than an exact process holds, contradictory
@@ -60,31 +47,48 @@ def fit_process(
             f"{samples.observations} observations are more than the {EXACT_LIMIT} an exact "
             "Gaussian process holds: use kind='polynomial', or fewer samples"
         )
-    parameters = estimate(samples, kernel, gradient_noise, seed, starts)
+    parameters = estimate(samples, kernel, seed, starts)
     process = conditioned(parameters, samples, kernel, uneven_noise(samples))
     return calibrated(centred(process))
 
 
-def estimate(
-    samples: Samples,
-    kernel: Kernel,
-    gradient_noise: float | None = None,
-    seed: int = 0,
-    starts: int = 5,
-) -> Hyperparameters:
+def estimate(samples: Samples, kernel: Kernel, seed: int = 0, starts: int = 5) -> Hyperparameters:
     """Return the hyperparameters of `fit_process`, of at most 600 of the observations."""
-    noise, own = None, uneven_noise(samples)
+    own = uneven_noise(samples)
+    fixed: list[float | None] = [None, 0.0 if samples.dY is None else None]
     if samples.noise is not None:
-        noise = 0.0 if own.size else float(samples.noise_variances[0])
-    rng = np.random.default_rng(seed)
-    if samples.dY is None:
-        return _by_scikit_learn(kernel, samples.unit, samples.targets, noise, own, rng, starts)
-    slope_noise = None
-    if gradient_noise is not None:
-        slope_noise = (gradient_noise / samples.scaling[1]) ** 2
-    return _by_joint_likelihood(
-        kernel, samples.unit, samples.targets, [noise, slope_noise], own, rng, starts
-    )
+        fixed[0] = 0.0 if own.size else float(samples.noise_variances[0])
+    rng, X = np.random.default_rng(seed), samples.unit
+    n, d = X.shape
+    bounds = [LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS]
+    bounds += [NOISE_BOUNDS if noise is None else (max(noise, 1e-300),) * 2 for noise in fixed]
+    order = rng.permutation(n)
+    by_component = samples.targets.reshape(-1, n)
+
+    def search(starts: list[Array], limit: int, iterations: int) -> Array:
+        rows = order[: max(limit // len(by_component), 2)]
+        observed = by_component[:, rows].ravel()
+        own_here = own[rows] if own.size else own
+        return maximised(
+            lambda natural: log_likelihood(
+                kernel, X[rows], observed, _parameters(natural), SEARCH_JITTER, own_here
+            ),
+            starts,
+            bounds,
+            iterations,
+        )[1]
+
+    # The second start is a nearly linear function of many inputs, the others are drawn.
+    first = np.array([0.5] * d + [1.0, 1e-6, 1e-6])
+    spread = np.array([4.0] * d + [10.0, 100.0, 100.0])
+    drawn = [first * spread ** rng.uniform(-1.0, 1.0, d + 3) for _ in range(starts - 2)]
+    natural = search([first, 10.0 * first, *drawn][:starts], START_ORDER, 100)
+    if samples.observations > START_ORDER:
+        natural = search([natural], POLISH_ORDER, 60)
+    for place, known in enumerate(fixed, d + 1):
+        if known is not None:  # exactly, and 0 too
+            natural[place] = known
+    return _parameters(natural)
 
 
 def uneven_noise(samples: Samples) -> Array:
@@ -93,111 +97,6 @@ def uneven_noise(samples: Samples) -> Array:
     if samples.noise is None or np.ptp(samples.noise) <= 1e-9 * samples.noise.max():
         return np.empty(0)
     return samples.noise_variances
-
-
-def _by_scikit_learn(
-    kernel: Kernel,
-    X: Array,
-    y: Array,
-    noise: float | None,
-    own: Array,
-    rng: np.random.Generator,
-    starts: int,
-) -> Hyperparameters:
-    """Maximise the marginal likelihood of values with scikit-learn's regressor."""
-    # Imported here: it takes longer than the rest of the package together, and
-    # nobody who only reloads and evaluates a surrogate needs it.
-    from scipy.linalg import LinAlgError
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-
-    lengths = np.full(X.shape[1], 0.5)
-    shape = (
-        RBF(lengths, LENGTH_BOUNDS)
-        if kernel is Kernel.RBF
-        else Matern(lengths, LENGTH_BOUNDS, nu=2.5)
-    )
-    covariance = ConstantKernel(1.0, SIGNAL_BOUNDS) * shape
-    if noise is None:
-        covariance = covariance + WhiteKernel(1e-6, NOISE_BOUNDS)
-    known = own if own.size else np.full(len(X), noise or 0.0)
-    floor = np.maximum(known, NOISE_BOUNDS[0])
-    order = rng.permutation(len(X))
-
-    def search(initial: Any, rows: NDArray[np.intp]) -> tuple[float, Any]:
-        for more in NUGGETS:
-            regressor = GaussianProcessRegressor(initial, alpha=np.maximum(floor[rows], more))
-            try:
-                with warnings.catch_warnings():
-                    # Parameters at a bound are ordinary (an input without influence,
-                    # noise-free samples), and so is a line search ended by rounding.
-                    warnings.simplefilter("ignore", ConvergenceWarning)
-                    regressor.fit(X[rows], y[rows])
-                return float(regressor.log_marginal_likelihood_value_), regressor.kernel_
-            except LinAlgError:
-                # The optimum itself is singular: many samples close together, no noise.
-                continue
-        raise SurrogateFitError("the covariance of the samples is not positive definite")
-
-    # A first look at few samples from many starts, then one polish on more of them. The
-    # second start is a nearly linear function of many inputs, the others are drawn.
-    first = covariance.theta
-    shift = np.log(np.full(first.size, 10.0))
-    drawn = [first + rng.uniform(-1.5, 4.0, first.size) for _ in range(starts - 2)]
-    trials = [first, first + shift, *drawn][:starts]
-    found = [search(covariance.clone_with_theta(theta), order[:START_ORDER]) for theta in trials]
-    covariance = max(found, key=lambda pair: pair[0])[1]
-    if len(X) > START_ORDER:
-        covariance = search(covariance, order[:POLISH_ORDER])[1]
-    theta = np.exp(covariance.theta)
-    d = X.shape[1]
-    return Hyperparameters(
-        length_scales=theta[1 : 1 + d],
-        signal_variance=float(theta[0]),
-        noise_variance=noise if noise is not None else float(theta[1 + d]),
-    )
-
-
-def _by_joint_likelihood(
-    kernel: Kernel,
-    X: Array,
-    targets: Array,
-    fixed: list[float | None],
-    own: Array,
-    rng: np.random.Generator,
-    starts: int,
-) -> Hyperparameters:
-    """Maximise the joint likelihood of values and gradients with L-BFGS-B."""
-    n, d = X.shape
-    bounds = [LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS]
-    bounds += [NOISE_BOUNDS if noise is None else (max(noise, 1e-300),) * 2 for noise in fixed]
-    order = rng.permutation(n)
-    by_component = targets.reshape(1 + d, n)
-
-    def search(starts: list[Array], limit: int, iterations: int) -> Array:
-        rows = order[: max(limit // (1 + d), 2)]
-        samples, observed = X[rows], by_component[:, rows].ravel()
-        own_here = own[rows] if own.size else own
-        return maximised(
-            lambda natural: log_likelihood(
-                kernel, samples, observed, _parameters(natural), SEARCH_JITTER, own_here
-            ),
-            starts,
-            bounds,
-            iterations,
-        )[1]
-
-    first = np.array([0.5] * d + [1.0, 1e-6, 1e-6])
-    spread = np.array([4.0] * d + [10.0, 100.0, 100.0])
-    drawn = [first * spread ** rng.uniform(-1.0, 1.0, d + 3) for _ in range(starts - 1)]
-    natural = search([first, *drawn], START_ORDER, 100)
-    if n * (1 + d) > START_ORDER:
-        natural = search([natural], POLISH_ORDER, 60)
-    for place, known in enumerate(fixed, d + 1):
-        if known is not None:  # exactly, and 0 too
-            natural[place] = known
-    return _parameters(natural)
 
 
 def _parameters(natural: Array) -> Hyperparameters:

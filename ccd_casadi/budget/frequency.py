@@ -65,7 +65,7 @@ class Integral:
         )
 
 
-def integrate(f: Callable[[Array], Array], ends: Array, *, relative: float = RELATIVE) -> Integral:
+def integrate(f: Callable[[Array], Array], ends: Array) -> Integral:
     """Rows f(x) (rows, len(x)) over the panels between `ends`, rising and above 0."""
     low, high = np.log(ends[:-1]), np.log(ends[1:])
     done: list[Array] = []  # low, high, shares and errors of panels, by column
@@ -78,7 +78,7 @@ def integrate(f: Callable[[Array], Array], ends: Array, *, relative: float = REL
         part, rows = value @ KRONROD, len(value)
         error = np.abs(value @ (KRONROD - GAUSS))
         total = part.sum(1) + sum(item[2 : 2 + rows].sum(1) for item in done)
-        allowed = relative * np.abs(total)[:, None] / (4 * len(ends))
+        allowed = RELATIVE * np.abs(total)[:, None] / (4 * len(ends))
         wide = (error > np.maximum(allowed, 1e-15 * np.abs(part))).any(0)
         if turn == ROUNDS - 1 or spent > MOST:
             wide[:] = False

@@ -59,7 +59,6 @@ def descend(
     x: Array,
     *,
     steps: int = 30,
-    radius: float = FIRST,
     settled: float = SETTLED,
     ended: Sequence[tuple[Array, float]] = (),
 ) -> Array:
@@ -74,7 +73,7 @@ def descend(
         return x
     scale = max(float(np.abs(here.gradient).max()), 1e-300)
     end = minimise(
-        model, here, scale * np.eye(x.size), Radius(radius, LEAST, LARGEST), steps=steps,
+        model, here, scale * np.eye(x.size), Radius(FIRST, LEAST, LARGEST), steps=steps,
         penalty=scale, least_gain=settled * abs(here.value),
     )  # fmt: skip
     return model.lower + model.width * end.best.x

@@ -128,17 +128,13 @@ def solve_lifted(
 
 
 def fit_quantities(
-    problem: CoDesignProblem,
-    samples: list[QuantitySample],
-    seed: int,
-    gradients: bool = True,
-    kind: str = "matern52",
+    problem: CoDesignProblem, samples: list[QuantitySample], seed: int, kind: str = "matern52"
 ) -> tuple[GaussianProcess, ...]:
     """Processes of ω_b (rad/s) and ln of each bounded figure over x = (θ, ln ω_S, ln ω_T)."""
     lower, upper = lifted_bounds(problem)
     X = np.array([sample.x for sample in samples])
     Y = np.array([sample.values[:-1] for sample in samples])
-    dY = np.array([sample.gradients[:-1] for sample in samples]) if gradients else None
+    dY = np.array([sample.gradients[:-1] for sample in samples])
     found = [
         fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1, kernel=kernel)
         for kernel in kernels_of(kind)

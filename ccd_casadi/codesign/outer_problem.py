@@ -25,6 +25,7 @@ OPTIONS: dict[str, Any] = {
     "print_time": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
+    "ipopt.tol": 1e-9,
     "ipopt.constr_viol_tol": 1e-9,
     "ipopt.acceptable_tol": 1e-7,
     "ipopt.max_iter": 300,
@@ -37,10 +38,7 @@ APART = 1e-4  # of the box: ends closer than this are one optimum
 
 @dataclass(frozen=True)
 class NonlinearProgram:
-    """min f(x), g_lower <= g(x) <= 0, lower <= x <= upper; g has λ in shares of its size.
-
-    `g_lower` is minus infinity where it is not given; zero makes an equation of a row.
-    """
+    """min f(x), g(x) <= 0, lower <= x <= upper; g has λ in shares of its size."""
 
     x: ca.MX
     f: ca.MX
@@ -48,7 +46,6 @@ class NonlinearProgram:
     lower: Array
     upper: Array
     exact_hessian: bool = True
-    g_lower: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -127,44 +124,29 @@ def lifted_bounds(problem: CoDesignProblem) -> tuple[Array, Array]:
     return lower, upper
 
 
-def solve_program(
-    program: NonlinearProgram,
-    starts: Array,
-    *,
-    tolerance: float = 1e-9,
-    settled: float | None = None,
-) -> OuterSolution:
+def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
     """IPOPT from every row of `starts`; variables are scaled to the unit box.
 
-    `settled`: an end is also where f changes by no more than that (relative) in four iterations one
-    after the other.
     Raises OuterFailure where no start converges.
     """
     width = program.upper - program.lower
     z = ca.MX.sym("z", program.x.shape[0])
     inside = program.lower + width * z
     f, g = ca.substitute([program.f, program.g], [program.x], [inside])
-    options = OPTIONS | {"ipopt.tol": tolerance}
+    options = OPTIONS.copy()
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
         # The true quantities carry rounding: there is no use in chasing the last digits.
         options["ipopt.acceptable_iter"] = 4
         # Where it has not converged by then it goes to and fro over a kink; `kinked` does not.
         options["ipopt.max_iter"] = 100
-    if settled is not None:
-        options |= {
-            "ipopt.acceptable_tol": 1e10,
-            "ipopt.acceptable_constr_viol_tol": 1e-9,
-            "ipopt.acceptable_obj_change_tol": settled,
-        }
     solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)
-    low = -np.inf if program.g_lower is None else program.g_lower
     begun = np.clip((np.atleast_2d(starts) - program.lower) / width, 0.0, 1.0)
     ends, verdicts = [], []
     for start in begun:
         raise_dropped()
         with interrupts_kept():  # Ctrl-C ends it after the start that is under way
-            result = solver(x0=start, lbx=0.0, ubx=1.0, lbg=low, ubg=0.0)
+            result = solver(x0=start, lbx=0.0, ubx=1.0, lbg=-np.inf, ubg=0.0)
         stats = solver.stats()
         verdicts.append(str(stats["return_status"]))
         if stats["success"]:

@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure import Certificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import Perturbation, modal_plant
-from ccd_casadi.plants.plant import Plant
+from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.progress import Progress
@@ -187,16 +187,10 @@ def check_references(
     problem: CoDesignProblem,
     theta: Sequence[float],
     design: Design,
-    plant: Plant | None = None,
     workers: Pool | None = None,
     quiet: bool = True,
 ) -> tuple[ReferenceCheck, ...]:
-    """The design's controller on every reference of the plant (default: the problem's) at θ.
-
-    `workers` share the references of the problem's own plant.
-    """
-    if plant is not None:
-        return tuple(_checked(problem, theta, design, plant, name) for name in plant.references)
+    """The design's controller on every reference of the problem's plant at θ."""
     names = tuple(plant_of(problem).references)
     tasks = [(problem, tuple(theta), design, name) for name in names]
     found = {}
@@ -209,23 +203,20 @@ def check_references(
 
 def _unit(task: tuple[CoDesignProblem, tuple[float, ...], Design, str]) -> ReferenceCheck:
     problem, theta, design, name = task
-    return _checked(problem, theta, design, plant_of(problem), name)
+    return check_on(problem, plant_of(problem).references[name](theta), design, name)
 
 
-def _checked(
-    problem: CoDesignProblem, theta: Sequence[float], design: Design, plant: Plant, name: str
+def check_on(
+    problem: CoDesignProblem, system: Mechanics, design: Design, name: str
 ) -> ReferenceCheck:
-    modal = modal_plant(plant.references[name](theta), problem.suspension)
-    closer = scale_plant(modal, problem.weights.M_K)
+    """The design's controller on one plant, given by its matrices."""
+    closer = scale_plant(modal_plant(system, problem.suspension), problem.weights.M_K)
     outcome = Outcome.CERTIFIED
     for gamma in (design.figures.certificate.norm_bound, UNBOUNDED):
         figures = measure(
-            closer,
-            design.controller,
-            design.weights,
-            gamma=gamma,
+            closer, design.controller, design.weights, gamma=gamma,
             omega_low=problem.inner.omega_low,
-        )
+        )  # fmt: skip
         if gamma != UNBOUNDED:
             outcome = figures.outcome
         if figures.certified:

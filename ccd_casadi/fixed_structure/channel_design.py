@@ -34,7 +34,6 @@ from ccd_casadi.fixed_structure.sections_design import (
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -50,7 +49,7 @@ def synthesise(
     sampling: Sampling | None = None,
     starts: int = 12,
     seed: int = 0,
-    initial: Sequence[Array | StateSpace] = (),
+    initial: Sequence[Array] = (),
     only_initial: bool = False,
     frequencies: tuple[float, float] | None = None,
     progress: Progress | None = None,
@@ -58,7 +57,7 @@ def synthesise(
 ) -> SectionsDesign:
     """max ω_b over κ on a set of plants, of one channel or of several; see `synthesise_sections`.
 
-    With several `initial` are stacked parameters κ in SI, or controllers of the whole plant.
+    With several `initial` are stacked parameters κ in SI.
     """
     if isinstance(structure, Structure):
         return synthesise_sections(
@@ -97,7 +96,7 @@ def synthesise(
                     others = [channel_plant(plant, structure.decoupling, j) for plant in alike]
                     members += [other for other, one in zip(others, members, strict=False)
                                 if not answer_alike([one], [other])]  # fmt: skip
-            begins = [_of_channel(structure, item, i) for item in initial]
+            begins = [np.asarray(kappa, float)[structure.slices[i]] for kappa in initial]
             again = bool(before) and bool(np.isfinite(before[i].kappa).all())
             if again:
                 begins = [before[i].kappa]
@@ -128,8 +127,7 @@ def synthesise(
             words = f"channel {name}: {one.words}"
             return failed(problem, one.outcome, words, seed, begun)
         return _joined(problem, plants, sampling, made, seed, begun)
-    pool = [in_problem_units(problem, item) for item in initial if not isinstance(item, StateSpace)]
-    pool = [np.clip(kappa, *problem.box) for kappa in pool]
+    pool = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
     field = _stable(problem, pool)
     evaluations = len(pool)
     shared = len(structure.decoupling.outputs) < len(structure.structures)
@@ -175,17 +173,6 @@ def _joined(
     starts = sum(one.starts for one in made)
     return designed(problem, plants, sampling, point, optima, starts, evaluations, seed,
                     perf_counter() - begun)  # fmt: skip
-
-
-def _of_channel(
-    structure: ChannelStructure, item: Array | StateSpace, i: int
-) -> Array | StateSpace:
-    """One channel's part of stacked parameters, or of a controller of the whole."""
-    if not isinstance(item, StateSpace):
-        return np.asarray(item, float)[structure.slices[i]]
-    U, V = structure.decoupling.outputs, structure.decoupling.inputs
-    into, out = np.linalg.inv(U.T)[:, [i]], np.linalg.inv(V)[[i]]
-    return StateSpace(item.A, item.B @ into, out @ item.C, out @ item.D @ into)
 
 
 def _stacked(problem: CompositeProblem, made: Sequence[SectionsDesign]) -> Array | None:

@@ -26,10 +26,9 @@ from ccd_casadi.fixed_structure.sections_design import (
     failed,
     in_problem_units,
 )
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept, redrawn
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -77,7 +76,7 @@ def synthesise_sections(
     sampling: Sampling | None = None,
     starts: int = 12,
     seed: int = 0,
-    initial: Sequence[Array | StateSpace] = (),
+    initial: Sequence[Array] = (),
     only_initial: bool = False,
     frequencies: tuple[float, float] | None = None,
     progress: Progress | None = None,
@@ -85,16 +84,16 @@ def synthesise_sections(
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every SISO plant.
 
-    `initial`: parameters κ in SI, or controllers in SI that the structure is fitted to; they start
-    beside `starts` others by rules and at random, or alone with `only_initial`. `frequencies` as in
-    `problem_for`: give them where designs at several θ are compared. The searches are
-    spread over `workers`; their number changes nothing else. Raises PlantError for plants that
-    cannot be in a set.
+    `initial`: parameters κ in SI that start beside `starts` others by rules and at random, or alone
+    with `only_initial`. `frequencies` as in `problem_for`: give them where designs at several θ are
+    compared. The searches are spread over `workers`; their number changes nothing else. Raises
+    PlantError for plants that cannot be in a set.
     """
     begun = perf_counter()
     problem = cast(Problem, problem_for(plants, structure, bounds, sampling, frequencies))
     rng = np.random.default_rng(seed)
-    pool = _initial(problem, initial, rng)
+    begun_at = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
+    pool = kept(problem, np.reshape(begun_at, (-1, len(structure.names))))
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     tell = progress or (lambda words: None)
@@ -144,18 +143,6 @@ def concluded(
     assert best is not None
     tell(f"{best.outcome.value}: {best.bandwidth / (2.0 * np.pi):.2f} Hz")
     return best
-
-
-def _initial(
-    problem: Problem, initial: Sequence[Array | StateSpace], rng: np.random.Generator
-) -> Array:
-    found = [np.zeros((0, len(problem.structure.names)))]
-    for item in initial:
-        if isinstance(item, StateSpace):
-            found.append(fitted(problem, item, rng))
-        else:
-            found.append(np.clip(in_problem_units(problem, item), *problem.box)[None])
-    return kept(problem, np.concatenate(found))
 
 
 def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:

@@ -11,8 +11,8 @@ from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import from_control, plant_from_control
 
@@ -28,7 +28,7 @@ def synthesise_sections(
     M_K: float | None = None,
     starts: int = 12,
     seed: int = 0,
-    initial: Sequence[Any] = (),
+    initial: Sequence[Array] = (),
     progress: Progress | None = None,
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every plant of a set.
@@ -41,8 +41,8 @@ def synthesise_sections(
     `control.TransferFunction`, or `ScaledPlant` as `scaled_plant` gives it. They have to be stable:
     give a free mass the slow suspension that it has, if only of its cables. With `sampling` hold
     and delay are exact. `M_K` (N/m) sets the scale of control systems; without it that of
-    `bounds.weights`, or where there are none ω₀ = 10 ω_low/S_low. `initial`: controllers, or
-    parameters κ of an earlier design, that start beside `starts` others.
+    `bounds.weights`, or where there are none ω₀ = 10 ω_low/S_low. `initial`: parameters
+    κ of earlier designs that start beside `starts` others.
 
     The `outcome` says how it ended, `controller` is K(s) in SI (e = r - y to force). Raises
     UserError for a system that is no continuous one, PlantError for one that cannot be a plant.
@@ -69,12 +69,8 @@ def synthesise_sections(
             scale = _scale(system, bounds) if scale is None else scale
             system = plant_from_control(system, scale)
         scaled.append(system)
-    begun = [
-        item if isinstance(item, StateSpace | np.ndarray) else from_control(item)[0]
-        for item in initial
-    ]
     return design.synthesise_sections(
-        scaled, structure, bounds, sampling=sampling, starts=starts, seed=seed, initial=begun,
+        scaled, structure, bounds, sampling=sampling, starts=starts, seed=seed, initial=initial,
         progress=progress,
     )  # fmt: skip
 

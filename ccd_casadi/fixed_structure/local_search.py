@@ -34,9 +34,9 @@ class Point:
     tau: float
     assessment: Assessment
 
-    def merit(self, penalty: float = PENALTY) -> float:
+    def merit(self) -> float:
         """τ - ρ violation, to be made large."""
-        return self.tau - penalty * self.assessment.violation
+        return self.tau - PENALTY * self.assessment.violation
 
 
 @dataclass(frozen=True)

@@ -14,20 +14,17 @@ plant is on its stiffness line at the crossover (a piezo) its lead is turned aro
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.structure import Kind, response, response_and_slopes
+from ccd_casadi.fixed_structure.structure import Kind, response
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
-FITS = 6
 # Two biquads at a resonance: (root, over its frequency, damping), first a lag, then a lead.
 SKEWED = (
     (("zeros", 0.93, 0.07), ("poles", 0.8, 0.1)),
@@ -148,32 +145,6 @@ def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     K = response(problem.structure, kappa.T, 1j * v)
     kappa[:, kinds] = -np.log(np.abs(problem.first_response(v) * K))[:, None]
     return np.clip(kappa, *problem.box)
-
-
-def fitted(problem: Problem, controller: StateSpace, rng: np.random.Generator) -> Array:
-    """(N, n) structures fitted to a controller in SI over two decades around ω₀; stable or not.
-
-    Least squares of ln K, gain and phase, from random structures: a reduced H∞ controller as start.
-    """
-    plants, structure = problem.plants, problem.structure
-    v = np.geomspace(0.03, 3.0, 60)
-    omega = plants.frequency(v) * plants.omega_0
-    goal = controller.response(omega)[:, 0, 0] / plants.force
-
-    def residual(kappa: Array) -> Array:
-        difference = np.log(response(structure, kappa, 1j * v) / goal)
-        return np.concatenate([difference.real, difference.imag])
-
-    def slope(kappa: Array) -> Array:
-        slopes = response_and_slopes(structure, kappa, 1j * v)[1]
-        return np.concatenate([slopes.real, slopes.imag])
-
-    found = []
-    for start in at_random(problem, np.exp(rng.uniform(np.log(0.05), 0.0, FITS)), rng):
-        inside = np.clip(start, problem.box[0] + 1e-6, problem.box[1] - 1e-6)
-        made = least_squares(residual, inside, slope, bounds=tuple(problem.box), max_nfev=60)
-        found.append(made.x)
-    return np.array(found)
 
 
 def actuator_starts(

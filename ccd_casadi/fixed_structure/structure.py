@@ -8,7 +8,6 @@ frequency and damping ratio: all positive, so K is stable (but the integrator) a
 by construction. κ has the units of what it is multiplied with: everything here is blind to them.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -112,39 +111,13 @@ class Structure:
 
 def response(structure: Structure, kappa: Array, s: np.ndarray) -> np.ndarray:
     """K(s), of the shape of s; `kappa` (n,) or (n, ...) with trailing axes that go with s's."""
-    value = np.exp(kappa[0]) * np.ones_like(s)
-    for factor, sign, _, _ in _factors(structure, np.exp(kappa), s):
-        value = value * factor if sign > 0 else value / factor
-    return value
-
-
-def response_and_slopes(
-    structure: Structure, kappa: Array, s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K(s), ∂ln K/∂κ with the parameters as the last axis, and ∂ln K/∂ln s."""
-    value = np.exp(kappa[0]) * np.ones_like(s)
-    slopes = np.zeros((*s.shape, len(structure.names)), complex)
-    slopes[..., 0] = 1.0
-    slope = np.zeros_like(value)
-    for factor, sign, index, parts in _factors(structure, np.exp(kappa), s):
-        value = value * factor if sign > 0 else value / factor
-        for offset, part in enumerate(parts):
-            slopes[..., index + offset] = sign * part / factor
-        slope = slope - sign * parts[0] / factor
-    return value, slopes, slope
-
-
-def _factors(
-    structure: Structure, values: Array, s: np.ndarray
-) -> Iterator[tuple[np.ndarray, int, int, tuple[np.ndarray, ...]]]:
-    """(polynomial, +1 above or -1 below, index of its first parameter, its derivatives)."""
+    values = np.exp(kappa)
+    K = values[0] * np.ones_like(s)
     for kind, sign, at in structure.factors[1:].tolist():
         x = values[at] / s if kind == INTEGRATOR else s / values[at]
-        if kind == PAIR:
-            middle = 2.0 * values[at + 1] * x
-            yield 1.0 + middle + x * x, sign, at, (-middle - 2.0 * x * x, middle)
-        else:
-            yield 1.0 + x, sign, at, (x if kind == INTEGRATOR else -x,)
+        factor = 1.0 + 2.0 * values[at + 1] * x + x * x if kind == PAIR else 1.0 + x
+        K = K * factor if sign > 0 else K / factor
+    return K
 
 
 def roots(structure: Structure, kappa: Array) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,7 @@ from ccd_casadi.synthesis.weights import Weights
 # The local solves aim this far inside a constraint, so that what they return satisfies it.
 MARGIN = 1e-9
 NEAR = 1e-3  # of ln ω: how near to an uncertified design a local solve looks for a better one
+STARTS = 6  # local solves after a sweep, at most
 ACTIVE = 1e-5  # relative distance within which a constraint counts as binding
 LABELS = {
     "S_max": "peak of S",
@@ -175,9 +176,7 @@ def evaluate(
     )
 
 
-def sweep_starts(
-    problem: InnerProblem, rows: Sequence[DesignFigures], limit: int = 6
-) -> list[tuple[float, float]]:
+def sweep_starts(problem: InnerProblem, rows: Sequence[DesignFigures]) -> list[tuple[float, float]]:
     """Local maxima of ln ω_b - 3·violation over the sweep grid, best first.
 
     Designs a little outside the bounds count too: a feasible sliver may lie between grid points.
@@ -197,7 +196,7 @@ def sweep_starts(
                 row = rows[(i - 1) * n_T + j - 1]
                 found.append((here, (row.omega_S, row.omega_T)))
     found.sort(key=lambda item: -item[0])
-    return [point for _, point in found[:limit]]
+    return [point for _, point in found[:STARTS]]
 
 
 def _violation(problem: InnerProblem, row: DesignFigures) -> float:

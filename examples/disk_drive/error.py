@@ -19,7 +19,8 @@ import plant as drive
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet
-from ccd_casadi.fixed_structure.structure import response_and_slopes
+from ccd_casadi.fixed_structure.structure import Structure, response
+from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
 
 HZ = 2.0 * np.pi
 TRACK = 52.697e-9  # m
@@ -32,6 +33,24 @@ FAN = ((0.6, 0.008, 2200), (0.3, 0.005, 2937), (1, 0.005, 3300), (0.5, 0.005, 35
        (2, 0.003, 5370), (15, 0.04, 5850), (10, 0.008, 6660), (1.5, 0.003, 7670),
        (2.5, 0.07, 9200))  # fmt: skip
 NOISE = 2.0 / 12.0 / (20.0 * drive.RATE_HZ)  # one-sided density per Hz
+
+
+def response_and_slopes(
+    structure: Structure, kappa: np.ndarray, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """K(s) and ∂ln K/∂κ with the parameters as the last axis."""
+    values = np.exp(kappa)
+    slopes = np.zeros((*s.shape, len(kappa)), complex)
+    slopes[..., 0] = 1.0
+    for kind, sign, at in structure.factors[1:].tolist():
+        x = values[at] / s if kind == INTEGRATOR else s / values[at]
+        middle = 2.0 * values[at + 1] * x if kind == PAIR else 0.0
+        factor = 1.0 + middle + x * x if kind == PAIR else 1.0 + x
+        first = -middle - 2.0 * x * x if kind == PAIR else x if kind == INTEGRATOR else -x
+        slopes[..., at] = sign * first / factor
+        if kind == PAIR:
+            slopes[..., at + 1] = sign * middle / factor
+    return response(structure, kappa, s), slopes
 
 
 def run_out() -> np.ndarray:
@@ -117,7 +136,7 @@ class PositionError:
         for c, (own, place) in enumerate(
             zip(self.structure.structures, self.structure.slices, strict=True)
         ):
-            K[c], slopes[c][:, place], _ = response_and_slopes(own, kappa[place], 1j * v)
+            K[c], slopes[c][:, place] = response_and_slopes(own, kappa[place], 1j * v)
         rows = []
         for G, held in zip(*self.responses, strict=True):
             L = G.T * K

@@ -149,21 +149,6 @@ def test_convex_problems_in_a_box_agree_with_scipy(seed: int, exact: bool) -> No
     np.testing.assert_allclose(best.x, reference.x, atol=1e-4)
 
 
-def test_at_a_kink_a_search_ends_where_it_gains_no_more() -> None:
-    """Its line searches go to and fro over the kink, of which they see one side's gradient."""
-    x = ca.MX.sym("x", 2)
-    across = x[0] - 0.3 - 0.1 * (x[1] - 0.2) ** 2
-    bandwidth = ca.fmin(19.5 * across, -4.9 * across) - (x[1] - 0.4) ** 2 + 743.0
-    ends = np.zeros(2), np.ones(2)
-    program = NonlinearProgram(x, -bandwidth, ca.MX(0, 1), *ends, False)
-    start = np.array([0.4, 0.6])
-    with pytest.raises(OuterFailure, match="Maximum_Iterations"):
-        solve_program(program, start, tolerance=1e-6)
-    found = solve_program(program, start, tolerance=1e-6, settled=1e-7).best
-    assert found.objective == pytest.approx(-743.0, rel=1e-6)
-    np.testing.assert_allclose(found.x, [0.304, 0.4], atol=2e-2)
-
-
 def test_starts_outside_the_box_are_put_onto_it() -> None:
     program = nested_program(problem(), surrogate(lambda a, b: -((a - 60.0) ** 2) - b))
     best = solve_program(program, np.array([[-1e3, 1e3]])).best

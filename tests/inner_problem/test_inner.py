@@ -178,4 +178,3 @@ def test_sweep_starts_are_the_local_maxima_of_the_merit_best_first() -> None:
     }
     starts = sweep_starts(inner, rows)
     assert starts == sorted(expected, key=lambda point: -expected[point])[:6]
-    assert sweep_starts(inner, rows, limit=1) == starts[:1]

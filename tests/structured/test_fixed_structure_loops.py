@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from differences import slopes
 from fixed_structure_channels import closed
-from fixed_structure_loops import BOUNDS, FAST, LATE, SLOW, by_curve, loop, plant
+from fixed_structure_loops import (
+    BOUNDS,
+    FAST,
+    LATE,
+    SLOW,
+    by_curve,
+    loop,
+    plant,
+    response_and_slopes,
+)
 
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.timing import Discretisation
@@ -25,7 +34,7 @@ from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import Brackets
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random
-from ccd_casadi.fixed_structure.structure import response, response_and_slopes, roots, state_space
+from ccd_casadi.fixed_structure.structure import response, roots, state_space
 from ccd_casadi.kernels import sections
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import in_w, sampled

@@ -9,7 +9,9 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.loop_problem import Curve, Problem
 from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.kernels.loop_rows import levels
+from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
@@ -58,3 +60,22 @@ def by_curve(
     codes, loop = np.tile(np.array(curves, np.int64), (len(v), 1)), problem.loop(kappa, tau)
     found = levels(codes, np.arange(len(v)), v, loop, -np.inf)
     return {curve: found[:, :, i, 0] for i, curve in enumerate(curves)}
+
+
+def response_and_slopes(
+    structure: Structure, kappa: Array, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K(s), ∂ln K/∂κ with the parameters as the last axis, and ∂ln K/∂ln s."""
+    values = np.exp(kappa)
+    slopes, slope = np.zeros((*s.shape, len(kappa)), complex), np.zeros(s.shape, complex)
+    slopes[..., 0] = 1.0
+    for kind, sign, at in structure.factors[1:].tolist():
+        x = values[at] / s if kind == INTEGRATOR else s / values[at]
+        middle = 2.0 * values[at + 1] * x if kind == PAIR else 0.0
+        factor = 1.0 + middle + x * x if kind == PAIR else 1.0 + x
+        first = -middle - 2.0 * x * x if kind == PAIR else x if kind == INTEGRATOR else -x
+        slopes[..., at] = sign * first / factor
+        if kind == PAIR:
+            slopes[..., at + 1] = sign * middle / factor
+        slope = slope - sign * first / factor
+    return response(structure, kappa, s), slopes, slope

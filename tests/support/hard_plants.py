@@ -10,6 +10,7 @@ import control
 import numpy as np
 from scipy.linalg import block_diag
 
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.synthesis.backends.standard_plant import StandardPlant
 
 Rows = list[list[float]]
@@ -22,6 +23,13 @@ class HardPlant:
     gamma: float | None = None
     digits: float = 0.0
     irregular: bool = False
+
+
+def close(plant: StandardPlant, K: StateSpace) -> StateSpace:
+    """The loop from w to z, by python-control."""
+    P, controller = (control.ss(*vars(part).values()) for part in (plant.whole(), K))
+    loop = P.lft(controller)
+    return StateSpace(*(np.asarray(M) for M in (loop.A, loop.B, loop.C, loop.D)))
 
 
 def regularised(plant: StandardPlant, size: float) -> StandardPlant:

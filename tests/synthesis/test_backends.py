@@ -12,7 +12,7 @@ import control
 import numpy as np
 import pytest
 from benchmark_scripts import benchmark
-from hard_plants import regularised
+from hard_plants import close, regularised
 from helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,7 +29,7 @@ from ccd_casadi.synthesis.backends.mixed import (
     synthesise_with,
     verdicts,
 )
-from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, close, mixed_sensitivity
+from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, mixed_sensitivity
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -47,17 +47,6 @@ def random_plant(seed: int) -> tuple[StandardPlant, StateSpace]:
 
 def parts(system: control.StateSpace) -> StateSpace:
     return StateSpace(*(np.asarray(M) for M in (system.A, system.B, system.C, system.D)))
-
-
-@few(max_examples=15)
-@given(st.integers(0, 10**6), st.floats(0.1, 10.0))
-def test_loop_is_the_linear_fractional_transformation(seed: int, omega: float) -> None:
-    plant, K = random_plant(seed)
-    theirs = control.ss(*vars(plant.whole()).values()).lft(control.ss(*vars(K).values()))
-    ours = control.ss(*vars(close(plant, K)).values())
-    assert ours(1j * omega, squeeze=False) == pytest.approx(
-        theirs(1j * omega, squeeze=False), rel=1e-6, abs=1e-8
-    )
 
 
 @few(max_examples=15)

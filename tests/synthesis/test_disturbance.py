@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from case_documents import TWO_MASS
 from differences import difference
+from hard_plants import close
 from helpers import HZ, PAPER, few, random_plant, scaled, two_mass
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -24,7 +25,7 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
-from ccd_casadi.synthesis.backends.standard_plant import balance, close, mixed_sensitivity
+from ccd_casadi.synthesis.backends.standard_plant import balance, mixed_sensitivity
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.statics import statics
 from ccd_casadi.synthesis.synthesis import Design, synthesise

@@ -5,12 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from benchmark_scripts import benchmark
-from hard_plants import HARD, regularised
+from hard_plants import HARD, close, regularised
 
 from ccd_casadi.lti.norms import gains
 from ccd_casadi.support.worker_process import Runner
 from ccd_casadi.synthesis.backends.mixed import solve_slicot
-from ccd_casadi.synthesis.backends.standard_plant import close
 
 pytest.importorskip("cvxpy")
 pytest.importorskip("slycot")

@@ -1,4 +1,4 @@
-"""The standard plant of H∞ control and its loop with a controller.
+"""The standard plant of H∞ control, and what a back end answers of it.
 
 ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 """
@@ -92,22 +92,6 @@ def balance(plant: StandardPlant) -> StandardPlant:
     whole = plant.whole()
     A, B, C = balanced(whole.A, whole.B, whole.C)
     return StandardPlant.from_parts(A, B, C, whole.D, plant.C2.shape[0], plant.B2.shape[1])
-
-
-def close(plant: StandardPlant, K: StateSpace) -> StateSpace:
-    """The loop from w to z. Raises LinAlgError where it is not well posed."""
-    p, m = plant.C2.shape[0], plant.B2.shape[1]
-    E = np.linalg.inv(np.eye(m) - K.D @ plant.D22)
-    F = np.linalg.inv(np.eye(p) - plant.D22 @ K.D)
-    DC, DD = E @ K.D @ plant.C2, E @ K.D @ plant.D21  # u = DC x + E C_K x_K + DD w
-    EC = E @ K.C
-    A = np.block([
-        [plant.A + plant.B2 @ DC, plant.B2 @ EC],
-        [K.B @ F @ plant.C2, K.A + K.B @ F @ plant.D22 @ K.C],
-    ])  # fmt: skip
-    B = np.vstack([plant.B1 + plant.B2 @ DD, K.B @ F @ plant.D21])
-    C = np.hstack([plant.C1 + plant.D12 @ DC, plant.D12 @ EC])
-    return StateSpace(A, B, C, plant.D11 + plant.D12 @ DD)
 
 
 @dataclass(frozen=True)
