@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 
-ROUNDS = (15, *(30,) * 13)  # steps of each: short, so that gains are recent ones
+ROUNDS = (15, 30, 60, 60, 60, 60, 60, 60)  # steps of each
 HALVINGS = 3  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over

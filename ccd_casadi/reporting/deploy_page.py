@@ -136,7 +136,7 @@ def _step(run: FinishedRun, found: Deployment) -> Figure:
         y = outputs @ direction
         curves.append(Curve(1e3 * t, y, label, colour, line))
     where = "" if len(direction) == 1 else f", channel {found.orders[0].channel.name}"
-    panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves), legend="lower right")
+    panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves))
     table = over_time(("ms", "y"), 1e3 * t, y)
     caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
     return Figure(Lines(((panel,),), "Step of the reference", (3.0,)), caption, (table,))

@@ -256,7 +256,7 @@ def _move(found: Study) -> Section:
         if found.moves[0].free
         else "on its soft suspension, without which the loop is not stable"
     )
-    ways = {"with mass feedforward" if m.feedforward else "without feedforward": m
+    ways = {"with mass feedforward" if m.feedforward else "without feedforward": [m]
             for m in found.moves}  # fmt: skip
     words = (
         f"A fourth-order setpoint for output {found.demands.axis + 1}, simulated exactly on the "
