@@ -127,7 +127,7 @@ class LoopProblem:
     @cached_property
     def antiresonances(self) -> Array:
         """|z| of the light zeros of the first plant, the lightest first."""
-        z = self.plants.zeros[0]
+        z = self.plants.systems[0].zeros()
         light = z[(z.imag > 0.0) & (np.abs(z.real) < 0.2 * np.abs(z))]
         return np.asarray(np.abs(light)[np.argsort(np.abs(light.real) / np.abs(light))])
 

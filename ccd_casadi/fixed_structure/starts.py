@@ -49,7 +49,7 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
     skewed = count > 1 and not narrow and len(tops) > 0
     found, at = [], []
     for crossover in crossovers:
-        shapes = [(*one, ()) for one in plain]
+        shapes: list[tuple[float, float, tuple[float, ...]]] = [(*one, ()) for one in plain]
         if count > 1 and narrow:  # |L| just below the crossover, where S rises
             shapes += [(1.0, 1.0, (ratio * crossover, 1.02, 0.1, 0.07)) for ratio in (0.7, 1.0)]
         elif skewed:
