@@ -199,11 +199,9 @@ def _plants(
     residues = (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
     out = np.eye(p) if isinstance(structure, Structure) else structure.decoupling.outputs.T
     into = np.eye(m) if isinstance(structure, Structure) else structure.decoupling.inputs
-    A, B, C, D = (np.zeros((1, *shape)) for shape in ((0, 0), (0, m), (p, 0), (p, m)))
     out, into = (np.ascontiguousarray(M, float) for M in (out, into))
     T = None if period is None else period * omega_0
-    return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, (), A, B, C, D,
-                      out, into, omega)  # fmt: skip
+    return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, out, into, omega)
 
 
 @assess.register

@@ -67,12 +67,10 @@ class LoopProblem:
     @cached_property
     def fixed(self) -> Array:
         """The base grid and the flanks of every plant's poles and zeros, (P, k)."""
-        P = self.plants
-        widest = max(len(z) for z in P.zeros)
-        found = np.full((len(P.plants), P.A.shape[1] + widest), np.nan, complex)
-        for i, plant in enumerate(P.plants):
-            found[i, : len(plant.A)] = np.linalg.eigvals(plant.A)
-            found[i, P.A.shape[1] : P.A.shape[1] + len(P.zeros[i])] = P.zeros[i]
+        roots = [np.append(np.linalg.eigvals(G.A), G.zeros()) for G in self.plants.systems]
+        found = np.full((len(roots), max(map(len, roots))), np.nan, complex)
+        for i, own in enumerate(roots):
+            found[i, : len(own)] = own
         return np.concatenate([np.tile(self.base, (len(found), 1)), flanked(found)], axis=1)
 
     @cached_property
@@ -95,7 +93,7 @@ class LoopProblem:
     @property
     def first(self) -> int:
         """How many gains of each matrix are of the whole; the others are rows of channels."""
-        return len(self.plants.C[0])
+        return int(self.plants.residues.shape[2])
 
     @cached_property
     def _factors(self) -> tuple[np.ndarray, np.ndarray]:
