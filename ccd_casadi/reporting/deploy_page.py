@@ -201,13 +201,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
         return Words(words), sections_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
-        (
-            s.kind,
-            *_root(s.zero),
-            *_root(s.pole),
-            "" if s.depth_db is None else number(s.depth_db, 4),
-        )
-        for s in found.sections
+        (s.kind, *_root(s.zero), *_root(s.pole), number(s.depth_db, 4)) for s in found.sections
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
