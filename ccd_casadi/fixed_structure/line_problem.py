@@ -145,6 +145,11 @@ class LineProblem(LoopProblem):
         """v at the peaks of the first response, the strongest first."""
         return self.base[self.responses[0].resonances]
 
+    @cached_property
+    def antiresonances(self) -> Array:
+        """v at the dips of the first response, the deepest first."""
+        return self.base[self.responses[0].antiresonances]
+
     def first_response(self, v: Array) -> np.ndarray:
         """G (k,) of the first response's first entry, at the lines next to v."""
         at = np.clip(np.searchsorted(self.base, v), 0, len(self.base) - 1)

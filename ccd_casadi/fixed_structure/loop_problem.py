@@ -124,6 +124,13 @@ class LoopProblem:
         order = np.argsort(-strength[light])
         return np.asarray(np.abs(p[light])[order])
 
+    @cached_property
+    def antiresonances(self) -> Array:
+        """|z| of the light zeros of the first plant, the lightest first."""
+        z = self.plants.systems[0].zeros()
+        light = z[(z.imag > 0.0) & (np.abs(z.real) < 0.2 * np.abs(z))]
+        return np.asarray(np.abs(light)[np.argsort(np.abs(light.real) / np.abs(light))])
+
     def first_response(self, v: Array) -> np.ndarray:
         """The first entry of the first plant's G (k,) at jv."""
         return self.plants.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
