@@ -201,7 +201,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
         return Words(words), sections_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
-        (s.kind, *_root(s.zero), *_root(s.pole), _depth(s.depth_db)) for s in found.sections
+        (s.kind, *_root(s.zero), *_root(s.pole), number(s.depth_db, 4)) for s in found.sections
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
@@ -210,10 +210,6 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
         " A negative ζ, or a negative frequency of a single root, is one in the right half plane."
     )
     return Words(words), Table(head, rows)
-
-
-def _depth(value: float | None) -> str:
-    return "" if value is None else number(value, 4)
 
 
 def _root(root: Root | None) -> tuple[str, str]:

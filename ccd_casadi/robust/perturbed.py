@@ -113,7 +113,8 @@ def _line(
     judged = []
     with progress:
         for place, off in places.items():
-            judged.append(judge(run, _modal(run, system, off), (place,)))
+            modal = modal_plant(system, run.problem.suspension, off)
+            judged.append(judge(run, modal, (place,)))
             progress.advance()
     return Line(tuple(judged), stable, within)
 
@@ -147,15 +148,11 @@ def worst_in_box(
 
     def at(x: Array) -> Judged:
         s, d = float(x[0]), float(np.exp(x[1]))
-        return judge(run, _modal(run, system, Perturbation(s, d)), (s, d))
+        return judge(run, modal_plant(system, run.problem.suspension, Perturbation(s, d)), (s, d))
 
     grid = [np.array([s, d]) for s in np.linspace(low[0], high[0], 9)
             for d in np.linspace(low[1], high[1], 5)]  # fmt: skip
     return search(at, grid, low, high, "shift and damping", quiet)
-
-
-def _modal(run: FinishedRun, system: Mechanics, perturbation: Perturbation) -> ModalPlant:
-    return modal_plant(system, run.problem.suspension, perturbation)
 
 
 def search(
