@@ -65,8 +65,7 @@ omega_T_hz = [60.0, 1000.0]
 [controller]
 structure = "sections"
 biquads = {biquads}
-least_damping = 0.05
-weighted_level = 20.0
+{least}weighted_level = 20.0
 
 [loop]
 rate_hz = {rate}
@@ -120,6 +119,7 @@ def written(seed: int, folder: Path) -> Path:
         "S_max": float(rng.uniform(1.7, 2.0)), "biquads": int(rng.integers(0, 2)),
         "rate": float(rng.choice([4000.0, 8000.0])), "delay": float(rng.choice([60.0, 125.0])),
     }  # fmt: skip
+    drawn["least"] = "least_damping = 0.05\n" if drawn["biquads"] else ""  # of biquads alone
     (folder / "gantries.py").write_text(Path(__file__).read_text())
     for name, side in (("left", -0.3), ("right", 0.3)):
         (folder / f"{name}.toml").write_text(f"at = {side * span}\n")

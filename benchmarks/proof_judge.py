@@ -121,7 +121,7 @@ def main() -> None:
     structure, sampling = structure_of(problem), sections_of_problem(problem).sampling
     values = json.loads((built.DESIGN / "sections.json").read_text())
     kappa = np.log([values[name] for name in structure.names])
-    bounds = replace(bounds_of(problem), shape=None)
+    bounds = replace(bounds_of(problem), shape=None, weighted_level=None, compliance_max=None)
     bandwidth = 60.0 * HZ
     rng = np.random.default_rng(0)
     for option in range(len(whole.options)) if given.option is None else [given.option]:

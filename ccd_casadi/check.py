@@ -14,17 +14,14 @@ from ccd_casadi.support.units import counted
 def text(found: dict[str, Any]) -> str:
     """The diagnosis for a terminal."""
     from ccd_casadi.cases.plant_report import SHARES
+    from ccd_casadi.reporting.facts import theta_words
 
-    theta = ", ".join(
-        f"{name} = {value:.6g} {found['units'][name]}".strip()
-        for name, value in found["theta"].items()
-    )
     lines = [
         f"plant         {found['plant']}: {counted(found['inputs'], 'input')}, "
         f"{counted(found['outputs'], 'output')}",
         *(f"note          {words}" for words in found["notes"]),
         f"checked       {found['points']} points: start, middle and corners of the bounds",
-        f"start         {theta}",
+        f"start         {theta_words(found)}",
         f"in SI         {found['size']}",
         "",
         "  mode          Hz  damping   driven  measured   over the bounds",

@@ -95,7 +95,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.moves import way_words
 
     if moved is not None and not options.quiet:
-        say(f"{'a move':13s} {way_words(moved.ways[-1].words, moved.ways[-1].move)}")
+        say(f"{'a move':13s} {way_words(moved.ways[-1].words, [moved.ways[-1].move])}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)

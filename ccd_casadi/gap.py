@@ -28,9 +28,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     else:
         case = load_case(options.case)
         problem = problem_of(case)
-        theta = problem.start
-        if options.theta is not None:
-            theta = parse_theta(case, options.theta)
+        theta = problem.start if options.theta is None else parse_theta(case, options.theta)
     found = gap_of(problem, theta)
     answer: dict[str, Any] = {
         "theta": dict(zip(problem.names, theta, strict=True)),

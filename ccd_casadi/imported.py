@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccd_casadi.support.command_line import ExitCode, run, run_parser
+from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import whole
 
@@ -35,17 +35,11 @@ def command(options: argparse.Namespace) -> ExitCode:
         table = _table(folder, options)
     except PlantError as error:  # it names the file at fault, and there is no case
         raise UserError(str(error)) from error
-    out = options.out or folder
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        write_modal_table(out / "modes.csv", table)
-    except OSError as error:
-        raise UserError(
-            f"{out}: cannot be written: {error.strerror}; choose another --out"
-        ) from None
+    file = run_folder(folder, options.out or folder) / "modes.csv"
+    write_modal_table(file, table)
     if not options.quiet:
         N, r = table.omega.shape
-        print(f"{out / 'modes.csv'}: {N} samples of {r} modes, {', '.join(table.names)}")
+        print(f"{file}: {N} samples of {r} modes, {', '.join(table.names)}")
     return ExitCode.DONE
 
 

@@ -31,27 +31,23 @@ def command(options: argparse.Namespace) -> ExitCode:
     done = read_run(options.run)
     require_bandwidth(done.problem, "insight")
     folder = run_folder(options.run, options.out or options.run)
-    tolerance = done.case.outer.tolerance
     with (
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(done.folder / "samples.sqlite") as samples,
     ):
         sampler = Sampler(done.problem, samples, workers, quiet=options.quiet)
         outer = outer_of(sampler)
-        own = outer.point_of(done)
-        learner = outer.learner(done.case.sampling.lifted_points, options.seed)
         front = pareto_front(
-            learner, points=options.points, tolerance=tolerance, seed=options.seed, own=own
+            outer_of, sampler, done.theta, points=options.points, seed=options.seed
         )
-        responses = outer.responses(own)
+        responses = outer.responses(outer.point_of(done))
     seconds = perf_counter() - began
     told = insight_dict(done, front, responses)
     write_json(folder / "insight.json", told | {"seed": options.seed, "seconds": seconds})
     verified = [point for point in front.points if point.verified]
     if not options.quiet:
-        efficient = sum(point.efficient for point in verified)
         say(f"front         {len(verified)} of {len(front.points)} points verified, "
-            f"{efficient} efficient, {front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
+            f"{front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
     from ccd_casadi.reporting.index import index_of, publish
     from ccd_casadi.reporting.insight import insight_page
 
@@ -71,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar="N",
         type=whole(2, 9999),
         default=20,
-        help="points on the front (default: 20)",
+        help="most points on the front (default: 20)",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.insight"])

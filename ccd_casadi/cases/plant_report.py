@@ -13,6 +13,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts
 from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.support.units import number
 
 # ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less where
 # resonances stand in the way.
@@ -68,7 +69,7 @@ def size_words(facts: PlantFacts) -> str:
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
     if math.isfinite(facts.effort_hz):
         low, high = (share * facts.effort_hz for share in WINDOW)
-        parts.append(f"M_K suits a bandwidth of {low:.2g} to {high:.2g} Hz")
+        parts.append(f"M_K suits a bandwidth of {number(low, 2)} to {number(high, 2)} Hz")
     return ", ".join(parts)
 
 

@@ -32,19 +32,16 @@ def insight_dict(run: FinishedRun, front: Front, responses: PostOptimal) -> dict
             "theta": dict(zip(names, point.theta, strict=True)),
             "hardware_cost": point.hardware_cost,
             "bandwidth_hz": point.bandwidth / HZ,
-            "predicted_bandwidth_hz": point.predicted / HZ,
             "omega_S_hz": point.omega_S / HZ,  # NaN with sections
             "omega_T_hz": point.omega_T / HZ,
             "active": list(point.active),
-            "efficient": point.efficient,
             "status": "verified" if point.verified else "not_verified",
-            "reason": point.reason,
         }
         for point in front.points
     ]
     natural = natural_hz(run)
     return {
-        "front": {"points": points, "rounds": front.rounds, "syntheses": front.syntheses},
+        "front": {"points": points, "whole": front.whole, "syntheses": front.syntheses},
         "optimum": {
             "responses": {item.parameter: asdict(item) for item in responses.responses},
             "determined": responses.determined,

@@ -14,7 +14,6 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
-from ccd_casadi.codesign.front_learners import Learner
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.stored import Surrogates
@@ -161,10 +160,6 @@ class Outer(ABC):
     def point_of(self, run: FinishedRun) -> Array:
         """x of a run's design."""
         return np.array(run.theta)
-
-    @abstractmethod
-    def learner(self, samples: int, seed: int) -> Learner:
-        """Surrogates for the trade-off of hardware cost against the value."""
 
     @abstractmethod
     def responses(self, x: Array) -> PostOptimal:

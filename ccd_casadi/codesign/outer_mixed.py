@@ -16,7 +16,6 @@ from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.direct import Direct, acceptable, polish, solve_direct, true_objective
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
-from ccd_casadi.codesign.front_learners import LiftedLearner
 from ccd_casadi.codesign.kinked import SETTLED, descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -236,9 +235,6 @@ class MixedOuter(Outer):
 
     def point_of(self, run: FinishedRun) -> Array:
         return np.append(run.theta, np.log([run.weights.omega_S, run.weights.omega_T]))
-
-    def learner(self, samples: int, seed: int) -> LiftedLearner:
-        return LiftedLearner(self.sampler, samples, seed)
 
     def responses(self, x: Array) -> PostOptimal:
         return post_optimal(self.problem, x, self.sampler.quiet)

@@ -38,10 +38,7 @@ APART = 1e-4  # of the box: ends closer than this are one optimum
 
 @dataclass(frozen=True)
 class NonlinearProgram:
-    """min f(x), g_lower <= g(x) <= 0, lower <= x <= upper; g has λ in shares of its size.
-
-    `g_lower` is minus infinity where it is not given; zero makes an equation of a row.
-    """
+    """min f(x), g(x) <= 0, lower <= x <= upper; g has λ in shares of its size."""
 
     x: ca.MX
     f: ca.MX
@@ -49,7 +46,6 @@ class NonlinearProgram:
     lower: Array
     upper: Array
     exact_hessian: bool = True
-    g_lower: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -145,13 +141,12 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
         # Where it has not converged by then it goes to and fro over a kink; `kinked` does not.
         options["ipopt.max_iter"] = 100
     solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)
-    low = -np.inf if program.g_lower is None else program.g_lower
     begun = np.clip((np.atleast_2d(starts) - program.lower) / width, 0.0, 1.0)
     ends, verdicts = [], []
     for start in begun:
         raise_dropped()
         with interrupts_kept():  # Ctrl-C ends it after the start that is under way
-            result = solver(x0=start, lbx=0.0, ubx=1.0, lbg=low, ubg=0.0)
+            result = solver(x0=start, lbx=0.0, ubx=1.0, lbg=-np.inf, ubg=0.0)
         stats = solver.stats()
         verdicts.append(str(stats["return_status"]))
         if stats["success"]:

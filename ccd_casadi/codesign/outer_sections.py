@@ -26,7 +26,7 @@ from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_joint import together
-from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
+from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
@@ -322,7 +322,8 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
 def _stationary(sampler: Sampler, best: BandwidthSample) -> bool:
     """Whether a sample is optimal to first order, by the gradients of several sides of it."""
     envelope = value_at(sampler, best.theta).envelope
-    return theta_kkt(sampler.problem, best, envelope=envelope).stationarity <= SMOOTH
+    kkt = theta_kkt(sampler.problem, best, envelope=envelope)
+    return kkt.stationarity <= VerifiedSections.kkt_level
 
 
 def by_pieces(

@@ -13,7 +13,6 @@ import numpy as np
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
-from ccd_casadi.codesign.front_learners import NestedLearner
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
@@ -97,9 +96,6 @@ class ThetaOuter(Outer, ABC):
             return None
         stationary = theta_kkt(problem, best).stationarity <= SMOOTH
         return Place(np.array(best.theta), J, stationary)
-
-    def learner(self, samples: int, seed: int) -> NestedLearner:
-        return NestedLearner(self.sampler, seed=seed)
 
     def responses(self, x: Array) -> PostOptimal:
         raise UserError("insight has no derivatives of an optimum of this kind of controller")

@@ -6,20 +6,20 @@ of first order, M + ∂M Δθ and so forth, within a reach of |Δz| (z is θ in 
     min w1 f(z) + w2 e^τ ω₀,   c(κ, τ; z) <= 0,  λ(z) <= 0      over z, κ and τ = ln ω_b/ω₀
 
 is one search by `optim.trust_region`: the rows are those of `local_search`, with slopes to z. At
-its end the plants are made anew, the controller climbs on these, and the true J tells how far the
-first order may reach. Where no more is promised the conditions of optimality hold for the true
-plants too, as values and slopes are exact in the middle.
+its end the plants are made anew and the controller adapts to them in a few steps; J there tells how
+far the first order may reach. Where no more is promised the conditions of optimality hold for the
+true plants too, as values and slopes are exact in the middle.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.decoupling import in_units_of
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
-from ccd_casadi.fixed_structure.local_search import PENALTY, all_rows
+from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
 from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
@@ -39,90 +39,143 @@ from ccd_casadi.support.arrays import Array
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
-CYCLES = 6  # times at most that the plants are made anew before worse ones are looked for
-STEPS = 40  # of a search
+CYCLES = 10  # times at most that the plants are made anew before worse ones are looked for
+PENALTY = (
+    6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
+)
+STEPS, ADAPTING = 30, 15  # of a search, and of the controller alone at its end
 FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-6  # of w2 ω_b
-SETTLED = 1e-5  # of J: less is not worth another set of plants
+SETTLED = 1e-4  # of J: less is not worth another set of plants
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
 
 
 @dataclass(frozen=True)
-class Proposal:
-    """θ, κ (SI) and by how much J falls there, on the plants to first order."""
+class Place:
+    """θ, κ (SI) and ω_b in rad/s, which may exceed the bounds a little."""
 
     theta: tuple[float, ...]
     kappa: tuple[float, ...]
+    bandwidth: float
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The end of a search and by how much J falls there, on the plants to first order."""
+
+    end: Place
     gain: float
 
 
 def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample, bool]:
     """From θ towards where the joint search promises no more: the sampler of the problem whose
     anchor is the controller there, its true sample, and whether no more is promised."""
-    best = sampler.bandwidths(theta, "polishing")[0]
-    J, reach = objective_of(sampler.problem, best), REACH
+    problem, first = sampler.problem, sampler.bandwidths(theta, "polishing")[0]
+    if not np.isfinite(objective_of(problem, first)):
+        return sampler, first, True
+    best, J = Place(first.theta, first.kappa, first.bandwidth), objective_of(problem, first)
+    reach, stretch, settled = REACH, 1.0, False
     for _ in range(CYCLES):
-        if not np.isfinite(J) or reach < LEAST:
-            return sampler, best, True
-        make = partial(proposed, sampler.problem, best, reach)
+        make = partial(proposed, problem, best, reach)
         found = sampler.kept("together", (*best.theta, reach), Proposal, make)
-        if found.gain <= SETTLED * abs(J):
-            return sampler, best, True
-        other = sampler.of(with_sections(sampler.problem, anchors=(found.kappa,)))
-        sample = other.bandwidths(np.array(found.theta), "polishing")[0]
-        gained = J - objective_of(other.problem, sample)
+        settled = found.gain <= SETTLED * abs(J) or reach < LEAST
+        if settled:
+            break
+        further = stretched(problem, best, found.end, stretch)
+        end, there = JointModel(problem, further, reach).adapted()
+        gained = J - there
         if gained > 0.0:
-            sampler, best, J = other, sample, J - gained
-        if gained > GOOD * found.gain:
+            best, J = end, there
+        if gained <= 0.0 and stretch > 1.0:
+            stretch = max(0.25 * stretch, 1.0)
+        elif gained > found.gain:  # the true plants bend J less than those of first order
+            stretch, reach = 2.0 * stretch, min(2.0 * reach, LARGEST)
+        elif gained > GOOD * found.gain:
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    return sampler, best, False
+    if best.theta == first.theta:
+        return sampler, first, settled
+    other = sampler.of(with_sections(problem, anchors=(best.kappa,)))
+    last = other.bandwidths(np.array(best.theta), "polishing")[0]
+    if objective_of(problem, last) < objective_of(problem, first):
+        return other, last, settled
+    return sampler, first, True
 
 
-def proposed(problem: CoDesignProblem, sample: BandwidthSample, reach: float) -> Proposal:
-    """The end of one search around a sample of the problem."""
-    model = JointModel(problem, sample, reach)
+def stretched(problem: CoDesignProblem, here: Place, there: Place, factor: float) -> Place:
+    """The place that lies `factor` times as far from here, within the box of θ."""
+    theta = np.array(here.theta) + factor * (np.array(there.theta) - np.array(here.theta))
+    kappa = np.array(here.kappa) + factor * (np.array(there.kappa) - np.array(here.kappa))
+    omega_b = here.bandwidth * (there.bandwidth / here.bandwidth) ** factor
+    theta = np.clip(theta, *box(problem))
+    return Place(tuple(map(float, theta)), tuple(map(float, kappa)), float(omega_b))
+
+
+def proposed(problem: CoDesignProblem, at: Place, reach: float) -> Proposal:
+    """The end of one search around a place."""
+    model = JointModel(problem, at, reach)
     start = model.at(model.start)
     if start is None:
-        return Proposal(sample.theta, sample.kappa, 0.0)
+        return Proposal(at, 0.0)
     n, radius = len(start.x), Radius(min(FIRST, reach), NARROWEST, WIDEST)
     end = minimise(
         model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=LEAST_GAIN
     ).best
-    gain = model.unit * (start.value - end.value - PENALTY * end.violation)
-    z, kappa, _ = model.parts(end.x)
-    loops = end.data[0]
-    found = loops.structure.in_units(kappa, loops.plants.omega_0, loops.plants.force)
-    theta = np.clip(model.theta(z), *box(problem))
-    return Proposal(tuple(map(float, theta)), tuple(map(float, found)), float(gain))
+    gain = start.value - end.value - PENALTY * end.violation
+    return Proposal(model.place(end.x), model.unit * float(gain))
 
 
 class JointModel(Model[tuple[LoopProblem, Assessment]]):
-    """J over its `unit`, w2 ω_b in the middle, on the plants to first order around a sample; over
+    """J over its `unit`, w2 ω_b in the middle, on the plants to first order around a place; over
     x = (z, κ, τ), with the loops at x."""
 
     corrected = True
 
-    def __init__(self, problem: CoDesignProblem, sample: BandwidthSample, reach: float) -> None:
-        self.problem, self.middle = problem, np.array(sample.theta)
+    def __init__(self, problem: CoDesignProblem, place: Place, reach: float) -> None:
+        self.problem, self.middle = problem, np.array(place.theta)
         sections = sections_of_problem(problem)
-        self.uncertain = uncertain_plant(problem, sample.theta)
+        self.uncertain = uncertain_plant(problem, place.theta)
         known = [(option, np.array(point)) for option, point in sections.members]
         self.members = known or self.uncertain.corners()
         self.first = self.uncertain.plants(self.members[:1])[0]
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
-        self.unit = -problem.w2 * sample.bandwidth
+        self.unit = -problem.w2 * place.bandwidth
         middle = (self.middle - lower) / self.width
-        loops = self.loops(middle)
-        self.tau = float(np.log(sample.bandwidth / loops.plants.omega_0))
-        kappa = np.clip(in_problem_units(loops, np.array(sample.kappa)), *loops.box)
+        loops = self.first_loops = self.loops(middle)
+        self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
+        kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
         self.start = np.concatenate([middle, kappa, [self.tau]])
         low, high = np.maximum(middle - reach, 0.0), np.minimum(middle + reach, 1.0)
         self.low = np.concatenate([low, loops.box[0], [-np.inf]])
         self.high = np.concatenate([high, loops.box[1], [np.inf]])
+
+    def place(self, x: Array) -> Place:
+        """That of x."""
+        z, kappa, tau = self.parts(x)
+        loops = self.first_loops
+        kappa = loops.structure.in_units(kappa, loops.plants.omega_0, loops.plants.force)
+        theta = np.clip(self.theta(z), *box(self.problem))
+        omega_b = float(np.exp(tau) * loops.plants.omega_0)
+        return Place(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
+
+    def adapted(self) -> tuple[Place, float]:
+        """The middle after a few steps of the controller alone, and J there with what is left of a
+        violation; infinite where a loop is unstable."""
+        z, kappa, tau = self.parts(self.start)
+        found = assess(self.first_loops, kappa, tau)
+        if not found.stable:
+            return self.place(self.start), np.inf
+        point = ascend(self.first_loops, Point(kappa, tau, found), iterations=ADAPTING,
+                       radius=FIRST).point  # fmt: skip
+        x = np.concatenate([z, point.kappa, [point.tau]])
+        unmet = float(hardware_at(self.problem, self.middle).constraints.max(initial=0.0))
+        worth = np.exp(point.tau - self.tau)
+        worth -= PENALTY * max(point.assessment.violation, unmet)
+        cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.middle)
+        return self.place(x), float(cost - self.unit * worth)
 
     def theta(self, z: Array) -> Array:
         """θ of its shares."""
@@ -174,9 +227,12 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         own = hardware_at(self.problem, self.theta(z))
         of_z = np.pad(own.slopes, ((0, 0), (0, len(here.x) - count)))
 
+        @cache
+        def beside() -> list[LoopProblem]:
+            return [self.loops(z + BESIDE * unit) for unit in np.eye(count)]
+
         def second(index: np.ndarray) -> Array:
-            beside = [self.loops(z + BESIDE * unit) for unit in np.eye(count)]
-            return hessians(problem, kappa, tau, found.only(index), beside)
+            return hessians(problem, kappa, tau, found.only(index), beside())
 
         return Rows(
             np.concatenate([found.value, own.constraints + INSIDE]), np.vstack([slopes, of_z]),

@@ -7,6 +7,7 @@ computed before the state is advanced, so that u leaves as early as it can.
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,14 +32,10 @@ ERROR = 1e-6  # m; size of the errors in the test vectors
 TOLERANCE = 1e-12  # of the largest force
 
 
-def write_c(
-    folder: Path, realisation: Realisation, *, title: str, delay: float, verified: bool,
-    forward: Array | None = None,
-) -> Mapping[str, str]:  # fmt: skip
-    """controller.h, controller.c and controller_test.c in `folder`, and their texts; delay in s."""
-    files = c_files(
-        realisation, title=title, delay=delay, verified=verified, forward=forward
-    )  # fmt: skip
+def write_c(folder: Path, realisation: Realisation, **how: Any) -> Mapping[str, str]:
+    """controller.h, controller.c and controller_test.c in `folder`, and their texts; `how` as in
+    `c_files`."""
+    files = c_files(realisation, **how)
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8")
     return files
@@ -48,7 +45,7 @@ def c_files(
     realisation: Realisation, *, title: str, delay: float, verified: bool,
     forward: Array | None = None,
 ) -> Mapping[str, str]:  # fmt: skip
-    """The three files' texts by name; the header says whether the loop was verified.
+    """The three files' texts by name; delay in s; the header says whether the loop was verified.
 
     `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none.
     """

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 NEAR = 1.5  # ratio of zero to pole frequency up to which a pair is a notch
@@ -47,12 +46,6 @@ class Section:
     pole: Root | None
     depth_db: float | None = None
 
-    def response(self, omega: Array) -> np.ndarray:
-        """H(jω), ω in rad/s."""
-        s = 1j * np.asarray(omega, float)
-        above = self.zero.response(s) if self.zero else np.ones_like(s)
-        return above / self.pole.response(s) if self.pole else above
-
 
 @dataclass(frozen=True)
 class Sections:
@@ -61,13 +54,6 @@ class Sections:
     gain: float
     gain_at_bandwidth: float
     sections: tuple[Section, ...]
-
-    def response(self, omega: Array) -> np.ndarray:
-        """K(jω), the product; ω in rad/s."""
-        product = np.full(len(np.atleast_1d(omega)), self.gain, complex)
-        for section in self.sections:
-            product *= section.response(np.atleast_1d(omega))
-        return product
 
 
 def sections_of(K: StateSpace, bandwidth: float) -> Sections:

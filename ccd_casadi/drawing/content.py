@@ -14,8 +14,6 @@ from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE, require_shapes
 from ccd_casadi.support.arrays import Array
 
-Corner = Literal["best", "lower left", "lower right", "upper left", "upper right", "center left",
-                 "center right", "lower center", "upper center", "center"]  # fmt: skip
 Fact = tuple[str, str, str]  # quantity, value, remark
 INDEX = "index.html"  # of a run's folder
 
@@ -91,7 +89,7 @@ class Panel:
     y_range: tuple[float, float] | None = None
     whole_x: bool = False
     y_step: float | None = None
-    legend: Corner | None = "best"
+    legend: Literal["best"] | None = "best"
     title: str = ""
     forbidden: tuple[Area, ...] = ()
     equal: bool = False

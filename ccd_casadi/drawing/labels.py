@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Corner
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -17,11 +15,6 @@ POINT = 3.0  # pt; half a marker
 AROUND = ((0, 7), (8, 3), (-8, 3), (0, -7), (8, -5), (-8, -5), (0, 20), (12, 16), (-12, 16),
           (0, -20), (12, -18), (-12, -18))  # fmt: skip
 SHARES = (0.0, 0.2, 0.45, 0.75)  # of a line's length where its words may begin
-CORNERS: tuple[Corner, ...] = (
-    "lower right", "upper right", "lower left", "upper left", "center right", "center left",
-    "lower center", "upper center", "center",
-)  # fmt: skip
-HANDLE, PAD = 32.0, 5.0  # pt; a line's sample in a legend, and its margin
 APART = 2.0  # pt between the points that a curve is looked at by
 BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 
@@ -66,23 +59,6 @@ class Labels:
             at = np.arange(0.0, along[-1], APART)
             points = np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
         self._curves = np.vstack([self._curves, points])
-
-    def legend_at(self, entries: Sequence[str], wish: Corner) -> Corner:
-        """Where a legend covers the least, of matplotlib's places; `wish` if that is free."""
-        wide = LETTER * max(map(len, entries)) + HANDLE + 2.0 * PAD
-        tall = LINE * len(entries) + 2.0 * PAD
-        left, bottom, right, top = self._inside
-        x = {"left": left, "right": right - wide, "center": 0.5 * (left + right - wide)}
-        y = {"lower": bottom, "upper": top - tall, "center": 0.5 * (bottom + top - tall)}
-        best, least = wish, np.inf
-        for place in ([] if wish == "best" else [wish]) + list(CORNERS):
-            low, _, side = place.partition(" ")
-            a, b = x[side or "center"], y[low]
-            box = (a, b, a + wide, b + tall)
-            covered = self._covered(box) + 50.0 * sum(_meet(box, one) for one in self._taken)
-            if covered < least:
-                best, least = place, covered
-        return best
 
     def beside(self, x: float, y: float, text: str, wish: tuple[float, float]) -> None:
         """A label beside a point, at the offset `wish` in pt if that is free."""

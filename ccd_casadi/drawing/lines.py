@@ -120,10 +120,8 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
-    labelled = [*(b.label for b in panel.bands), *(c.label for c in panel.curves)]
-    named = [label for label in labelled if label]
-    if named and panel.legend is not None:
-        axes.legend(loc=labels.legend_at(named, panel.legend), borderaxespad=0.2)
+    if panel.legend is not None and axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="best", borderaxespad=0.2)
 
 
 def _leaves(panel: Panel, curve: Curve) -> bool:

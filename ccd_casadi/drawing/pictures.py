@@ -48,3 +48,11 @@ class ModeShapes:
     faces: np.ndarray
     modes: tuple[ModeShape, ...]
     view: str = ""
+
+
+def outer_faces(faces: np.ndarray) -> np.ndarray:
+    """Of the faces (f, k) of all elements those that no second element has: the surface."""
+    _, first, times = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return faces[first[times == 1]]

@@ -12,7 +12,6 @@ from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.reporting.bode import loop_panels, size_panels
 from ccd_casadi.reporting.loops import gain_panels
-from ccd_casadi.reporting.moves import over_plants
 from ccd_casadi.reporting.nyquist import loci_of, nyquist_panel
 
 # Name of a figure -> its heading, and whether its axes are logarithmic.
@@ -78,7 +77,7 @@ def drawn(look: Look, c: Curves | None, sampled: AsSampled | None) -> Drawn:
 
 
 def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -> Panel:
-    return over_plants(1e3 * time, np.asarray(values)[None], label, levels=(level,))
+    return Panel("time (ms)", label, (Curve(1e3 * time, values),), levels=(level,))
 
 
 def _poles(c: Curves) -> Panel:

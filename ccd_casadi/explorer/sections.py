@@ -84,7 +84,7 @@ def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) 
         standing, reason = Standing.MISSED, f"the constraint {broken[0]} on θ is not met"
     look = without_controller(problem, knobs, elements, how, reason)
     return replace(
-        look, figures=_figures(found), controller=controller, standing=standing,
+        look, figures=_figures(found, look.figures), controller=controller, standing=standing,
         kappa=kappa, seconds=perf_counter() - began,
     )  # fmt: skip
 
@@ -96,21 +96,16 @@ def _standing(found: SetCertificate) -> tuple[Standing, str]:
     return Standing.MISSED if stable and found.bandwidth > 0.0 else Standing.REFUSED, found.words
 
 
-def _figures(found: SetCertificate) -> DesignFigures:
+def _figures(found: SetCertificate, none: DesignFigures) -> DesignFigures:
     """The worst of the set; ω_S and ω_T are 0, and the norm is the largest share of a bound."""
     stable = all(plant.stable for plant in found.plants)
-    nan = float("nan")
     highest = max(found.plants, key=lambda plant: float(np.nan_to_num(plant.S_peak, nan=np.inf)))
-    worst = max(found.worst.values(), default=nan)
+    worst = max(found.worst.values(), default=float("nan"))
     pole = max(plant.stability for plant in found.plants)
-    return DesignFigures(
-        omega_S=0.0,
-        omega_T=0.0,
+    return replace(
+        none,
         outcome=Outcome.CERTIFIED if found.passed else Outcome.NOT_ROBUST,
-        gamma_opt=nan,
-        gamma_lower_bound=nan,
         gamma=worst,
-        limited_by_bound=False,
         bandwidth=found.bandwidth,
         sensitivity_peak=highest.S_peak,
         sensitivity_peak_frequency=highest.S_peak_frequency,

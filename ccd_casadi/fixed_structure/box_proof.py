@@ -168,9 +168,9 @@ def _divide(families: list[LoopFamily], box: Array, slack: float, share: int) ->
     levels: dict[str, float] = {}
     names, looked = families[0].names, 0
     for option, family in enumerate(families):
-        boxes, spent = _first(family, box), 0
-        while len(boxes.chart):
-            again: list[Boxes] = []
+        queue, spent = [_first(family, box)], 0
+        while queue:
+            boxes = queue.pop(0)
             for start in range(0, len(boxes.chart), AT_ONCE):
                 part = boxes.only(np.arange(start, min(start + AT_ONCE, len(boxes.chart))))
                 with np.errstate(all="ignore"):  # of boxes that enclose nothing
@@ -189,8 +189,7 @@ def _divide(families: list[LoopFamily], box: Array, slack: float, share: int) ->
                 for name, value in zip(found.names, found.highest[:, closed], strict=True):
                     levels[name] = max(levels.get(name, 0.0), float(value.max(initial=0.0)))
                 if not closed.all():
-                    again.append(_divided(part.only(~closed), found.spread[:, ~closed]))
-            boxes = _joined(again)
+                    queue.append(_divided(part.only(~closed), found.spread[:, ~closed]))
         looked += spent
     highest = max(levels.values(), default=0.0)
     outcome = ProofOutcome.PROVEN
@@ -247,14 +246,4 @@ def _divided(boxes: Boxes, spread: Array) -> Boxes:
         np.concatenate([boxes.chart, boxes.chart]),
         np.concatenate([boxes.low, right], axis=1),
         np.concatenate([left, boxes.high], axis=1),
-    )
-
-
-def _joined(parts: list[Boxes]) -> Boxes:
-    if not parts:
-        return Boxes(np.zeros(0, int), np.zeros((1, 0)), np.zeros((1, 0)))
-    return Boxes(
-        np.concatenate([part.chart for part in parts]),
-        np.concatenate([part.low for part in parts], axis=1),
-        np.concatenate([part.high for part in parts], axis=1),
     )

@@ -74,7 +74,7 @@ class LoopFamily:
             self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
         )
         gains, loose, faint = self._gains(axis)
-        known = held.known & free.known
+        known = np.isfinite(held.middle + held.radius + free.middle + free.radius)
         good = known.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
         one = np.ones(len(good))
         y, moved, most = one, 0.0 * one, one
@@ -110,14 +110,14 @@ class LoopFamily:
         S = np.minimum(most * over, np.abs(y) * w[0] + apart), np.abs(y) * w[1] - apart
         found = self._of_S(boxes, S, over)
         if level is not None:
-            k = W.behind(K).norms()
+            k = W.between(K, np.eye(len(c.T))).norms()
             turned = loose * over * (norm(K) + k[0] * more * (most + faintly))  # of K̂T₁E M₂⁻¹
             upper = (1.0 + loose) * (k[0] * more + turned) + grain * over
             lower = (1.0 - loose) * (k[1] - k[0] * after * off - turned) - grain * over
             found += self._weighted(boxes, level, (upper, lower), (T[0] + apart, T[1] - apart))
         if compliance is not None:
             g, e = np.where(good, free.middle, 0.0), np.where(good, free.radius, 0.0)
-            h = W.times(_total(g, c, b)).norms()
+            h = W.between(np.eye(len(c.T)), _total(g, c, b)).norms()
             change = most * after * _left(e, c, b)
             change += (np.abs(y) * after * off + moved * more) * h[0]
             inside = compliance * self._inside(boxes)

@@ -145,6 +145,11 @@ class LineProblem(LoopProblem):
         """v at the peaks of the first response, the strongest first."""
         return self.base[self.responses[0].resonances]
 
+    @cached_property
+    def antiresonances(self) -> Array:
+        """v at the dips of the first response, the deepest first."""
+        return self.base[self.responses[0].antiresonances]
+
     def first_response(self, v: Array) -> np.ndarray:
         """G (k,) of the first response's first entry, at the lines next to v."""
         at = np.clip(np.searchsorted(self.base, v), 0, len(self.base) - 1)
@@ -199,11 +204,9 @@ def _plants(
     residues = (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
     out = np.eye(p) if isinstance(structure, Structure) else structure.decoupling.outputs.T
     into = np.eye(m) if isinstance(structure, Structure) else structure.decoupling.inputs
-    A, B, C, D = (np.zeros((1, *shape)) for shape in ((0, 0), (0, m), (p, 0), (p, m)))
     out, into = (np.ascontiguousarray(M, float) for M in (out, into))
     T = None if period is None else period * omega_0
-    return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, (), A, B, C, D,
-                      out, into, omega)  # fmt: skip
+    return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, out, into, omega)
 
 
 @assess.register

@@ -24,7 +24,7 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels
 from ccd_casadi.fixed_structure.structure import Structure, state_spaces
 from ccd_casadi.kernels import modes
-from ccd_casadi.lti.hold import Sampling, in_w, moments, sampled, transfer
+from ccd_casadi.lti.hold import Sampling, delayed, in_w, moments, transfer
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -38,20 +38,33 @@ CLOSE = 1e-6  # relative gap of two poles below which their divided difference i
 class LoopPlant:
     """One plant as the loop sees it.
 
-    (A, B, C, D) in w. `poles` of the continuous plant, with `drive` = V⁻¹B (n, m) and `reading` =
-    CV (p, n) in its eigenvectors; `dA` = V⁻¹ ∂A V, `dB` = V⁻¹ ∂B, `dC` = ∂C V, leading axis θ.
+    `system` is the continuous plant, `poles` are its, with `drive` = V⁻¹B (n, m) and `reading` =
+    CV (p, n) in its eigenvectors V (n, n), W = V⁻¹; `dA` = W ∂A V, `dB` = W ∂B, `dC` = ∂C V,
+    leading axis θ.
     """
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
+    system: StateSpace
+    V: np.ndarray
+    W: np.ndarray
     poles: np.ndarray
     drive: np.ndarray
     reading: np.ndarray
     dA: np.ndarray
     dB: np.ndarray
     dC: np.ndarray
+
+    def in_w(self, period: float | None, delay: float) -> StateSpace:
+        """With hold and delay, as a rational function of w; itself where nothing is sampled.
+
+        x_{k+1} = V e^{pT} W x_k + V late W B u_{k-d} + V early W B u_{k-d-1}
+        """
+        if period is None:
+            return self.system
+        d, *shares = moments(self.poles, period, delay)
+        gains = [((self.V * share) @ self.drive).real for share in shares]
+        gains = [np.zeros_like(self.system.B)] * int(d) + gains[: 1 + bool(np.any(shares[1]))]
+        step = ((self.V * np.exp(self.poles * period)) @ self.W).real
+        return in_w(delayed(step, gains, self.system.C, period))
 
 
 @dataclass(frozen=True)
@@ -71,11 +84,6 @@ class PlantSet:
     delay: float
     poles: np.ndarray
     residues: np.ndarray
-    zeros: tuple[np.ndarray, ...]
-    A: Array
-    B: Array
-    C: Array
-    D: Array
     out: Array
     into: Array
 
@@ -83,6 +91,22 @@ class PlantSet:
     def count(self) -> int:
         """How many plants."""
         return len(self.poles)
+
+    @cached_property
+    def systems(self) -> tuple[StateSpace, ...]:
+        """The plants in w."""
+        return tuple(plant.in_w(self.period, self.delay) for plant in self.plants)
+
+    @cached_property
+    def states(self) -> tuple[Array, Array, Array, Array]:
+        """A (P, n, n), B, C and D of these; the shorter ones with stable states that do nothing."""
+        most, (p, m) = max(len(G.A) for G in self.systems), self.residues.shape[2:]
+        A = np.tile(-np.eye(most), (self.count, 1, 1))
+        B, C = np.zeros((self.count, most, m)), np.zeros((self.count, p, most))
+        for i, G in enumerate(self.systems):
+            n = len(G.A)
+            A[i, :n, :n], B[i, :n], C[i, :, :n] = G.A, G.B, G.C
+        return A, B, C, np.array([G.D for G in self.systems])
 
     @cached_property
     def modes(self) -> modes.Plants:
@@ -158,10 +182,12 @@ class PlantSet:
             (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap),
         )
         c, b = left @ plant.reading, right @ plant.drive.T
-        out = np.einsum("ki,kij,kj,tij->kt", c, between, b, plant.dA, optimize=True)
-        out += np.einsum("kp,tpi,ki,ki->kt", left, plant.dC, f, b, optimize=True)
-        out += np.einsum("ki,ki,tim,km->kt", c, f, plant.dB, right, optimize=True)
-        return np.asarray(out)
+        pairs = [
+            (c[:, :, None] * between * b[:, None, :], plant.dA),
+            (left[:, :, None] * (f * b)[:, None, :], plant.dC),
+            ((c * f)[:, :, None] * right[:, None, :], plant.dB),
+        ]
+        return np.asarray(sum(np.tensordot(a, d, ((1, 2), (1, 2))) for a, d in pairs))
 
 
 def plant_set(
@@ -197,23 +223,19 @@ def plant_set(
     omega_0, force = plants[0].omega_0, plants[0].force
     period = None if sampling is None else sampling.period * omega_0
     delay = 0.0 if sampling is None else sampling.delay * omega_0
-    units = (omega_0, force, period, delay)
-    found = tuple(_loop_plant(plant, f"plant {i}", *units) for i, plant in enumerate(plants, 1))
-    # Shorter plants have residues of zero, and stable states that do nothing.
-    P, (p, m) = len(found), found[0].D.shape
-    most, states = max(len(one.poles) for one in found), max(len(one.A) for one in found)
-    poles, residues = np.full((P, most), -1.0, complex), np.zeros((P, most, p, m), complex)
-    A = np.tile(-np.eye(states), (P, 1, 1))
-    B, C = np.zeros((P, states, m)), np.zeros((P, p, states))
+    found = tuple(
+        _loop_plant(plant, f"plant {i}", omega_0, force) for i, plant in enumerate(plants, 1)
+    )
+    # Shorter plants have residues of zero.
+    most, (p, m) = max(len(one.poles) for one in found), found[0].system.D.shape
+    poles = np.full((len(found), most), -1.0, complex)
+    residues = np.zeros((len(found), most, p, m), complex)
     for i, loop in enumerate(found):
-        n, k = len(loop.A), len(loop.poles)
-        A[i, :n, :n], B[i, :n], C[i, :, :n] = loop.A, loop.B, loop.C
+        k = len(loop.poles)
         poles[i, :k] = loop.poles
         residues[i, :k] = np.einsum("pn,nm->npm", loop.reading, loop.drive)
-    zeros = tuple(StateSpace(one.A, one.B, one.C, one.D).zeros() for one in found)
-    D = np.array([one.D for one in found])
     out, into = (np.ascontiguousarray(M, float) for M in (out, into))
-    return PlantSet(found, *units, poles, residues, zeros, A, B, C, D, out, into)
+    return PlantSet(found, omega_0, force, period, delay, poles, residues, out, into)
 
 
 def closed_loops(
@@ -229,7 +251,7 @@ def closed_loops(
     else:
         systems = [structure.diagonal(one) for one in kappa]
         a, b, c, d = (np.array([getattr(one, name) for one in systems]) for name in "ABCD")
-    A, B, C, D = plants.A, plants.B, plants.C, plants.D
+    A, B, C, D = plants.states
     a, d = a[:, None], (plants.into @ d @ plants.out)[:, None]
     b, c = (b @ plants.out)[:, None], (plants.into @ c)[:, None]
     well = np.eye(d.shape[-2]) + d @ D
@@ -250,9 +272,7 @@ def stable(poles: np.ndarray) -> np.ndarray:
         return np.asarray((poles.real < 0.0).all(-1))
 
 
-def _loop_plant(
-    plant: ScaledPlant, name: str, omega_0: float, force: float, period: float | None, delay: float
-) -> LoopPlant:
+def _loop_plant(plant: ScaledPlant, name: str, omega_0: float, force: float) -> LoopPlant:
     ratio, drive = plant.omega_0 / omega_0, plant.omega_0 / omega_0 * force / plant.force
     A, B, C = ratio * plant.A, drive * plant.B, plant.C
     poles, V = np.linalg.eig(A)
@@ -262,14 +282,11 @@ def _loop_plant(
     W = np.linalg.inv(V)
     b, c = W @ B, C @ V
     at = 1j * np.geomspace(1e-2, 1e2, 7)
-    direct = StateSpace(A, B, C, np.zeros((len(C), B.shape[1]))).at(at)
+    system = StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))
+    direct = system.at(at)
     modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (at[:, None] - poles), b)
     if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
         words = "has poles that coincide and are coupled; move a damping ratio away from 1"
         raise PlantError(f"{name} {words}")
-    state = (A, B, C, np.zeros((len(C), B.shape[1])))
-    if period is not None:
-        w = in_w(sampled(StateSpace(*state), period, delay))
-        state = (w.A, w.B, w.C, w.D)
     dA = W @ (ratio * plant.dA) @ V
-    return LoopPlant(*state, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)
+    return LoopPlant(system, V, W, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)

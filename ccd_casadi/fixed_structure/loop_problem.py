@@ -67,12 +67,10 @@ class LoopProblem:
     @cached_property
     def fixed(self) -> Array:
         """The base grid and the flanks of every plant's poles and zeros, (P, k)."""
-        P = self.plants
-        widest = max(len(z) for z in P.zeros)
-        found = np.full((len(P.plants), P.A.shape[1] + widest), np.nan, complex)
-        for i, plant in enumerate(P.plants):
-            found[i, : len(plant.A)] = np.linalg.eigvals(plant.A)
-            found[i, P.A.shape[1] : P.A.shape[1] + len(P.zeros[i])] = P.zeros[i]
+        roots = [np.append(np.linalg.eigvals(G.A), G.zeros()) for G in self.plants.systems]
+        found = np.full((len(roots), max(map(len, roots))), np.nan, complex)
+        for i, own in enumerate(roots):
+            found[i, : len(own)] = own
         return np.concatenate([np.tile(self.base, (len(found), 1)), flanked(found)], axis=1)
 
     @cached_property
@@ -95,7 +93,7 @@ class LoopProblem:
     @property
     def first(self) -> int:
         """How many gains of each matrix are of the whole; the others are rows of channels."""
-        return len(self.plants.C[0])
+        return int(self.plants.residues.shape[2])
 
     @cached_property
     def _factors(self) -> tuple[np.ndarray, np.ndarray]:
@@ -125,6 +123,13 @@ class LoopProblem:
         strength = np.abs(r) / np.maximum(-p.real, 1e-300)
         order = np.argsort(-strength[light])
         return np.asarray(np.abs(p[light])[order])
+
+    @cached_property
+    def antiresonances(self) -> Array:
+        """|z| of the light zeros of the first plant, the lightest first."""
+        z = self.plants.systems[0].zeros()
+        light = z[(z.imag > 0.0) & (np.abs(z.real) < 0.2 * np.abs(z))]
+        return np.asarray(np.abs(light)[np.argsort(np.abs(light.real) / np.abs(light))])
 
     def first_response(self, v: Array) -> np.ndarray:
         """The first entry of the first plant's G (k,) at jv."""

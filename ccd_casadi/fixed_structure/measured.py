@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.signal import find_peaks
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
@@ -81,7 +80,17 @@ class MeasuredResponse:
     @property
     def resonances(self) -> np.ndarray:
         """The lines (indices) of the peaks of |G|, the strongest first."""
-        size = np.log(np.linalg.norm(self.matrix, axis=(1, 2)))
+        return self._extremes(1.0)
+
+    @property
+    def antiresonances(self) -> np.ndarray:
+        """Those of its dips, the deepest first."""
+        return self._extremes(-1.0)
+
+    def _extremes(self, sign: float) -> np.ndarray:
+        from scipy.signal import find_peaks  # slow to import, and every command imports this module
+
+        size = sign * np.log(np.linalg.norm(self.matrix, axis=(1, 2)))
         at, found = find_peaks(size, prominence=PEAK)
         return np.asarray(at[np.argsort(-found["prominences"])])
 

@@ -27,11 +27,6 @@ class Discs:
     radius: Array
     shares: Array
 
-    @property
-    def known(self) -> np.ndarray:
-        """Where there is a disc (n, N)."""
-        return np.isfinite(self.middle + self.radius)
-
 
 def discs_of(
     plant: ModalSum, names: tuple[str, ...], low: Array, high: Array, axis: Axis, free: bool
@@ -40,7 +35,10 @@ def discs_of(
     stay damped (N,)."""
     free &= axis.period is not None
     count = (len(plant.omega), 1 + len(names), low.shape[1])
-    held, bare = _none(count), _none(count)
+    held, bare = (
+        Discs(np.zeros(count[::2], complex), np.zeros(count[::2]), np.zeros(count))
+        for _ in range(2)
+    )
     damped = np.ones(count[2], bool)
     for i in range(count[0]):
         own = [k for k, name in enumerate(names)
@@ -53,10 +51,6 @@ def discs_of(
             s = axis.s.of(len(rows))
             _fill(bare, i, rows, *((s - p, residue) for p, residue in poles))
     return held, bare if free else held, damped
-
-
-def _none(count: tuple[int, int, int]) -> Discs:
-    return Discs(np.zeros(count[::2], complex), np.zeros(count[::2]), np.zeros(count))
 
 
 def _fill(found: Discs, i: int, rows: list[int], first: Pair, second: Pair) -> None:

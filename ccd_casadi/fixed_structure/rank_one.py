@@ -31,15 +31,10 @@ class Turned:
     lost: Array
     good: np.ndarray
 
-    def times(self, right: np.ndarray) -> "Turned":
-        """With a matrix (N, q, k) behind it."""
-        lost = self.lost * norm(right, loosely=True)
-        return replace(self, A=self.A @ right, B=self.B @ right, lost=lost)
-
-    def behind(self, left: np.ndarray) -> "Turned":
-        """With a matrix (N, k, p) in front of it."""
-        lost = self.lost * norm(left, loosely=True)
-        return replace(self, A=left @ self.A, B=left @ self.B, lost=lost)
+    def between(self, left: np.ndarray, right: np.ndarray) -> "Turned":
+        """With a matrix (N, k, p) in front of it and one (N, q, l) behind it."""
+        lost = self.lost * norm(left, loosely=True) * norm(right, loosely=True)
+        return replace(self, A=left @ self.A @ right, B=left @ self.B @ right, lost=lost)
 
     def from_one(self, y: np.ndarray) -> "Turned":
         """1 - y (A + γB), y (N,)."""

@@ -38,20 +38,25 @@ STIFFNESS_LINE = -1.0  # d ln|G|/d ln ω above which the stiffness holds what is
 def by_rules(problem: Problem, crossovers: Array) -> Array:
     """(N, n) controllers by rules: PID with roll-off at each crossover, notches at resonances.
 
-    Notches come narrow and wide, and shifted to either side. Of several biquads two are skewed
+    Notches come narrow and wide, and shifted to either side; in one more shape the last biquad
+    lifts |L| at the first anti-resonance, whose dip bounds |S|. Of several biquads two are skewed
     notches at the first resonance too, which turn its circle away from -1; where the shape ends at
     ω_b the last one is a filter at the crossover instead.
     """
     tops, count = problem.resonances, problem.structure.biquads
-    shapes = [(0.5, 1.0, 0.0), (1.0, 1.0, 0.0), (0.5, 0.8, 0.0), (0.5, 1.25, 0.0)]
+    plain = [(0.5, 1.0), (1.0, 1.0), (0.5, 0.8), (0.5, 1.25)]
     narrow = problem.bounds.shape is None or problem.bounds.shape_ends is ShapeEnd.CROSSING
-    if count > 1 and narrow:
-        shapes += [(1.0, 1.0, 0.7), (1.0, 1.0, 1.0)]
-    elif count > 1 and len(tops):
-        shapes.append((0.5, 1.0, 0.0))  # the notches beyond the skewed ones
-    found = []
+    skewed = count > 1 and not narrow and len(tops) > 0
+    found, at = [], []
     for crossover in crossovers:
-        for turn, (width, below, filtered) in enumerate(shapes):
+        shapes: list[tuple[float, float, tuple[float, ...]]] = [(*one, ()) for one in plain]
+        if count > 1 and narrow:  # |L| just below the crossover, where S rises
+            shapes += [(1.0, 1.0, (ratio * crossover, 1.02, 0.1, 0.07)) for ratio in (0.7, 1.0)]
+        elif skewed:
+            shapes.append((0.5, 1.0, ()))  # the notches beyond the skewed ones
+        if count:  # the dip of |L| at an anti-resonance, where S rises too
+            shapes += [(0.5, 1.0, (dip, 1.0, 0.5, 0.1)) for dip in problem.antiresonances[:1]]
+        for turn, (width, below, lift) in enumerate(shapes):
             values = _around(problem, float(crossover), np.random.default_rng(0), 0.0)
             for i in range(count):
                 notch = tops[i % len(tops)] if len(tops) else 4.0 * crossover
@@ -59,32 +64,40 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
                 values[f"biquad {i + 1} zeros damping"] = 0.1
                 values[f"biquad {i + 1} poles"] = notch * below
                 values[f"biquad {i + 1} poles damping"] = width
-            if turn == 4 and not filtered:
+            if turn == len(plain) and skewed:
                 for i, roots in enumerate(SKEWED, 1):
                     for root, ratio, damping in roots:
                         values[f"biquad {i} {root}"] = ratio * tops[0]
                         values[f"biquad {i} {root} damping"] = damping
-            if filtered:  # the last one lifts |L| just below the crossover, where S rises
-                values[f"biquad {count} zeros"] = 1.02 * filtered * crossover
-                values[f"biquad {count} poles"] = filtered * crossover
-                values[f"biquad {count} poles damping"] = 0.07
+            if lift:
+                poles, ratio, wide, light = lift
+                values[f"biquad {count} zeros"] = ratio * poles
+                values[f"biquad {count} zeros damping"] = wide
+                values[f"biquad {count} poles"] = poles
+                values[f"biquad {count} poles damping"] = light
             found.append(_kappa(problem, values))
-    return with_crossover(problem, np.array(found), np.repeat(crossovers, len(shapes)))
+            at.append(crossover)
+    return with_crossover(problem, np.array(found), np.array(at))
 
 
 def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> Array:
-    """(N, n) random controllers with these crossovers."""
+    """(N, n) random controllers with these crossovers.
+
+    A biquad has its zeros at a resonance, or its poles at an anti-resonance, or is anywhere.
+    """
     tops = problem.resonances
+    known = np.concatenate([tops, problem.antiresonances])
     found = []
     for crossover in crossovers:
         values = _around(problem, float(crossover), rng, 1.0)
         for i in range(problem.structure.biquads):
-            near = len(tops) and rng.random() < 0.6
-            middle = rng.choice(tops) if near else crossover * np.exp(rng.uniform(-0.5, 2.5))
-            values[f"biquad {i + 1} zeros"] = middle * np.exp(rng.normal(0.0, 0.25))
-            values[f"biquad {i + 1} zeros damping"] = np.exp(rng.uniform(np.log(0.02), 0.0))
-            values[f"biquad {i + 1} poles"] = middle * np.exp(rng.normal(0.1, 0.4))
-            values[f"biquad {i + 1} poles damping"] = np.exp(rng.uniform(np.log(0.05), 0.0))
+            place = int(rng.integers(len(known))) if len(known) and rng.random() < 0.6 else -1
+            middle = crossover * np.exp(rng.uniform(-0.5, 2.5)) if place < 0 else known[place]
+            near, far = ("zeros", "poles") if place < len(tops) else ("poles", "zeros")
+            values[f"biquad {i + 1} {near}"] = middle * np.exp(rng.normal(0.0, 0.25))
+            values[f"biquad {i + 1} {near} damping"] = np.exp(rng.uniform(np.log(0.02), 0.0))
+            values[f"biquad {i + 1} {far}"] = middle * np.exp(rng.normal(0.1, 0.4))
+            values[f"biquad {i + 1} {far} damping"] = np.exp(rng.uniform(np.log(0.05), 0.0))
         found.append(_kappa(problem, values))
     return with_crossover(problem, np.array(found), crossovers)
 

@@ -114,7 +114,7 @@ class UncertainPlant:
                 own = np.ix_(flexible, flexible)
                 dD[row][own] = modal.D[own] / value
                 continue
-            at = flexible[int(number) - 1 : int(number)] if number else flexible
+            at = modal.numbered[int(number) - 1 : int(number)] if number else flexible
             dK[row, at, at] = 2.0 * modal.K[at, at] / (1.0 + value)
             if not given:
                 dD[row, at, at] = modal.D[at, at] / (1.0 + value)
@@ -164,7 +164,8 @@ class ModalSum:
     """One option of an uncertain plant as Σ c_i b_iᵀ/(s² + g_i s + k_i), time in 1/`unit`, SI else.
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
-    `rigid` ones have their suspension's instead. `drive` (n, m), `reading` (n, p) are b_i and c_i.
+    `rigid` ones have their suspension's instead, and stand first; the others are in the order of
+    their numbers. `drive` (n, m), `reading` (n, p) are b_i and c_i.
     """
 
     omega: Array
@@ -223,10 +224,11 @@ def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum |
         return None
     diagonal = np.diag(given)
     diagonal = np.where(np.abs(diagonal) > UNCOUPLED * size, diagonal, 0.0)
+    order = np.append(np.flatnonzero(modal.rigid), modal.numbered)
     return ModalSum(
-        modal.natural / unit, modal.rigid,
-        (w_r / unit, uncertain.suspension.damping_ratio), diagonal / unit, zeta,
-        modal.B / unit**2, modal.C.T,
+        modal.natural[order] / unit, modal.rigid[order],
+        (w_r / unit, uncertain.suspension.damping_ratio), diagonal[order] / unit, zeta,
+        modal.B[order] / unit**2, modal.C.T[order],
     )  # fmt: skip
 
 

@@ -54,13 +54,20 @@ class Magnitude:
         return np.exp(least) * (1.0 - FAITHFUL), np.exp(most) * (1.0 + FAITHFUL)
 
 
-def magnitude(system: StateSpace) -> Magnitude:
+def magnitude(system: StateSpace) -> Magnitude | None:
     """Of one input and output, continuous or sampled; there in v, delays as zeros at 2/T.
+
+    None where the input does not reach the output, as between axes that are apart.
 
     Raises PlantError where poles and zeros do not give the response.
     """
     T = system.period
-    even = balanced(system.A, system.B, system.C)  # or its zeros have errors of 1e-3
+    on = _reached(system.A, system.B) & _reached(system.A.T, system.C.T)
+    if not on.any():
+        return None
+    even = balanced(
+        system.A[on][:, on], system.B[on], system.C[:, on]
+    )  # or its zeros have errors of 1e-3
     system = StateSpace(*even, system.D, period=T)
     poles = system.poles
     size = 1.0 if T else float(np.abs(poles).max())
@@ -78,6 +85,14 @@ def magnitude(system: StateSpace) -> Magnitude:
     if not error <= 1.5 * FAITHFUL:
         words = "its poles and zeros do not give its response"
         raise PlantError(f"no bound on every controller: {words} (off by {error:.1e})")
+    return found
+
+
+def _reached(A: Array, B: Array) -> np.ndarray:
+    """Which states the inputs reach through entries that are not zero."""
+    found = np.asarray(B.any(axis=1))
+    for _ in A:
+        found = found | A[:, found].any(axis=1)
     return found
 
 
@@ -159,11 +174,11 @@ def limits_of(
     else:
         held, period = sampled(plant, sampling.period, sampling.delay), sampling.period
     u = np.ones((1, 1)) if direction is None else np.asarray(direction)[None, :]
-    row = tuple(
+    parts = (
         magnitude(StateSpace(held.A, held.B[:, [j]], u @ held.C, u @ held.D[:, [j]], period=period))
         for j in range(held.B.shape[1])
-        if np.abs(held.B[:, j]).any()
     )
+    row = tuple(part for part in parts if part is not None)
     one = plant.B.shape[1] == 1 and len(plant.C) == 1
     zeros = row[0].zeros if one else np.empty(0, complex)
     beyond = zeros[zeros.real > OUTSIDE * np.abs(zeros)]

@@ -135,7 +135,8 @@ def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
     n, m, p = len(A), B.shape[1], C.shape[0]
     system = np.zeros((n + m + p, n + m + p))
     system[:n, :n], system[:n, n : n + m], system[n + m :, :n] = A, B, C
-    even, _ = matrix_balance(system, permute=False)
+    with np.errstate(invalid="ignore"):  # scales beyond 64 bits, as integers that nobody reads
+        even, _ = matrix_balance(system, permute=False)
     parts = (even[:n, :n], even[:n, n : n + m], even[n + m :, :n])
     A, B, C = (np.ascontiguousarray(part) for part in parts)
     return A, B, C

@@ -19,6 +19,7 @@ CURVED, SLACK = 1e-8, 1e-4  # of a step in its own units: its answer is then one
 UNBOUNDED = 1e30  # what DAQP takes for infinite
 QUIET = ("error_on_fail", "print_iter", "print_header", "print_info")
 TOLERANCES = {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}
+AT_FIRST, ADDED = 200, 50  # rows of a programme, and those that its answer exceeds, at a time
 LOST = 1e-8  # share of its factors below which a scalar product is rounding
 
 
@@ -68,19 +69,28 @@ def solve_elastic(
     σ is by how much the rows are left exceeded (l∞ penalty; Fletcher 1987, section 12.4), so that
     there is a solution where all are elastic; with `free` it may be negative. Solved in steps of
     one radius and with `unit`, the size of c or ρ, as one: the solvers' tolerances mean the same at
-    every radius. None as in `solve_quadratic`.
+    every radius. Of thousands of rows the first are solved for, and then those too that the answer
+    leaves exceeded, until there is none. None as in `solve_quadratic`.
     """
-    n = slopes.shape[1]
+    m, n = slopes.shape
     A = np.column_stack([slopes, -elastic])
     hessian = np.zeros((n + 1, n + 1))
     hessian[:n, :n] = radius / unit * H
     hessian[range(n + 1), range(n + 1)] += np.append(np.full(n, CURVED), CURVED if free else SLACK)
     ends = np.append(low / radius, -np.inf if free else 0.0), np.append(high / radius, np.inf)
-    cost = np.append(c, penalty) / unit
-    found = solve_quadratic(hessian, cost, A, -value / radius, *ends)
-    if found is None:
-        return None
-    return radius * np.clip(found.x[:n], ends[0][:n], ends[1][:n]), unit * found.multipliers
+    cost, upper, held = np.append(c, penalty) / unit, -value / radius, np.arange(m) < AT_FIRST
+    while True:
+        found = solve_quadratic(hessian, cost, A[held], upper[held], *ends)
+        if found is None:
+            return None
+        missed = np.where(held, -np.inf, A @ found.x - upper)
+        if not (missed > KEPT).any():
+            break
+        worst = np.argsort(-missed)[:ADDED]
+        held[worst[missed[worst] > KEPT]] = True
+    multipliers = np.zeros(m)
+    multipliers[held] = unit * found.multipliers
+    return radius * np.clip(found.x[:n], ends[0][:n], ends[1][:n]), multipliers
 
 
 @lru_cache(maxsize=256)

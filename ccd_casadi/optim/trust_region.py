@@ -22,10 +22,11 @@ import numpy as np
 from ccd_casadi.optim.quadratic import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
-ROWS = 400  # of a programme at most
 PROGRAMMES = 6  # around each other, for one step
+SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to the answer of a programme
 SETTLED = 1e-2  # of the radius: a step that moves less from one programme to the next
 HOLDS = 1e-7  # of the penalty: the multiplier of a row that holds the step
+BENDS = 0.2  # of the sizes of its parts: how far curvature may move a row more than it is known to
 FLAT = 1e-4  # of the slopes: least curvature, which leaves a linear programme one
 CONVEXIFYING = 10.0  # times AᵀA of the rows that hold: changes nothing along them
 ENOUGH, POOR = 0.7, 0.2  # of the predicted gain: with it a model is trusted further, or less far
@@ -215,19 +216,22 @@ def best_step(
     chosen = np.arange(len(rows.value))
     if not model.carried:  # a row that the step cannot lift over its bound is none of it
         chosen = _within_reach(rows.value + margin, rows.slopes, radius)
-    m, n = len(chosen), len(here.x)
+    n = len(here.x)
     value, slopes = rows.value[chosen], rows.slopes[chosen]
-    elastic = np.ones(m) if rows.hard is None else 1.0 - rows.hard[chosen]
+    elastic = np.ones(len(chosen)) if rows.hard is None else 1.0 - rows.hard[chosen]
     unit = _unit(here, penalty if model.carried else 0.0)
     weight = ELASTIC * (unit + penalty) if model.growing else penalty
     multipliers = np.zeros(len(rows.value))
 
-    def gain(p: Array, level: Array) -> float:
-        """Of merit at p, where the rows have these levels."""
+    curved, bent = np.zeros((0, n, n)), np.zeros(0, int)  # Hessians, and the rows that have them
+
+    def gain(p: Array) -> float:
+        """Of merit at p, with what is known of the curvature of the rows."""
+        level = value + slopes @ p
+        level[bent] += 0.5 * (curved @ p) @ p
         most = float(level[elastic > 0.0].max(initial=-np.inf if model.carried else 0.0))
         return penalty * (here.violation - most) - float(here.gradient @ p + 0.5 * p @ H @ p)
 
-    curved, known = np.zeros((m, n, n)), chosen >= rows.curved
     at, offset, M, p = slopes, value + margin[chosen], convex(H, FLAT * unit), np.zeros(n)
     best: Step | None = None
     straight = 0.0
@@ -239,28 +243,33 @@ def best_step(
         )
         if found is None:
             break
-        moved, (p, mu) = float(np.abs(found[0] - p).max()), found
+        way, mu = found[0] - p, found[1]
         if model.growing:
             penalty = max(FADING * penalty, 2.0 * float(mu.sum()))
         if turn == 0:
-            straight = gain(p, value + slopes @ p)
+            straight = gain(way)
         holds = mu > HOLDS * weight
-        fresh = holds & ~known
-        if fresh.any() and rows.hessians is not None:
-            curved[fresh] = rows.hessians(chosen[fresh])
-            known |= fresh
-        bend = curved @ p
-        at, offset = slopes + bend, value - 0.5 * bend @ p
-        predicted = gain(p, offset + at @ p)
+        # A row that ends below its bound by little of what it moves may bend over it.
+        counts = holds | (offset + at @ found[0] > -BENDS * (np.abs(slopes) @ np.abs(found[0])))
+        fresh = np.setdiff1d(np.flatnonzero(counts & (chosen < rows.curved)), bent)
+        if len(fresh) and rows.hessians is not None:
+            curved = np.concatenate([curved, rows.hessians(chosen[fresh])])
+            bent = np.concatenate([bent, fresh])
+        # The rows bend less on part of the way: a whole one may lead further and further out.
+        p = max((p + share * way for share in (SHARES if rows.curved else SHARES[:1])), key=gain)
+        bend, predicted = curved @ p, gain(p)
+        at, offset = slopes.copy(), value.copy()
+        at[bent] += bend
+        offset[bent] -= 0.5 * bend @ p
         if rows.curved:
-            lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0), curved)
+            lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0)[bent], curved)
             active = at[holds]
             M = convex(lagrangian + CONVEXIFYING * active.T @ active, FLAT * unit)
         if best is None or predicted > best.predicted:
             multipliers = np.zeros(len(rows.value))
             multipliers[chosen] = mu
             best = Step(p, predicted, straight, M, multipliers, rows, penalty)
-        if not rows.curved or (not fresh.any() and moved < SETTLED * radius):
+        if not rows.curved or (not len(fresh) and np.abs(way).max() < SETTLED * radius):
             break
     return best
 
@@ -287,14 +296,10 @@ def _corrected(
 
 def _within_reach(value: Array, slopes: Array, radius: float) -> np.ndarray:
     """The rows that a step can lift over their bounds: those that are over them first, by how far,
-    then those that the shortest step lifts.
-
-    Where there are too many these count: a steep row far below its bound must not push out one
-    that holds the step, nor a flat one just over its bound the one that is furthest over.
-    """
+    then those that the shortest step lifts."""
     away = -value / np.maximum(np.abs(slopes).sum(1), 1e-300)
     over = value > 0.0
-    order = np.lexsort((np.where(over, -value, away), ~over))[:ROWS]
+    order = np.lexsort((np.where(over, -value, away), ~over))
     return np.asarray(order[away[order] < radius])
 
 

@@ -20,6 +20,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 UNDAMPED = 1e-12  # of the largest modal damping: what is below is rounding of none
+ALIKE = 1e-9  # relative: singular values of outputs
 RIGID_RATIO = 1e-5  # a mode below this fraction of the highest frequency counts as rigid
 
 
@@ -36,8 +37,8 @@ class Perturbation:
     """A plant off its model: flexible frequencies times 1 + `shift`, damping times `damping`.
 
     Mode shapes stay. Modal damping ratios are multiplied by `damping`, or a given damping matrix,
-    which a shift leaves alone. `modes` shift single flexible modes besides, the lowest first; those
-    that it does not reach stay.
+    which a shift leaves alone. `modes` shift single flexible modes besides, as `numbered` has them;
+    those that it does not reach stay.
     """
 
     shift: float = 0.0
@@ -71,6 +72,11 @@ class ModalPlant:
     dC: Array
 
     @property
+    def numbered(self) -> np.ndarray:
+        """The flexible modes in the order of their numbers, see `numbered`."""
+        return numbered(self.modes, self.rigid)
+
+    @property
     def state_space(self) -> StateSpace:
         """[q; q̇] in SI, velocities in units in which a mode's energy is even."""
         n, k = len(self.K), np.diag(self.K)
@@ -98,7 +104,10 @@ def modal_plant(
     lam = np.where(rigid, 0.0, lam)
     modes = _aligned(modes, lam, rigid, system.C)
     root = np.sqrt(lam)
-    ratio = (1.0 + perturbation.shift) * (1.0 + _own_shifts(perturbation, rigid))
+    own = np.zeros(rigid.size)
+    shifted = numbered(modes, rigid)[: len(perturbation.modes)]
+    own[shifted] = perturbation.modes[: len(shifted)]
+    ratio = (1.0 + perturbation.shift) * (1.0 + own)
     h = np.where(rigid, w_r**2, ratio**2 * lam)
     given = system.damping_ratio is None
     model = 0.0 if given else float(system.damping_ratio or 0.0)
@@ -149,16 +158,18 @@ def require_damping(modal: ModalPlant) -> None:
     )
 
 
-def _own_shifts(perturbation: Perturbation, rigid: np.ndarray) -> Array:
-    """The relative shift of each mode on its own.
+def numbered(modes: Array, rigid: np.ndarray) -> np.ndarray:
+    """The flexible ones of modes (n, n), lowest first, in the order of their numbers.
 
-    Each branch of eigenvalues then has a function of its own, of which the divided differences
-    hold as they do for one, where eigenvalues are apart.
+    Where each coordinate of the model is a mode the model's order counts: what shifts a mode alone
+    then shifts the same one at every θ, also past a crossing of frequencies. Else the lowest is
+    the first. Each branch of eigenvalues has a function of its own, of which the divided
+    differences hold as they do for one, where eigenvalues are apart.
     """
-    out = np.zeros(rigid.size)
-    flexible = np.flatnonzero(~rigid)[: len(perturbation.modes)]
-    out[flexible] = perturbation.modes[: len(flexible)]
-    return out
+    flexible = np.flatnonzero(~rigid)
+    if np.count_nonzero(modes[:, flexible]) == len(flexible):
+        flexible = flexible[np.argsort(np.abs(modes).argmax(0)[flexible])]
+    return flexible
 
 
 def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
@@ -166,7 +177,8 @@ def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
 
     Any orthogonal basis of an eigenspace is one of modes. In the singular vectors of its outputs
     a direction that is not measured has c = 0 exactly; spread over several modes it would leave
-    the Riccati solution singular in a direction that rounding makes up.
+    the Riccati solution singular in a direction that rounding makes up. Where all are
+    measured alike, as tip and tilt of a square stage, there is nothing to part, and they stay.
     """
     modes = modes.copy()
     n = lam.size
@@ -179,8 +191,9 @@ def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
         ):
             end += 1
         if end - start > 1:
-            _, _, Vh = np.linalg.svd(C @ modes[:, start:end])
-            modes[:, start:end] = modes[:, start:end] @ Vh.T
+            seen, Vh = np.linalg.svd(C @ modes[:, start:end])[1:]
+            if len(seen) < end - start or seen[0] - seen[-1] > ALIKE * seen[0]:
+                modes[:, start:end] = modes[:, start:end] @ Vh.T
         start = end
     return modes
 

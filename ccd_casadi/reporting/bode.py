@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from ccd_casadi.analysis.loop_view import LoopView, phase_deg
 from ccd_casadi.deployment.channels import Channel
-from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Mark, Panel, Table
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel, Table
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY
-from ccd_casadi.reporting.loops import bandwidth_level, margin_words, over_hz
+from ccd_casadi.reporting.loops import bandwidth_level, margin_words, of_plants, over_hz
 from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
@@ -51,7 +51,7 @@ def loop_panels(
     L = loop.open[:, :, 0, 0] if loop.scalar else loci_of(loop.open[0], np.inf).T
     sizes, phases = np.abs(L), phase_deg(L.T).T
     minus_one = TURNS[(phases.min() - 60.0 <= TURNS) & (phases.max() + 60.0 >= TURNS)]
-    size: dict[str, Any] = {"levels": (Level(1.0, "1", colour=GREY),), "legend": "lower left"}
+    size: dict[str, Any] = {"levels": (Level(1.0, "1", colour=GREY),)}
     phase: dict[str, Any] = {
         "levels": tuple(Level(turn, "", colour=GREY) for turn in minus_one),
         "log_y": False, "y_step": 90.0, "legend": None,
@@ -62,13 +62,9 @@ def loop_panels(
             for of in (np.abs, phase_deg)
         ]
     elif loop.scalar:
-        label = "the model" if len(L) > 1 else ""
-        drawn = [[Curve(loop.hz, values[0], label)] for values in (sizes, phases)]
-        if len(L) > 1:
-            size["bands"], phase["bands"] = (
-                (Band(loop.hz, values.min(axis=0), values.max(axis=0), "all plants"),)
-                for values in (sizes, phases)
-            )
+        found = [of_plants(loop.hz, values) for values in (sizes, phases)]
+        drawn = [[*curves] for curves, _ in found]
+        size["bands"], phase["bands"] = (bands for _, bands in found)
         if stable:
             drawn = [[*own, *more] for own, more in
                      zip(drawn, _margins(loop, phases[0], size, phase), strict=True)]  # fmt: skip

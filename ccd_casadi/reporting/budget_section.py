@@ -88,8 +88,7 @@ def _figure(model: BudgetFigures) -> Figure:
     total = Curve(hz, 1e6 * np.sqrt(whole), "together", BLACK, width=1.8)
     top = 1e6 * float(np.sqrt(whole[-1]))
     panel = Panel("frequency (Hz)", "RMS error up to it (µm)", (*curves, total), log_x=True,
-                  log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top),
-                  legend="best")  # fmt: skip
+                  log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top))  # fmt: skip
     lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
     grid = np.geomspace(*x, ROWS)
     columns = (1e6 * np.sqrt(np.interp(grid, hz, part)) for part in (*parts, whole))

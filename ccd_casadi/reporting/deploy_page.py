@@ -136,7 +136,7 @@ def _step(run: FinishedRun, found: Deployment) -> Figure:
         y = outputs @ direction
         curves.append(Curve(1e3 * t, y, label, colour, line))
     where = "" if len(direction) == 1 else f", channel {found.orders[0].channel.name}"
-    panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves), legend="lower right")
+    panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves))
     table = over_time(("ms", "y"), 1e3 * t, y)
     caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
     return Figure(Lines(((panel,),), "Step of the reference", (3.0,)), caption, (table,))
@@ -201,7 +201,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
         return Words(words), sections_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
-        (s.kind, *_root(s.zero), *_root(s.pole), _depth(s.depth_db)) for s in found.sections
+        (s.kind, *_root(s.zero), *_root(s.pole), number(s.depth_db, 4)) for s in found.sections
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
@@ -210,10 +210,6 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
         " A negative ζ, or a negative frequency of a single root, is one in the right half plane."
     )
     return Words(words), Table(head, rows)
-
-
-def _depth(value: float | None) -> str:
-    return "" if value is None else number(value, 4)
 
 
 def _root(root: Root | None) -> tuple[str, str]:

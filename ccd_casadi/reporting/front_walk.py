@@ -14,11 +14,9 @@ MOST = 12  # designs that are drawn
 
 
 def front_walk(run: FinishedRun, front: Front) -> tuple[Steps, ...]:
-    """Nothing where no point has a design."""
+    """From the lightest to the fastest."""
     problem = run.problem
-    points = [point for point in front.points if np.isfinite(point.bandwidth)]
-    if not points:
-        return ()
+    points = front.points
     chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
     shown = [points[i] for i in chosen]
     steps = tuple(
@@ -46,7 +44,7 @@ def _machine(problem: CoDesignProblem, point: FrontPoint) -> Place:
 def _words(problem: CoDesignProblem, point: FrontPoint) -> str:
     theta = dict(zip(problem.names, point.theta, strict=True))
     named = theta_words({"theta": theta, "units": problem.parameter_units})
-    state = "verified" if point.verified else f"not verified: {point.reason}"
+    state = "verified" if point.verified else "not verified"
     held = f"; at {', '.join(point.active)}" if point.active else ""
     return (
         f"f = {f'{number(point.hardware_cost, 4)} {problem.cost_unit}'.strip()}, {named}: "

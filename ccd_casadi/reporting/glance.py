@@ -19,15 +19,15 @@ HEIGHT = 3.0  # inches of a row
 
 
 def glance(
-    problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: tuple[Lines, str, Table]
+    problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: Figure
 ) -> Section:
     """Of a design on the plants that it is made for."""
-    error, caption, numbers = move
+    assert isinstance(move.drawing, Lines)
     S_max, several = problem.inner.S_max, len(view.open) > 1
     names = ("the model", "other plants") if view.scalar else ("an eigenvalue of L", "the others")
     rows: tuple[tuple[Place, ...], ...] = (
         (machine(problem, theta), S_panel(view)),
-        (nyquist_panel(view.hz, loci(view), S_max, HEIGHT, names), error.rows[0][-1]),
+        (nyquist_panel(view.hz, loci(view), S_max, HEIGHT, names), move.drawing.rows[-2][0]),
     )
     peak = float(view.sizes[0].max())
     on = (
@@ -38,7 +38,7 @@ def glance(
         f"The machine at this design{on}. S stays out of the shaded area: its peak, "
         f"{number(peak, 4)}, is {100.0 * peak / S_max:.4g} % of S_max, so that "
         f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
-        f"from -1 in the Nyquist plot.{margin_words(view)} {caption}"
+        f"from -1 in the Nyquist plot.{margin_words(view)} {move.caption}"
     )
     head, columns = ["Hz", f"largest {view.named('S')}"], [view.sizes[0].max(axis=0)]
     if view.scalar:
@@ -46,7 +46,7 @@ def glance(
         head, columns = [*head, "Re L", "Im L"], [*columns, L.real, L.imag]
     table = over_frequency(head, view.hz, *columns, special=marked(view))
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
-    return Section("At a glance", (Figure(lines, words, (table, numbers)),))
+    return Section("At a glance", (Figure(lines, words, (table, *move.tables)),))
 
 
 def loci(view: LoopView) -> list[np.ndarray]:

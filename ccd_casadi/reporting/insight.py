@@ -88,16 +88,13 @@ def front_figure(
     """
     cost = np.array([point.hardware_cost for point in front.points])
     hz = np.array([point.bandwidth for point in front.points]) / HZ
-    good = np.array([point.efficient and point.verified for point in front.points])
-    failed = np.array([not point.verified for point in front.points])
+    good = np.array([point.verified for point in front.points])
     curves = [
-        Curve(cost, hz, "fastest at this cost", GREY, marker="."),
-        Curve(
-            cost[good], hz[good], "efficient: nothing is lighter and faster", line="", marker="o"
-        ),
+        Curve(cost, hz, "", GREY, marker="."),
+        Curve(cost[good], hz[good], "the best design for some weights", line="", marker="o"),
     ]
-    if failed.any():
-        curves.append(Curve(cost[failed], hz[failed], "not verified", CYCLE[1], "", "x"))
+    if not good.all():
+        curves.append(Curve(cost[~good], hz[~good], "not stationary", CYCLE[1], "", "x"))
     mark = Mark(design[0], design[1], design[2], "+", offset=(8.0, 3.0))
     top = Panel("", "bandwidth ω_b (Hz)", tuple(curves), marks=(mark,))
     low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
@@ -107,29 +104,29 @@ def front_figure(
         for i, name in enumerate(problem.names)
     )
     bottom = Panel(cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
-    title = "Largest bandwidth at each hardware cost, and the hardware that reaches it"
+    title = "Hardware cost against bandwidth as the weights of J change, and the hardware there"
     lines = Lines(((top,), (bottom,)), title, (3.3, 2.8))
     return Figure(lines, _caption(front), (_table(problem, front),))
 
 
 def _caption(front: Front) -> str:
-    """How many points, how well they are known, and what the trade-off comes to."""
-    points = front.points
-    verified = sum(point.verified for point in points)
-    efficient = [point for point in points if point.efficient and point.verified]
-    words = (
-        f"{verified} of {len(points)} points verified by the true inner problem, in {front.rounds} "
-        f"rounds of prediction and truth, {front.syntheses} true syntheses. "
+    """How many points, how well they are known, and what lies between them."""
+    verified = sum(point.verified for point in front.points)
+    between = (
+        "Local solves found no weights that lead to a design between two of them."
+        if front.whole
+        else "More points are possible between them (--points)."
     )
-    return words + (
-        f"{len(efficient)} of them {'is' if len(efficient) == 1 else 'are'} efficient: no other is "
-        "as light and as fast. The curve shows what every further unit of cost gains or loses."
+    return (
+        f"{verified} of {len(front.points)} points verified by the true inner problem, "
+        f"{front.syntheses} true syntheses. Each is the optimum of J for some weights: none found "
+        f"is as light and as fast. {between}"
     )
 
 
 def front_answer(problem: CoDesignProblem, front: Front) -> str:
     """What the front says of weight against bandwidth, in one sentence."""
-    efficient = [point for point in front.points if point.efficient and point.verified]
+    efficient = [point for point in front.points if point.verified]
     unit = problem.cost_unit
     costs = [f"{number(p.hardware_cost)} {unit}".strip() for p in efficient]
     hz = [f"{number(p.bandwidth / HZ, 4)} Hz" for p in efficient]
@@ -150,14 +147,13 @@ def _table(problem: CoDesignProblem, front: Front) -> Table:
     """One row a point."""
     axes = theta_axes(problem)
     rows = tuple(
-        (point.hardware_cost, point.bandwidth / HZ, point.predicted / HZ,
+        (point.hardware_cost, point.bandwidth / HZ,
          *(factor * v for (*_, factor), v in zip(axes, point.theta, strict=True)),
-         ", ".join(point.active), "efficient" if point.efficient else "",
-         "verified" if point.verified else point.reason)
+         ", ".join(point.active), "verified" if point.verified else "not verified")
         for point in front.points
     )  # fmt: skip
     heads = (axis_label(name, unit) for name, unit, _ in axes)
-    head = ("f", "ω_b (Hz)", "predicted (Hz)", *heads, "what binds", "", "status")
+    head = ("f", "ω_b (Hz)", *heads, "what binds", "status")
     return Table(head, rows)
 
 

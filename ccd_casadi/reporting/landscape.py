@@ -11,7 +11,6 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
-from surrogates.quality import Missed
 
 GRID = 25  # points per parameter of a landscape
 COARSER = 17  # the same where there are many samples
@@ -53,13 +52,8 @@ def landscape_data(
         half, at = radius * (upper - lower), np.asarray(theta)
         low, high = np.maximum(lower, at - half), np.minimum(upper, at + half)
         region = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-    label = "true ω_b*(θ), same colours"
-    known = {
-        tuple(t): float(hz)
-        for t, hz in zip(truths.theta.tolist(), truths.bandwidth_hz, strict=True)
-    }
-    if process is None:
-        known, label = best_designs(problem, truths), "best feasible ω_b, same colours"
+    label = "best feasible ω_b" if process is None else "true ω_b*(θ)"
+    known = known_bandwidths(problem, process, truths)
     single = {s.theta for s in truths.designs} - set(known)
     i, j = axes
     return Landscape(
@@ -70,14 +64,18 @@ def landscape_data(
         bandwidth_hz=field,
         truths=np.array([(t[i], t[j], hz) for t, hz in known.items()]).reshape(-1, 3),
         designs=np.array([(t[i], t[j]) for t in sorted(single)]).reshape(-1, 2),
-        truth_label=label,
+        truth_label=f"{label}, same colours",
         forbidden=forbidden,
         region=region,
     )
 
 
-def best_designs(problem: CoDesignProblem, truths: Truths) -> dict[tuple[float, ...], float]:
-    """θ -> the largest ω_b in Hz of the feasible designs there: ω_b* is at least that."""
+def known_bandwidths(
+    problem: CoDesignProblem, process: GaussianProcess | None, truths: Truths
+) -> dict[tuple[float, ...], float]:
+    """θ -> true ω_b* in Hz; without a surrogate of it the largest of the feasible designs there."""
+    if process is not None:
+        return dict(zip(map(tuple, truths.theta.tolist()), truths.bandwidth_hz, strict=True))
     best: dict[tuple[float, ...], float] = {}
     for s in truths.designs:
         if feasible(problem, s):
@@ -118,30 +116,16 @@ def caption_disagreement(
     process: GaussianProcess | None,
     truths: Truths,
     design: tuple[float, ...],
-    missed: Missed | None = None,
 ) -> str:
-    """How far the surrogate's ω_b* is from the true one where it was not fitted to it.
-
-    `missed`: by how much the samples around the design do so, left out.
-    """
+    """How far the surrogate's ω_b* is from the true one where it was not fitted to it."""
     if process is None:
         return ""
-    words = (
-        f" The surrogate of ω_b was fitted to {len(process.X)} samples"
-        f"{' with gradients' if process.has_gradients else ''}; left out one by one, they are "
-        f"predicted to {number(process.loo.rms / HZ, 2)} Hz (root mean square)."
-    )
-    if missed is not None:
-        words += (
-            f" Left out, {missed.where} is missed by {number(abs(missed.error), 2)} Hz: around the "
-            "design believe the colours, and their slope, no better than that."
-        )
     known = np.isfinite(truths.bandwidth_hz)
     unit = (truths.theta - process.lower) / (process.upper - process.lower)
     gaps = np.abs(unit[:, None, :] - process.X[None, :, :]).max(axis=2)
     known &= gaps.min(axis=1) > 1e-9  # it interpolates its own samples
     if not known.any():
-        return words
+        return ""
     theta, truth = truths.theta[known], truths.bandwidth_hz[known]
     error = 100.0 * np.abs(process.predict(theta) / HZ / truth - 1.0)
     worst = int(error.argmax())
@@ -152,7 +136,7 @@ def caption_disagreement(
     width = np.subtract(problem.upper, problem.lower)
     away = float((np.abs(theta - np.array(design)) / width).max(axis=1).min())
     return (
-        f"{words} Where the true ω_b* is known besides ({len(error)} θ, the nearest "
+        f" Where the true ω_b* is known besides ({len(error)} θ, the nearest "
         f"{100.0 * away:.2g} % of the box away from the design) it is off by at most "
         f"{number(float(error[worst]), 2)} % (at {place}), {number(float(np.median(error)), 2)} % "
         "in the median."

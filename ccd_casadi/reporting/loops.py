@@ -63,6 +63,14 @@ def over_hz(label: str, curves: Sequence[Curve], ends: tuple[float, float], **mo
     return Panel("frequency (Hz)", label, tuple(curves), log_x=True, x_range=ends, **kept)
 
 
+def of_plants(x: Array, values: Array) -> tuple[tuple[Curve], tuple[Band, ...]]:
+    """The model's curve, the first row, and the band of all plants where there are several."""
+    if len(values) == 1:
+        return (Curve(x, values[0]),), ()
+    band = Band(x, values.min(axis=0), values.max(axis=0), "all plants")
+    return (Curve(x, values[0], "the model"),), (band,)
+
+
 def bandwidth_level(hz: float, colour: str = GREY, text: str = "") -> Level:
     """ω_b on the axis of frequency."""
     return Level(hz, f"ω_b {number(hz, 4)} Hz{text}", True, colour)
@@ -76,7 +84,7 @@ def sensitivity_panel(
     levels = [Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY)]
     levels += [replace(level, text="") for level in at]
     words = tuple(Mark(v.value, 2**-0.5, v.text, "", v.colour, (8.0, -8.0)) for v in at)
-    kept = {"legend": "lower right", **more, "marks": (*more.get("marks", ()), *words)}
+    kept = {**more, "marks": (*more.get("marks", ()), *words)}
     return over_hz(label, curves, ends, levels=tuple(levels), **kept)
 
 
@@ -101,16 +109,16 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
     found: dict[str, Any] = {}
     for view, colour in zip(views, CYCLE * len(views), strict=False):
         size, bound = view.sizes[i], view.bounds[i]
-        several = len(size) > 1
-        label = view.label or ("the model" if several else view.named(name))
-        curves.append(Curve(view.hz, size[0] if alone else size.max(axis=0), label, colour))
+        if alone and len(size) > 1:
+            own, found["bands"] = of_plants(view.hz, size)
+            curves.append(replace(own[0], label=view.label or own[0].label))
+        else:
+            label = view.label or view.named(name)
+            curves.append(Curve(view.hz, size.max(axis=0), label, colour))
         if bounds and np.isfinite(bound).any():
             words = view.bounded.words[i] if alone else ""
-            own = ORANGE if view.bounded.asked and alone else colour
-            curves.append(Curve(view.hz, bound, words, own, "--", width=0.9))
-        if alone and several:
-            low, high = size.min(axis=0), size.max(axis=0)
-            found["bands"] = (Band(view.hz, low, high, "all plants"),)
+            look = ORANGE if view.bounded.asked and alone else colour
+            curves.append(Curve(view.hz, bound, words, look, "--", width=0.9))
         if i == 0:
             marks += _peak_marks(_high_peaks(view), colour)
     at = [bandwidth_level(view.bandwidth_hz, GREY if alone else colour)
@@ -146,12 +154,10 @@ def figure_gains(views: Sequence[LoopView], *, bounds: bool = True) -> Lines:
 
 def compliance_panel(view: LoopView, most: float) -> Panel:
     """|GS| of the model in a band of all plants, with its bound in m/N."""
-    GS = 1e6 * view.sizes[3]
-    bands = (Band(view.hz, GS.min(axis=0), GS.max(axis=0), "all plants"),)
+    curves, bands = of_plants(view.hz, 1e6 * view.sizes[3])
     level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
-    return over_hz(f"{view.named('GS')} (µm/N)", (Curve(view.hz, GS[0], "the model"),), view.ends,
-                   levels=(level,), bands=bands if len(GS) > 1 else (), legend="lower right",
-                   )  # fmt: skip
+    label = f"{view.named('GS')} (µm/N)"
+    return over_hz(label, curves, view.ends, levels=(level,), bands=bands)
 
 
 def margin_words(view: LoopView) -> str:

@@ -1,6 +1,6 @@
 """A move and a step of force of a design on every plant of its set; a move on the machine."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -31,63 +31,56 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import counted, number, shown, shown_unit
 
-AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
 STEPS = 200  # points of it
 DRAWN = 1200  # points of a curve of a move on the machine
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
+FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
+    "settled after, ms": lambda m: 1e3 * m.settled,
+    "RMS error, µm": lambda m: 1e6 * m.rms_error,
+    "peak error, µm": lambda m: 1e6 * m.peak_error,
+    "last error, µm": lambda m: 1e6 * m.last_error(WATCHED),
+    "peak force, N": lambda m: float(m.peak_force.max()),
+    "at the limit, %": lambda m: 100.0 * m.saturated,
+}
 
 
-def move_parts(
+def move_figure(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
     loops: Sequence[Loop], bandwidth_hz: float,
-) -> tuple[Lines, str, Table]:  # fmt: skip
-    """Error of the case's move, or of the default one of `robustness`, on the plants of `loops`,
-    their rigid bodies free: without and with feedforward (the last panel), its words and numbers.
-    """
+) -> Figure:  # fmt: skip
+    """The case's move, or the default one of `robustness`, on the plants of `loops`, their rigid
+    bodies free: without and with feedforward."""
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
         profile, window = motion.cycle.profile, motion.motion.window
-        name, other = "feedforward up to snap", "the move of [move]"
+        name, other = "with feedforward up to snap", "the move of [move]"
         ahead: Array | None = motion.forward
     else:
         profile, window = setpoint(LIMITS), WINDOW
         modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
-        name, ahead = "mass feedforward", mass_feedforward(modal, 0)
+        name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
         other = "for other moves [move] of the case, or the options of robustness"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     free = free_loops(problem, theta, controller)
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=bandwidth_hz)  # fmt: skip
-    end = profile.duration
-    time = np.linspace(0.0, (1.0 + AFTER) * end, POINTS)
-    panels, words, columns, heads = [], [], [1e3 * time], ["ms"]
-    for name, made in zip(ways, found, strict=True):
-        error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made])
-        panels.append(over_plants(
-            1e3 * time, error, f"error, {name} (µm)", legend="upper right",
-            levels=(Level(1e3 * end, "end of the move", True, GREY),
-                    *(Level(side * 1e6 * window, "") for side in (-1.0, 1.0))),
-        ))  # fmt: skip
-        columns += _columns(error)
-        heads += [f"µm, {name}", "least", "largest"] if len(error) > 1 else [f"µm, {name}"]
-        words.append(_words(name, made))
-    sampled = loops[0].sampling is not None
-    how = "hold and delay exact, at the instants" if sampled else "continuous loop"
-    where = "without the suspension" if found[0][0].free else "on the soft suspension"
-    caption = (
-        f"{number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in {number(1e3 * end, 4)} ms "
-        f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; {other}). "
-        f"{' '.join(words)}"
+    end, model = profile.duration, found[0][0]
+    several = " on every plant of the set (band), the largest of all in words and numbers"
+    words = (
+        f"{number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in {number(1e3 * end, 4)} ms"
+        f"{several if len(loops) > 1 else ''}, "
+        f"{'without the suspension' if model.free else 'on the soft suspension'} "
+        f"({'continuous loop' if loops[0].sampling is None else 'hold and delay exact'}; {other})."
     )
-    lines = Lines((tuple(panels),), "Error of a move", (3.2,))
-    return lines, caption, over_time(heads, *columns)
+    return ways_figure(dict(zip(ways, found, strict=True)), words)
 
 
 def cycle_section(
@@ -143,7 +136,8 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
-    panel = over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
+    curves, bands = of_plants(1e3 * t, y)
+    panel = Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
     head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
     on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
         "the stage, until it rests"
@@ -153,83 +147,63 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     return Figure(lines, words, (over_time(head, 1e3 * t, *_columns(y)),))
 
 
-def over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:
-    """The model's in a band of all."""
-    several = len(values) > 1
-    curve = Curve(ms, values[0], "the model" if several else "")
-    band = Band(ms, values.min(axis=0), values.max(axis=0), "all plants")
-    return Panel("time (ms)", label, (curve,), (band,) if several else (), **more)  # type: ignore[arg-type]
-
-
 def _columns(values: Array) -> list[Array]:
     found = [values[0]]
     return [*found, values.min(axis=0), values.max(axis=0)] if len(values) > 1 else found
 
 
-def _words(name: str, made: Sequence[Move]) -> str:
-    latest = max(move.settling for move in made)
-    several = len(made) > 1
-    settled = (
-        f"settles within ±{number(1e6 * made[0].window)} µm {number(1e3 * latest, 3)} ms after "
-        f"the end{' at the latest' if several else ''}"
-        if np.isfinite(latest)
-        else f"does not settle {'on all plants ' if several else ''}while it is watched"
-    )
-    peak = 1e6 * max(move.peak_error for move in made)
-    force = max(float(move.peak_force.max()) for move in made)
-    return (
-        f"{name[0].upper()}{name[1:]}: error of at most {number(peak, 3)} µm, {settled}, "
-        f"{number(force, 4)} N at most."
-    )
-
-
 def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    ways = {way.words: way.move for way in found.ways}
+    ways = {way.words: [way.move] for way in found.ways}
     words = "The plant has its soft suspension, hold and delay are exact."
     return ways_figure(ways, words), Words(_limit_words(found))
 
 
-def ways_figure(ways: Mapping[str, Move], words: str) -> Figure:
-    """Error and first force of one move made in several ways, and a table; `words` end the
-    caption."""
-    moves = list(ways.values())
-    first, until = moves[0], max(map(shown_until, moves))
+def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
+    """Error and first force of one move made in several ways, each on one plant or on several, the
+    model first, and a table of the largest; `words` end the caption."""
+    made = list(ways.values())
+    first, until = made[0][0], max(shown_until(m) for each in made for m in each)
     end = Level(1e3 * first.duration, "setpoint ends", vertical=True)
-    kept = [(name, m, colour) for (name, m), colour in zip(ways.items(), COLOURS, strict=False)
-            if m.peak_error < 1e3 * first.peak_error]  # fmt: skip
-    top = max(m.peak_error for _, m, _ in kept)
+    peaks = [max(m.peak_error for m in each) for each in made]
+    kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False)
+            if way[2] < 1e3 * peaks[0]]  # fmt: skip
+    top = max(peak for _, _, peak, _ in kept)
+    time = np.linspace(0.0, until, DRAWN)
+    ms, numbers = 1e3 * time, {}
     panels, force = [], []
     for large in (True, False):  # those that are flat beside the large ones by themselves
-        same = [way for way in kept if (FLAT * way[1].peak_error > top) == large]
-        unit, scale = shown_unit("m", max((m.peak_error for _, m, _ in same), default=0.0))
-        curves = []
-        for name, m, colour in same:
-            at = np.flatnonzero(m.time <= until)
-            at = at[np.unique(np.linspace(0, at.size - 1, DRAWN).astype(int))]
-            ms = 1e3 * m.time[at]
-            curves.append(Curve(ms, scale * _error(m)[at], name, colour))
-            force.append(Curve(ms, m.force[at, 0], "", colour))
+        same = [way for way in kept if (FLAT * way[2] > top) == large]
+        unit, scale = shown_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
+        curves, bands = [], []
+        for name, each, _, colour in same:
+            error = scale * np.array([_over(time, e, _error(e)) for e in each])
+            curves.append(Curve(ms, error[0], name, colour))
+            force.append(Curve(ms, _over(time, each[0], each[0].force[:, 0]), "", colour))
+            numbers[f"{unit}, {name}"] = error[0]
+            if len(each) > 1:
+                bands.append(Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
         if curves:
-            panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), levels=(end,),
-                                legend="upper right"))  # fmt: skip
+            panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
+                                levels=(end,)))  # fmt: skip
     heights = (*[2.6] * len(panels), 2.2)
     panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
     lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
-    head = ("way", "settled after, ms", "RMS error, µm", "peak error, µm", "last error, µm",
-            "peak force, N", "at the limit")  # fmt: skip
     rows = tuple(
-        (name, "not" if np.isinf(m.settled) else number(1e3 * m.settled), 1e6 * m.rms_error,
-         1e6 * m.peak_error, 1e6 * m.last_error(WATCHED), float(m.peak_force.max()),
-         f"{100.0 * m.saturated:.3g} %")
-        for name, m in ways.items()
-    )  # fmt: skip
+        (name, *(max(map(read, each)) for read in FIGURES.values())) for name, each in ways.items()
+    )
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
-        f"{ends}. Settled is what stays within {shown(first.window, 'm')}; the last error in the "
-        f"data below is the largest over the last quarter. {words}"
+        f"{ends[:1].upper()}{ends[1:]}. Settled is what stays within {shown(first.window, 'm')}; "
+        f"the last error in the data below is the largest over the last quarter. {words}"
     )
-    return Figure(lines, caption, (Table(head, rows),))
+    table = over_time(("ms", *numbers), ms, *numbers.values())
+    return Figure(lines, caption, (Table(("way", *FIGURES), rows), table))
+
+
+def _over(time: Array, m: Move, values: Array) -> Array:
+    """A move's values at other times; NaN where it was watched no longer."""
+    return np.interp(time, m.time, values, right=np.nan)
 
 
 def _error(m: Move) -> Array:
@@ -242,12 +216,13 @@ def shown_until(found: Move) -> float:
     return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
 
 
-def way_words(name: str, m: Move, until: float = np.inf) -> str:
+def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
-    when = "does not settle" if np.isinf(m.settled) else f"settled after {shown(m.settled, 's')}"
-    words = f"{name}: {when}, error of at most {shown(m.peak_error, 'm')}"
-    after = np.abs(_error(m)[m.time > until])
-    if not after.size or m.settled <= until:
+    settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
+    when = "does not settle" if np.isinf(settled) else f"settled after {shown(settled, 's')}"
+    words = f"{name}: {when}, error of at most {shown(peak, 'm')}"
+    after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
+    if not after.size or settled <= until:
         return words
     return f"{words}, of {shown(float(after.max()), 'm')} after the figure's end"
 

@@ -39,7 +39,7 @@ def nyquist_panel(
     arrows, marks = _along(hz, loci[0], half)
     return Panel(
         "Re L (–)", "Im L (–)", (*curves, *arrows), marks=(Mark(-1.0, 0.0, marker="+"), *marks),
-        x_range=SHOWN, y_range=(-half, half), legend="lower right",
+        x_range=SHOWN, y_range=(-half, half),
         forbidden=(Area(disk.real, disk.imag),),
     )  # fmt: skip
 

@@ -13,7 +13,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
-DRAWN = 1500  # points of a curve in time
 
 
 def named(run: FinishedRun, name: str) -> str:

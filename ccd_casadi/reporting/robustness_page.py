@@ -88,8 +88,7 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         step = f"{1e6 * run.sampling.period:.5g} µs"
         words.append(
             f"A controller in discrete time, a step every {step}, hold and "
-            "delay exact at the instants; noise and the structured singular value are of "
-            "continuous ones."
+            "delay exact at the instants; the structured singular value is of continuous ones."
         )
     return words
 
@@ -256,7 +255,7 @@ def _move(found: Study) -> Section:
         if found.moves[0].free
         else "on its soft suspension, without which the loop is not stable"
     )
-    ways = {"with mass feedforward" if m.feedforward else "without feedforward": m
+    ways = {"with mass feedforward" if m.feedforward else "without feedforward": [m]
             for m in found.moves}  # fmt: skip
     words = (
         f"A fourth-order setpoint for output {found.demands.axis + 1}, simulated exactly on the "

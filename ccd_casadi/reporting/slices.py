@@ -1,6 +1,7 @@
 """ω_b*(θ) along each parameter through the optimum, for one parameter or more than two."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,134 +9,79 @@ from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel,
 from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
-from ccd_casadi.reporting.true_samples import Truths, feasible
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.reporting.landscape import known_bandwidths
+from ccd_casadi.reporting.true_samples import Truths
 from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
+from surrogates.gaussian_process import TWO_SIDED_95
 
 SLICE = 61
 NEARBY = 0.1  # share of the box within which a sample is shown beside a slice
 TABLE_STEP = 4
 
 
-@dataclass(frozen=True)
-class Slice:
-    """ω_b* in Hz along one parameter through the optimum; the band is 95 %. `near`: (θ_i, Hz)."""
+def slices_figure(
+    problem: CoDesignProblem, process: GaussianProcess | None, truths: Truths,
+    theta: Sequence[float], best_hz: float, extra: str,
+) -> Figure | None:  # fmt: skip
+    """One small panel a parameter: prediction, its 95 % band, and the truths nearby.
 
-    name: str
-    unit: str
-    theta: Array
-    bandwidth_hz: Array
-    deviation_hz: Array
-    near: Array
-    optimum: float
-
-
-def slices_data(
-    problem: CoDesignProblem,
-    process: GaussianProcess | None,
-    truths: Truths,
-    theta: tuple[float, ...],
-) -> list[Slice]:
-    """Along every parameter through θ: prediction, deviation, and the truths nearby.
-
-    Without a surrogate the feasible designs nearby stand for the truths.
+    None where nothing is known. `extra` ends the caption.
     """
-    lower, upper = np.array(problem.lower), np.array(problem.upper)
-    known, values = truths.theta, truths.bandwidth_hz
-    if process is None:
-        inside = [s for s in truths.designs if feasible(problem, s)]
-        known = np.array([s.theta for s in inside]).reshape(-1, len(lower))
-        values = np.array([s.bandwidth / HZ for s in inside])
-    found = []
+    lower, upper, at = (np.array(each, float) for each in (problem.lower, problem.upper, theta))
+    known = known_bandwidths(problem, process, truths)
+    places, values = np.array([*known]).reshape(-1, len(at)), np.array([*known.values()])
+    away = np.abs(places - at) / (upper - lower)
+    panels, tables, seen = [], [], [np.array([best_hz])]
+    spans: dict[str, tuple[float, float]] = {}  # the prediction's, and the band's half width
     for k, (name, unit, factor) in enumerate(theta_axes(problem)):
-        axis = np.linspace(lower[k], upper[k], SLICE)
-        points = np.tile(np.array(theta), (SLICE, 1))
-        points[:, k] = axis
-        empty = np.full(SLICE, np.nan)
-        bandwidth, deviation = (
-            (empty, empty) if process is None else process.predict(points, return_std=True)
-        )
-        away = np.abs((known - np.array(theta)) / (upper - lower))
-        away[:, k] = 0.0
-        near = (away.max(axis=1) <= NEARBY) & np.isfinite(values)
-        dots = np.column_stack([factor * known[near, k], values[near]])
-        at = factor * float(theta[k])
-        hz = bandwidth / HZ, deviation / HZ
-        found.append(Slice(name, unit, factor * axis, *hz, dots, at))
-    return found
-
-
-def slices_figure(slices: list[Slice], best_hz: float, extra: str) -> Figure:
-    """One small panel a parameter; `extra` ends the caption."""
-    caption = _caption(slices, best_hz) + extra
-    return Figure(_lines(slices, best_hz), caption, _tables(slices))
-
-
-def _lines(slices: list[Slice], best_hz: float) -> Lines:
-    """The same vertical axis in all."""
-    values = [best_hz]
-    for item in slices:
-        values += [v for v in (*item.bandwidth_hz, *item.near[:, 1]) if np.isfinite(v)]
-    margin = 0.06 * (max(values) - min(values)) + 1e-3 * max(values)
-    y_range = (min(values) - margin, max(values) + margin)
-    panels: list[Panel | None] = [
-        _panel(item, y_range, legend=i == 0) for i, item in enumerate(slices)
-    ]
-    per_row = 1 if len(panels) == 1 else 4 if len(panels) % 3 else 3
-    panels += [None] * (-len(panels) % per_row)
-    rows = tuple(tuple(panels[i : i + per_row]) for i in range(0, len(panels), per_row))
+        axis, ends = axis_label(name, unit), (factor * lower[k], factor * upper[k])
+        near = (np.delete(away, k, axis=1) <= NEARBY).all(axis=1) & np.isfinite(values)
+        dots = factor * places[near, k], values[near]
+        curves = [Curve(*dots, "truth nearby", GREEN, "", "o")] if near.any() else []
+        bands, table = [], Table.of((axis, "true ω_b (Hz)"), *dots)
+        seen.append(values[near])
+        if process is not None:
+            points = np.tile(at, (SLICE, 1))
+            points[:, k] = np.linspace(lower[k], upper[k], SLICE)
+            hz, deviation = (each / HZ for each in process.predict(points, return_std=True))
+            x, half = factor * points[:, k], TWO_SIDED_95 * deviation
+            curves.insert(0, Curve(x, hz, "surrogate"))
+            bands = [Band(x, hz - half, hz + half, "95 % band")]
+            columns = (column[::TABLE_STEP] for column in (x, hz, half))
+            table = Table.of((axis, "ω_b* (Hz)", "± 95 % (Hz)"), *columns)
+            spans[name] = float(np.ptp(hz)), float(half.max())
+            seen.append(hz)
+        optimum = Level(factor * at[k], "" if k else "optimum", True, GREY)
+        panels.append(Panel(
+            axis, "largest bandwidth ω_b* (Hz)", tuple(curves), tuple(bands), levels=(optimum,),
+            x_range=ends, legend=None if k else "best",
+        ))  # fmt: skip
+        tables.append(table)
+    if not any(panel.curves for panel in panels):
+        return None
+    all_hz = np.concatenate(seen)
+    margin = 0.06 * float(np.ptp(all_hz)) + 1e-3 * float(all_hz.max())
+    y_range = (float(all_hz.min()) - margin, float(all_hz.max()) + margin)
+    same = [replace(panel, y_range=y_range) for panel in panels]
+    per_row = 1 if len(same) == 1 else 4 if len(same) % 3 else 3
+    full = [*same, *[None] * (-len(same) % per_row)]
+    rows = tuple(tuple(full[i : i + per_row]) for i in range(0, len(full), per_row))
     heights = (3.2 if len(rows) == 1 else 2.5,) * len(rows)
-    return Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
+    lines = Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
+    return Figure(lines, _caption(spans, len(same) > 1, best_hz) + extra, tuple(tables))
 
 
-def _panel(item: Slice, y_range: tuple[float, float], legend: bool) -> Panel:
-    curves, bands = [], []
-    if np.isfinite(item.bandwidth_hz).any():
-        half = 1.96 * item.deviation_hz
-        low, high = item.bandwidth_hz - half, item.bandwidth_hz + half
-        bands = [Band(item.theta, low, high, "95 % band" if legend else "")]
-        curves = [Curve(item.theta, item.bandwidth_hz, "surrogate" if legend else "")]
-    if len(item.near):
-        label = "truth nearby" if legend else ""
-        curves.append(Curve(item.near[:, 0], item.near[:, 1], label, GREEN, "", "o"))
-    return Panel(
-        axis_label(item.name, item.unit),
-        "largest bandwidth ω_b* (Hz)",
-        tuple(curves),
-        bands=tuple(bands),
-        levels=(Level(item.optimum, "optimum" if legend else "", True, GREY),),
-        x_range=(float(item.theta[0]), float(item.theta[-1])),
-        y_range=y_range,
-    )
-
-
-def _caption(slices: list[Slice], best_hz: float) -> str:
+def _caption(spans: dict[str, tuple[float, float]], many: bool, best_hz: float) -> str:
     """Along which parameter the bandwidth changes most, and how sure the surrogate is."""
-    spans = [(float(np.nanmax(s.bandwidth_hz) - np.nanmin(s.bandwidth_hz)), s) for s in slices
-             if np.isfinite(s.bandwidth_hz).any()]  # fmt: skip
-    many = len(slices) > 1
     words = "ω_b* along each parameter, the others at the optimum" if many else "ω_b*(θ)"
     words += f" ({number(best_hz)} Hz there, dashed line); dots: true values"
     words += f" within {100 * NEARBY:.0f} % of the box." if many else "."
     if not spans:
         return words + " No surrogate is of ω_b*(θ) alone: the dots are the run's own designs."
-    largest, item = max(spans, key=lambda pair: pair[0])
-    widest = max(float(np.max(1.96 * s.deviation_hz)) for _, s in spans)
-    most = "changes most along" if many else "changes along"
-    words += f" It {most} {item.name}, by {number(largest, 3)} Hz over the range"
-    words += f"; the 95 % band is at most ±{number(widest, 2)} Hz"
-    return words + "."
-
-
-def _tables(slices: list[Slice]) -> tuple[Table, ...]:
-    """Every slice, thinned."""
-    found = []
-    for s in slices:
-        head: tuple[str, ...] = (axis_label(s.name, s.unit), "true ω_b (Hz)")
-        columns = s.near.T
-        if np.isfinite(s.bandwidth_hz).any():
-            head = (axis_label(s.name, s.unit), "ω_b* (Hz)", "± 95 % (Hz)")
-            columns = np.array([s.theta, s.bandwidth_hz, 1.96 * s.deviation_hz])[:, ::TABLE_STEP]
-        found.append(Table.of(head, *columns))
-    return tuple(found)
+    most = max(spans, key=lambda name: spans[name][0])
+    return (
+        f"{words} It changes {'most ' if many else ''}along {most}, by "
+        f"{number(spans[most][0], 3)} Hz over the range; the 95 % band is at most "
+        f"±{number(max(half for _, half in spans.values()), 2)} Hz."
+    )

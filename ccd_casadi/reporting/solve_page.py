@@ -24,7 +24,6 @@ from ccd_casadi.drawing.content import (
     Figure,
     Head,
     Heading,
-    Lines,
     Page,
     Section,
     Source,
@@ -51,7 +50,7 @@ from ccd_casadi.reporting.landscape import (
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
-from ccd_casadi.reporting.moves import cycle_section, force_step, move_parts
+from ccd_casadi.reporting.moves import cycle_section, force_step, move_figure
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
     binding_words,
@@ -60,7 +59,7 @@ from ccd_casadi.reporting.sections_page import (
     limits_blocks,
     sections_facts,
 )
-from ccd_casadi.reporting.slices import slices_data, slices_figure
+from ccd_casadi.reporting.slices import slices_figure
 from ccd_casadi.reporting.start import start_section
 from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import table_trust, trust_figure
@@ -161,17 +160,13 @@ def design_parts(
     loops = cache(lambda: design_loops(own, theta, K))
 
     @cache
-    def move() -> tuple[Lines, str, Table]:
-        return move_parts(own, theta, K, loops(), view().bandwidth_hz)
-
-    def move_section() -> list[Section]:
-        lines, caption, table = move()
-        return [Section("A move", (Figure(lines, caption, (table,)),))]
+    def move() -> Figure:
+        return move_figure(own, theta, K, loops(), view().bandwidth_hz)
 
     parts: dict[str, Part] = {
         "glance": lambda: [glance(own, theta, view(), move())],
         "design": lambda: [design_section(problem, result)],
-        "move": move_section,
+        "move": lambda: [Section("A move", (move(),))],
         "motor": lambda: cycle_section(own, theta, result),
         "force": lambda: [Section("A step of force", (force_step(loops(), view().bandwidth_hz),))],
         "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
@@ -210,8 +205,7 @@ def _theta(
     iterates = solution.outcome.iterates
     process = bandwidth_process(solution.outcome.surrogates)
     best = float(solution.result["bandwidth_hz"])
-    missed = solution.quality[0].missed if solution.quality else None
-    extra = caption_disagreement(problem, process, truths, verified.theta, missed)
+    extra = caption_disagreement(problem, process, truths, verified.theta)
     if len(problem.names) == 2:
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, process, truths, radius, verified.theta)
@@ -220,11 +214,9 @@ def _theta(
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
         figure = Figure(land, caption_landscape(land, best) + extra, tables_landscape(land))
         return Section("Bandwidth over the hardware", (figure,))
-    slices = slices_data(problem, process, truths, verified.theta)
-    if not any(len(s.near) or np.isfinite(s.bandwidth_hz).any() for s in slices):
-        words = "There is no surrogate, and no design near the optimum to show in its place."
-        return Section("Bandwidth over the hardware", (Words(words),))
-    return Section("Bandwidth over the hardware", (slices_figure(slices, best, extra),))
+    slices = slices_figure(problem, process, truths, verified.theta, best, extra)
+    words = "There is no surrogate, and no design near the optimum to show in its place."
+    return Section("Bandwidth over the hardware", (slices or Words(words),))
 
 
 def stage_sections(

@@ -1,6 +1,6 @@
 """The controller on plants off the model: shifted resonances and other damping."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -76,12 +76,11 @@ def shift_line(
     run: FinishedRun, system: Mechanics, reach: float, count: int = 41, quiet: bool = True
 ) -> Line:
     """All flexible frequencies times 1 + s, |s| <= reach."""
-    places = np.unique(np.append(np.linspace(-reach, reach, count), 0.0))
-    loops = _loops(run, system)
+    shifts = np.unique(np.append(np.linspace(-reach, reach, count), 0.0))
     marks = [abs(end) for end in kind_of(run.problem).common_shifts()]
-    ends = _ends(run, loops, lambda f: shift_range(loops, f, reach, marks), 0.0)
-    with Progress(len(places), "resonance shifts", quiet=quiet) as progress:
-        return Line(_judged(run, system, [(s, 1.0) for s in places], 0, progress), *ends)
+    places = {float(s): Perturbation(float(s)) for s in shifts}
+    return _line(run, system, places, 0.0, partial(shift_range, limit=reach, marks=marks),
+                 Progress(len(places), "resonance shifts", quiet=quiet))  # fmt: skip
 
 
 def damping_line(
@@ -93,40 +92,31 @@ def damping_line(
     quiet: bool = True,
 ) -> Line:
     """Damping times d, low <= d <= high; evenly in its logarithm."""
-    places = np.exp(np.unique(np.append(np.linspace(np.log(low), np.log(high), count), 0.0)))
-    loops = _loops(run, system)
-    ends = _ends(run, loops, lambda f: damping_range(loops, f, (low, high)), 1.0)
-    with Progress(len(places), "damping", quiet=quiet) as progress:
-        return Line(_judged(run, system, [(0.0, d) for d in places], 1, progress), *ends)
+    factors = np.exp(np.unique(np.append(np.linspace(np.log(low), np.log(high), count), 0.0)))
+    places = {float(d): Perturbation(0.0, float(d)) for d in factors}
+    return _line(run, system, places, 1.0, partial(damping_range, limits=(low, high)),
+                 Progress(len(places), "damping", quiet=quiet))  # fmt: skip
 
 
-def _loops(run: FinishedRun, system: Mechanics) -> LoopsOffModel:
-    """The loops of which the verdict of a solve reads its ranges."""
-    return loops_off_model(system, run.problem.suspension, run.controller, run.sampling)
-
-
-def _ends(
-    run: FinishedRun, loops: LoopsOffModel, search: Callable[[Figure], Ends], model: float
-) -> tuple[Ends, Ends]:
-    """Between what the loop is stable, and within S_max; the model's place where not even there."""
-    nominal, nothing = loops.at(Perturbation()), (model, model)
-    if not nominal.stable:
-        return nothing, nothing
-    level = run.problem.inner.S_max * (1.0 + kind_of(run.problem).slack)
-    excess = partial(excess_of, level=level)
-    return search(growth_of), search(excess) if excess(nominal) <= 0.0 else nothing
-
-
-def _judged(
-    run: FinishedRun, system: Mechanics, places: list[tuple[float, float]], shown: int,
-    progress: Progress,
-) -> tuple[Judged, ...]:  # fmt: skip
-    found = []
-    for place in places:
-        off = Perturbation(float(place[0]), float(place[1]))
-        found.append(judge(run, _modal(run, system, off), (float(place[shown]),)))
-        progress.advance()
-    return tuple(found)
+def _line(
+    run: FinishedRun, system: Mechanics, places: Mapping[float, Perturbation], model: float,
+    search: Callable[[LoopsOffModel, Figure], Ends], progress: Progress,
+) -> Line:  # fmt: skip
+    """The plants at these places, and between what the loop is stable, and within S_max, by the
+    search that the verdict of a solve makes; `model`: its place, where not even there."""
+    loops = loops_off_model(system, run.problem.suspension, run.controller, run.sampling)
+    nominal, stable, within = loops.at(Perturbation()), (model, model), (model, model)
+    excess = partial(excess_of, level=run.problem.inner.S_max * (1.0 + kind_of(run.problem).slack))
+    if nominal.stable:
+        stable = search(loops, growth_of)
+        within = search(loops, excess) if excess(nominal) <= 0.0 else within
+    judged = []
+    with progress:
+        for place, off in places.items():
+            modal = modal_plant(system, run.problem.suspension, off)
+            judged.append(judge(run, modal, (place,)))
+            progress.advance()
+    return Line(tuple(judged), stable, within)
 
 
 def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Judged, ...]:
@@ -158,15 +148,11 @@ def worst_in_box(
 
     def at(x: Array) -> Judged:
         s, d = float(x[0]), float(np.exp(x[1]))
-        return judge(run, _modal(run, system, Perturbation(s, d)), (s, d))
+        return judge(run, modal_plant(system, run.problem.suspension, Perturbation(s, d)), (s, d))
 
     grid = [np.array([s, d]) for s in np.linspace(low[0], high[0], 9)
             for d in np.linspace(low[1], high[1], 5)]  # fmt: skip
     return search(at, grid, low, high, "shift and damping", quiet)
-
-
-def _modal(run: FinishedRun, system: Mechanics, perturbation: Perturbation) -> ModalPlant:
-    return modal_plant(system, run.problem.suspension, perturbation)
 
 
 def search(

@@ -97,7 +97,13 @@ def robustness(
         peaks=highest(sizes, HZ * hz) if sampled else norms(loop.closed),
         margins=margins(loop.responses, hz),
         noise=noise(loop, d.sensor, d.disturbance),
-        statics=_statics(run),
+        statics=statics(
+            run.plant.plant_si(),
+            run.controller,
+            bandwidth=run.figures.bandwidth,
+            omega_low=run.problem.inner.omega_low,
+            period=0.0 if run.sampling is None else run.sampling.period,
+        ),
         shift=shift_line(run, system, d.shift, quiet=quiet),
         damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
@@ -111,14 +117,6 @@ def robustness(
         setpoint=profile,
         moves=_moves(run, profile, d),
     )
-
-
-def _statics(run: FinishedRun) -> Statics:
-    return statics(
-        run.plant.plant_si(), run.controller, bandwidth=run.figures.bandwidth,
-        omega_low=run.problem.inner.omega_low,
-        period=0.0 if run.sampling is None else run.sampling.period,
-    )  # fmt: skip
 
 
 def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[Move, ...]:

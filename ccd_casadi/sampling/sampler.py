@@ -73,12 +73,14 @@ class Sampler:
         self.nearest: BandwidthSample | None = None  # of the infeasible ones
         self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # inner problems asked for
 
-    def of(self, problem: CoDesignProblem, *, traced: bool = True) -> "Sampler":
+    def of(
+        self, problem: CoDesignProblem, *, traced: bool = True, quiet: bool = False
+    ) -> "Sampler":
         """One for another problem with the same store, workers and count; and trace, if `traced`.
 
         An easier problem's designs are worth nothing to this one: they are not traced.
         """
-        other = Sampler(problem, self.store, self.workers, quiet=self.quiet)
+        other = Sampler(problem, self.store, self.workers, quiet=quiet or self.quiet)
         other.spent = self.spent
         if traced:
             other.trace = self.trace

@@ -38,7 +38,7 @@ def cost_figure(methods: Sequence[Method]) -> Figure:
         curves_b.append(Curve(*_steps(spent, bandwidth), "", colour, marker=marker))
     x = "true syntheses spent (–)"
     rows = (
-        (Panel(x, "least J so far (–)", tuple(curves_J), log_x=True, legend="upper right"),),
+        (Panel(x, "least J so far (–)", tuple(curves_J), log_x=True),),
         (Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True),),
     )
     lines = Lines(rows, "Objective and bandwidth against the number of true syntheses", (3.6, 2.6))

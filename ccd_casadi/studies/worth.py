@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.case import Case
-from ccd_casadi.codesign.outer_problem import OuterFailure, solve_program
+from ccd_casadi.codesign.nested import fit_bandwidth
+from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
@@ -24,7 +25,7 @@ from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.studies.sequential import design_hardware, first_resonance
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ, number
-from surrogates import design
+from surrogates import design, to_casadi
 
 SECONDS = 20.0  # after which no further round begins
 STARTS = 8  # of IPOPT, on the hardware and on the surrogates
@@ -40,7 +41,8 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     Raises UserError where too few designs are certified to learn from, or none is feasible.
     """
     began, rule = perf_counter(), HZ * case.baseline.first_resonance_hz
-    first_resonance(sampler.problem, np.array(sampler.problem.start))
+    beside = np.array(sampler.problem.start) + 1e-3 * np.subtract(*box(sampler.problem)[::-1])
+    first_resonance(sampler.problem, np.clip(beside, *box(sampler.problem)))  # not the start: known
     slow = (perf_counter() - began) * EVALUATIONS > SECONDS  # finite elements: the start alone
     hardware = design_hardware(
         sampler.problem, rule, starts=0 if slow else STARTS, seed=seed, workers=sampler.workers
@@ -51,31 +53,31 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     spread = design("sobol", *box(problem), LOOKS * count, seed)
     known = sampler.bandwidths(np.array([hardware.theta, problem.start]), "first designs")
     for i in range(0, len(spread), 2 * count):
-        if perf_counter() - began < 0.5 * SECONDS:
+        if i == 0 or perf_counter() - began < 0.5 * SECONDS:
             known += sampler.bandwidths(spread[i : i + 2 * count], "global check")
     best = min(known, key=lambda sample: _value(problem, sample))
-    learner = outer.learner(LOOKS // 2 * len(outer.bounds[0]), seed)
-    learner.begin(None)
-    feasible = [sample for sample in known if sample.feasible]
-    missed = [learner.predicted(learner.point(sample)) - sample.value for sample in feasible]
-    learner.learn(np.array([learner.point(sample) for sample in feasible]), feasible)
+    missed: list[float] = []
     while True:
-        before, starts = _value(problem, best), design("sobol", *learner.bounds, STARTS, seed)
-        if np.isfinite(before):
-            starts = np.vstack([starts, learner.point(best)])
+        before, learnt = _value(problem, best), [sample for sample in known if sample.feasible]
+        if len(learnt) <= count:
+            words = f"only {len(learnt)} of {len(known)} designs in the box were certified"
+            raise UserError(f"no trade-off can be learnt: {words}; widen the bounds")
+        process = fit_bandwidth(problem, learnt, seed, gradients=True)
+        program = nested_program(problem, to_casadi(process, std=False))
+        starts = np.vstack([best.theta, design("sobol", *box(problem), STARTS, seed)])
         try:
-            expected = solve_program(learner.program(), starts).best
-        except OuterFailure:  # the surrogates expect a feasible design nowhere
+            expected = solve_program(program, starts).best
+        except OuterFailure:  # the surrogate expects a feasible design nowhere
             break
-        new = sampler.bandwidths(outer.theta_of(expected.x), "the best expected")[0]
-        missed += [learner.predicted(learner.point(new)) - new.value] if new.feasible else []
+        new = sampler.bandwidths(expected.x, "the best expected")[0]
+        missed += [process.predict(expected.x[None])[0] - new.value] if new.feasible else []
         best = min(best, new, key=lambda sample: _value(problem, sample))
         level = SETTLED * abs(_value(problem, best))
         true = abs(_value(problem, new) - expected.objective) <= level
-        if (true and before - _value(problem, best) <= level) or perf_counter() - began > SECONDS:
+        settled = true and before - _value(problem, best) <= level
+        if settled or new in known or perf_counter() - began > SECONDS:
             break
-        rows = [expected.x, learner.point(new)] if new.feasible else [expected.x]
-        learner.learn(np.array(rows), [new] * len(rows))
+        known.append(new)
     if not np.isfinite(_value(problem, best)):
         raise UserError(f"no feasible design was found: {known[0].shortfall}")
     entries: list[dict[str, Any]] = [
@@ -90,7 +92,7 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     ]
     old, co = entries
     # True designs that the model had not learnt, and those that it is fitted without in turn.
-    error = max(np.abs(missed).max(initial=0.0), SIGMAS * learner.processes[0].loo.rms) / HZ
+    error = max(np.abs(missed).max(initial=0.0), SIGMAS * process.loo.rms) / HZ
     return {
         "sequential": old,
         "co_design": co,

@@ -10,7 +10,31 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.interrupts import pending
 
 
-class VectorCallback(ca.Callback):
+class _Dense(ca.Callback):
+    """The first of some inputs -> a dense output."""
+
+    def __init__(
+        self, name: str, inputs: Sequence[ca.Sparsity], output: ca.Sparsity,
+        values: Callable[[Array], Array], options: Mapping[str, Any],
+    ) -> None:  # fmt: skip
+        ca.Callback.__init__(self)
+        self._inputs, self._output, self._values = inputs, output, values
+        self.construct(name, options)
+
+    def get_n_in(self) -> int:
+        return len(self._inputs)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return self._inputs[i]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return self._output
+
+    def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
+        return [self._values(np.array(arguments[0]).ravel())]
+
+
+class VectorCallback(_Dense):
     """x (n,) -> values (m,) and ∂values (m, n); keep a reference to it while it is in use.
 
     NaN values make IPOPT shorten its step. Hessians are not available, and a quasi-Newton method is
@@ -27,28 +51,15 @@ class VectorCallback(ca.Callback):
         jacobian: Callable[[Array], Array],
         hessians: bool = False,
     ) -> None:
-        ca.Callback.__init__(self)
-        self._sizes, self._hessians = (inputs, outputs), hessians
-        self._values, self._jacobian = values, jacobian
+        column, out = (ca.Sparsity.dense(size, 1) for size in (inputs, outputs))
+        super().__init__(name, [column], out, values, {})
+        self._sizes, self._jacobian, self._hessians = (outputs, inputs), jacobian, hessians
         self._derivative: ca.Callback | None = None
-        self.construct(name, {})
-
-    def get_n_in(self) -> int:
-        return 1
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(self._sizes[0], 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(self._sizes[1], 1)
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
         if pending():  # NaN ends IPOPT quickly; the interrupt is raised when it has returned
-            return [np.full(self._sizes[1], np.nan)]
-        return [self._values(np.array(arguments[0]).ravel())]
+            return [np.full(self._sizes[0], np.nan)]
+        return super().eval(arguments)
 
     def has_jacobian(self) -> bool:
         return True
@@ -57,35 +68,8 @@ class VectorCallback(ca.Callback):
         self, name: str, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]
     ) -> ca.Function:
         more = {"enable_fd": True, "fd_method": "central"} if self._hessians else {}
-        self._derivative = _Jacobian(name, self._sizes, self._jacobian, {**options, **more})
+        inputs = [*self._inputs, ca.Sparsity(self._sizes[0], 1)]  # of its own output none is used
+        self._derivative = _Dense(
+            name, inputs, ca.Sparsity.dense(*self._sizes), self._jacobian, {**options, **more}
+        )
         return self._derivative
-
-
-class _Jacobian(ca.Callback):
-    def __init__(
-        self,
-        name: str,
-        sizes: tuple[int, int],
-        values: Callable[[Array], Array],
-        options: Mapping[str, Any],
-    ) -> None:
-        ca.Callback.__init__(self)
-        self._sizes, self._values = sizes, values
-        self.construct(name, options)
-
-    def get_n_in(self) -> int:
-        return 2
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        inputs, outputs = self._sizes
-        return ca.Sparsity.dense(inputs, 1) if i == 0 else ca.Sparsity(outputs, 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        inputs, outputs = self._sizes
-        return ca.Sparsity.dense(outputs, inputs)
-
-    def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
-        return [self._values(np.array(arguments[0]).ravel())]

@@ -35,25 +35,32 @@ def program(command: str) -> str:
 def parser(
     command: str, description: str, *, without_effect: Sequence[str] = ()
 ) -> argparse.ArgumentParser:
-    """A parser with the positional CASE and --out, --workers, --seed, --quiet, --no-user-code.
+    """As `run_parser`, with the positional CASE of a case file."""
+    return run_parser(
+        command, description, name="case", metavar="CASE.toml", nargs="?",
+        about=f"the case file (default: {DEFAULT_CASE})", default=Path(DEFAULT_CASE),
+        without_effect=without_effect,
+    )  # fmt: skip
+
+
+def run_parser(
+    command: str,
+    description: str,
+    *,
+    name: str = "run",
+    metavar: str = "RUN_DIR",
+    about: str = "the folder of a finished solve",
+    without_effect: Sequence[str] = (),
+    **how: Any,
+) -> argparse.ArgumentParser:
+    """A parser with the positional RUN_DIR and --out, --workers, --seed, --quiet, --no-user-code.
 
     What is `without_effect` is accepted, as scripts give every command the same options, and is
-    not in --help.
+    not in --help. `how` goes to argparse with the positional.
     """
     result = Parser(prog=program(command), description=description)
-    result.add_argument(
-        "case",
-        metavar="CASE.toml",
-        nargs="?",
-        type=Path,
-        default=Path(DEFAULT_CASE),
-        help=f"the case file (default: {DEFAULT_CASE})",
-    )
-    _shared(result, without_effect)
-    return result
+    result.add_argument(name, metavar=metavar, type=Path, help=about, **how)
 
-
-def _shared(result: argparse.ArgumentParser, without_effect: Sequence[str]) -> None:
     def add(name: str, words: str, **how: Any) -> None:
         words = argparse.SUPPRESS if name in without_effect else words
         result.add_argument(name, help=words, **how)
@@ -67,21 +74,6 @@ def _shared(result: argparse.ArgumentParser, without_effect: Sequence[str]) -> N
     add("--quiet", "print no progress and no summary", action="store_true")
     words = "refuse a case whose plant is a Python function, which is code of its author"
     add("--no-user-code", words, action="store_true")
-
-
-def run_parser(
-    command: str,
-    description: str,
-    *,
-    metavar: str = "RUN_DIR",
-    about: str = "the folder of a finished solve",
-    nargs: str | None = None,
-    without_effect: Sequence[str] = (),
-) -> argparse.ArgumentParser:
-    """As `parser`, with the positional RUN_DIR of a finished run."""
-    result = Parser(prog=program(command), description=description)
-    result.add_argument("run", metavar=metavar, type=Path, help=about, nargs=nargs)
-    _shared(result, without_effect)
     return result
 
 

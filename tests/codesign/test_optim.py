@@ -13,7 +13,7 @@ from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim import pieces as of_pieces
 from ccd_casadi.optim import quadratic
-from ccd_casadi.optim.quadratic import INSIDE, KEPT, solve_quadratic
+from ccd_casadi.optim.quadratic import AT_FIRST, INSIDE, KEPT, solve_elastic, solve_quadratic
 from ccd_casadi.support.arrays import Array
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -53,6 +53,26 @@ def test_an_answer_keeps_its_rows_and_is_optimal(seed: int) -> None:
     dual = -0.5 * x @ H @ x - mu @ upper + slope @ ends
     primal = c @ x + 0.5 * x @ H @ x
     assert primal - dual <= 1e-5 * (np.abs(c) @ np.abs(x) + np.abs(mu) @ np.abs(upper) + 1.0)
+
+
+@few(max_examples=20)
+@given(seed=SEEDS)
+def test_of_thousands_of_rows_none_is_left_out(seed: int) -> None:
+    """The row that holds the step is the last one in the order: the answer keeps it as if all were
+    in one programme, and it has the multiplier."""
+    rng = np.random.default_rng(seed)
+    n, m, radius = 8, 10 * AT_FIRST, 10.0 ** rng.uniform(-4, -1)
+    slopes = rng.normal(size=(m, n))
+    value = -radius * (1.0 + np.abs(slopes).sum(1))  # out of reach
+    c, ends = rng.normal(size=n), (np.full(n, -radius), np.full(n, radius))
+    slopes[-1], value[-1] = -c / np.abs(c).sum(), -0.1 * radius
+    given = (np.zeros((n, n)), c, slopes, value, np.ones(m), *ends)
+    found = solve_elastic(*given, 1e3 * np.abs(c).sum(), radius, 1.0)
+    assert found is not None
+    p, mu = found
+    assert (value + slopes @ p).max() <= 2e-3 * radius
+    assert mu[-1] == pytest.approx(np.abs(c).sum(), rel=1e-3)
+    assert np.delete(mu, -1).max() <= 1e-6 * mu[-1]
 
 
 class Refused:

@@ -10,7 +10,7 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
-from ccd_casadi.codesign.theta_joint import JointModel, proposed, together
+from ccd_casadi.codesign.theta_joint import JointModel, Place, proposed, together
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
@@ -19,7 +19,6 @@ from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant, with_se
 from ccd_casadi.inner_problem.sections_search import with_range
 from ccd_casadi.plants.plant import mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 
@@ -56,9 +55,7 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
 ) -> None:
     """Of peaks that move, along random directions, the frequency of each found anew."""
     omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
-    nan = float("nan")
-    sample = BandwidthSample((60.0, 60.0), omega, (nan, nan), nan, nan, (), "", 0.0, 1, stored)
-    model = JointModel(built(), sample, 0.1)
+    model = JointModel(built(), Place((60.0, 60.0), stored, omega), 0.1)
     family, start = model.loops, model.start
     z, kappa, tau = model.parts(start)
     loops = family(z)
@@ -96,7 +93,8 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
     with SampleStore(tmp_path / "samples.sqlite") as store:
         sampler = Sampler(problem, store, Workers(1))
         first = sampler.bandwidths(np.array(problem.start))[0]
-        promised = proposed(problem, first, 0.05)
+        at = Place(first.theta, first.kappa, first.bandwidth)
+        promised = proposed(problem, at, 0.05)
         assert promised.gain > 0.0
         last, best, settled = together(sampler, np.array(problem.start))
         assert settled

@@ -8,9 +8,8 @@ from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.optim.quadratic import damped_bfgs, symmetric_rank_one
+from ccd_casadi.optim.quadratic import AT_FIRST, damped_bfgs, symmetric_rank_one
 from ccd_casadi.optim.trust_region import (
-    ROWS,
     End,
     Iterate,
     Model,
@@ -181,8 +180,8 @@ def test_the_radius_follows_the_gain() -> None:
 
 
 def test_rows_far_below_their_bounds_push_out_none_that_holds_the_step() -> None:
-    """min ½ (x - 3)² within x <= 1, beside more steep rows than a programme takes."""
-    far = 2 * ROWS
+    """min ½ (x - 3)² within x <= 1, beside more steep rows than a programme begins with."""
+    far = 2 * AT_FIRST
     A = np.concatenate([np.full((far, 1), 100.0), np.ones((1, 1))])
     b = np.append(np.full(far, -150.0), -1.0)
     model = Smooth(np.eye(1), np.full(1, 3.0), b, A, np.zeros((far + 1, 1, 1)))
@@ -195,7 +194,7 @@ def test_rows_far_below_their_bounds_push_out_none_that_holds_the_step() -> None
 
 def test_rows_that_are_just_passed_push_out_none_that_is_passed_by_far() -> None:
     """From x = 0 with 1 - x <= 0 unmet, beside more flat rows that are hardly passed."""
-    flat = 2 * ROWS
+    flat = 2 * AT_FIRST
     A = np.concatenate([np.full((flat, 1), 1e-3), -np.ones((1, 1))])
     b = np.append(np.full(flat, 1e-2), 1.0)
     model = Smooth(np.eye(1), np.full(1, -1.0), b, A, np.zeros((flat + 1, 1, 1)))

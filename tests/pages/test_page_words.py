@@ -132,20 +132,18 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
     rest, error = np.zeros(801), 1e-4 * np.exp(-time)
     move = Move(time, rest, rest, error, rest[:, None], False, 0.18, window=1e-6)
     assert shown_until(move) == pytest.approx(0.54)
-    assert "of 57.7 µm after the figure's end" in ways_figure({"one": move}, "").caption
+    assert "of 57.7 µm after the figure's end" in ways_figure({"one": [move]}, "").caption
     soon = replace(move, error=1e-6 * np.exp(-time))
-    assert "after the figure's end" not in ways_figure({"one": soon}, "").caption
+    assert "after the figure's end" not in ways_figure({"one": [soon]}, "").caption
 
 
 def test_insight_and_compare_begin_with_their_answer() -> None:
     problem = SimpleNamespace(cost_unit="kg")
 
-    def point(cost: float, hz: float, efficient: bool = True) -> SimpleNamespace:
-        return SimpleNamespace(
-            hardware_cost=cost, bandwidth=HZ * hz, efficient=efficient, verified=True
-        )
+    def point(cost: float, hz: float) -> SimpleNamespace:
+        return SimpleNamespace(hardware_cost=cost, bandwidth=HZ * hz, verified=True)
 
-    one = SimpleNamespace(points=(point(110.0, 72.0), point(120.0, 60.0, efficient=False)))
+    one = SimpleNamespace(points=(point(110.0, 72.0),))
     assert front_answer(problem, one).startswith("There is nothing to trade")
     two = SimpleNamespace(points=(point(100.0, 50.0), point(110.0, 70.0)))
     assert front_answer(problem, two) == (

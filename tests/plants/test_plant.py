@@ -24,7 +24,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import PlantError
@@ -177,6 +177,20 @@ def test_what_counts_as_rigid(top: float) -> None:
     for factor, rigid in ((0.9, True), (1.1, False)):
         system = masses_on_springs(factor * limit, top, outputs=np.ones((1, 2)))
         assert list(modal_plant(system, Suspension()).rigid) == [rigid, False]
+
+
+def test_a_shift_of_one_mode_stays_with_it_where_frequencies_cross() -> None:
+    """In a model whose coordinates are its modes: the plant does not jump there."""
+    zero, shift = np.zeros((1, 2, 2)), Perturbation(modes=(0.02, -0.02))
+
+    def response(k: float) -> np.ndarray:
+        K = np.diag([k, 4.0])
+        C = np.array([[1.0, 0.3], [0.2, 1.0]])
+        system = Mechanics(np.eye(2), 0.0 * K, K, C.T, C, 0.01, (zero,) * 5)
+        return modal_plant(system, Suspension(), shift).state_space.response(np.linspace(1.8, 2.2))
+
+    before, after = response(4.0 - 1e-7), response(4.0 + 1e-7)
+    assert np.abs(after - before).max() <= 1e-4 * np.abs(before).max()
 
 
 def test_of_two_modes_at_one_frequency_the_one_that_no_sensor_sees_stands_alone() -> None:

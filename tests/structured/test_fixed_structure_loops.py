@@ -37,7 +37,7 @@ from ccd_casadi.fixed_structure.starts import at_random
 from ccd_casadi.fixed_structure.structure import response, roots, state_space
 from ccd_casadi.kernels import sections
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.hold import in_w, sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.robust.sampled import sampled_figures
@@ -100,7 +100,11 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
 def test_the_modal_response_is_that_of_the_matrices(sampling: Sampling | None) -> None:
     members = plant_set([plant(), plant(0.03, 0.5)], sampling)
     v = np.geomspace(1e-3, 10.0, 40)
-    for i, member in enumerate(members.plants):
+    for i, member in enumerate(members.systems):
+        if sampling is not None:  # by one exponential of the matrices
+            own, T = members.plants[i].system, members.period
+            held = in_w(sampled(own, T, members.delay))
+            np.testing.assert_allclose(member.response(v), held.response(v), rtol=1e-8)
         G, slope = (part[:, 0, 0] for part in members.responses(np.full(len(v), i), v))
         solved = np.linalg.solve(1j * v[:, None, None] * np.eye(len(member.A)) - member.A,
                                  member.B + 0j)  # fmt: skip
@@ -163,7 +167,7 @@ def test_the_peak_of_s_is_its_h_infinity_norm() -> None:
     for seed in range(5):
         problem, kappa = loop(seed, Structure())
         found = assess(problem, kappa, np.log(0.1), depth=-60.0).peaks
-        G, K = problem.plants.plants[0], state_space(problem.structure, kappa)
+        G, K = problem.plants.systems[0], state_space(problem.structure, kappa)
         A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
         S = StateSpace(A, np.vstack([G.B @ K.D, K.B]),
                        np.hstack([-G.C, np.zeros((1, len(K.A)))]), np.eye(1))  # fmt: skip

@@ -8,6 +8,7 @@ import pytest
 from benchmark_scripts import benchmark
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -26,6 +27,7 @@ from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out
 from ccd_casadi.synthesis.synthesis import synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 SECTIONS, chain_problem = benchmark("random_sections"), benchmark("chain_plants").chain_problem
 ROOT = Path(__file__).resolve().parents[2]
@@ -100,12 +102,29 @@ def test_a_response_stays_in_its_range(zero: float, width: float, delay: float, 
     plant, T = lag(zero), 0.05
     held = sampled(plant, T, delay * T) if hold else plant
     found = magnitude(held)
+    assert found is not None
     v = np.linspace(1.0, 1.0 + width, 300)
     omega = 2.0 / T * np.arctan(0.5 * T * v) if hold else v
     true = np.abs(held.response(omega)[:, 0, 0])
     least, most = found.range(v[:1], v[-1:])
     assert least[0] <= true.min()
     assert true.max() <= most[0]
+
+
+@pytest.mark.parametrize("sampling", [None, Sampling(0.01, 5e-3)])
+def test_axes_that_are_apart_are_bounded_as_if_alone(sampling: Sampling | None) -> None:
+    """A force that does not reach the output has no magnitude, and takes nothing from T's."""
+    one, other = lag(20.0), lag(3.0)
+    both = StateSpace(
+        *(block_diag(getattr(one, name), getattr(other, name)) for name in ("A", "B", "C", "D"))
+    )
+    weights = Weights(2.0, 1e-4, 1.0, 1e4, 5.0, 1.0, 1.0, 1e-2, 2.0)
+    bounds = Bounds(1.8, 0.9, 1e-3, weights=weights, weighted_level=1.0)
+    alone = limits_of(one, bounds, sampling)
+    beside = limits_of(both, bounds, sampling, direction=np.array([1.0, 0.0]))
+    v = np.geomspace(0.1, 50.0, 200)
+    for mine, same in zip(alone.radii(v, v, 2.0), beside.radii(v, v, 2.0), strict=True):
+        assert mine == pytest.approx(same, rel=1e-5)
 
 
 def test_no_multiplier_forbids_what_a_controller_does() -> None:

@@ -88,13 +88,6 @@ class Assembler:
             mass.append(M.ravel())
         return np.concatenate(stiff), np.concatenate(mass)
 
-    def matrices(
-        self, sector: Sector, theta: Array, shift: float = 0.0
-    ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """K + shift M and M of the elastic body in this sector, N/m and kg."""
-        stiff, mass = self.box_matrices(theta, shift)
-        return sector.stiffness.fill(stiff), sector.mass.fill(mass)
-
     def bilinear(self, sector: Sector, left: Array, right: Array) -> Array:
         """leftᵀ K_q right and leftᵀ M_q right of every box: (blocks, 7, a, b), reduced vectors."""
         out = np.zeros((len(self.blocks), 7, left.shape[1], right.shape[1]))

@@ -88,7 +88,7 @@ def height_lengths() -> tuple[Array, Array]:
 
 def bays(geometry: Geometry, theta: Sequence[Any]) -> tuple[Any, Any]:
     """Widths (b_1, b_2) of the outer and the inner bay in m; floats or CasADi symbols."""
-    _, t_o, t_i, t_c, _, x_i = _six(theta)
+    _, t_o, t_i, t_c, _, x_i = theta
     return 0.5 * geometry.side - x_i - t_o - 0.5 * t_i, x_i - 0.5 * t_i - 0.5 * t_c
 
 
@@ -110,7 +110,7 @@ def mass(geometry: Geometry, theta: Sequence[Any]) -> Any:
 
 def mass_properties(geometry: Geometry, theta: Sequence[Any]) -> MassProperties:
     """Mass, centre of gravity and inertia in closed form, exact for the stage as drawn."""
-    h, _, t_i, t_c, H, x_i = _six(theta)
+    h, _, t_i, t_c, H, x_i = theta
     L, rho = geometry.side, geometry.material.density
     outer, inner = bays(geometry, theta)
     W = 2.0 * (outer + inner)
@@ -146,7 +146,3 @@ def has_square_symmetry(geometry: Geometry) -> bool:
     mirrored = [(-x, y, m) for x, y, m in here]
     swapped = [(y, x, m) for x, y, m in here]
     return table(here) == table(mirrored) == table(swapped)
-
-
-def _six(theta: Sequence[Any]) -> tuple[Any, ...]:
-    return tuple(theta[i] for i in range(len(NAMES)))

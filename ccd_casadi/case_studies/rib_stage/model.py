@@ -83,7 +83,8 @@ class RibStage:
 
     def hardware(self, theta: Any) -> tuple[Any, dict[str, Any]]:
         """Mass in kg and λ(θ) <= 0 (no unit) for floats or CasADi symbols, in closed form."""
-        return shape.mass(self.geometry, theta), shape.constraints(self.geometry, theta)
+        here = [theta[i] for i in range(len(shape.NAMES))]
+        return shape.mass(self.geometry, here), shape.constraints(self.geometry, here)
 
 
 def orthonormal_directions(points: Sequence[Point], count: int) -> Array:
@@ -188,11 +189,6 @@ def assembled(
     return result
 
 
-def rigid_part(stage: RibStage, theta: Array) -> Array:
-    """(3, points) u_z of z, tip and tilt."""
-    return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)[0]
-
-
 def _displacements(
     stage: RibStage, found: ModeSet, theta: Array, points: tuple[Point, ...], derivatives: bool
 ) -> tuple[Array, Array, Array]:
@@ -219,12 +215,12 @@ def _displacements(
         if not derivatives:
             return
         dF = np.concatenate([steps[:, :, 2] for _, steps in made], axis=2)
-        change = slopes(disc, stage.geometry, item, keep, F, dF)
+        modes_dK, modes_du = slopes(disc, stage.geometry, item, keep, F, dF)
         for row, mode in own:
-            du[:, row] = change.dU[:, seen[mode.image], mode.place]
+            du[:, row] = modes_du[:, seen[mode.image], mode.place]
             for column, other in own:
                 if other.image == mode.image:
-                    dK[:, row, column] = change.dK[:, mode.place, other.place]
+                    dK[:, row, column] = modes_dK[:, mode.place, other.place]
 
     kept = [index for index in range(len(found.spectra)) if found.kept(index)]
     side_by_side(fill, kept[::-1])  # the last one, of the tilts, takes longest

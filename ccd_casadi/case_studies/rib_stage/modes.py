@@ -135,18 +135,10 @@ def spectrum(
     return Spectrum(group, theta, pencil, rigid, values, vectors)
 
 
-@dataclass(frozen=True)
-class Slopes:
-    """∂K (θ, k, k) of the k modes kept and ∂(u at functionals) (θ, r, k)."""
-
-    dK: Array
-    dU: Array
-
-
 def slopes(
     disc: Discretisation, geometry: Geometry, found: Spectrum, keep: int, F: Array, dF: Array
-) -> Slopes:
-    """Derivatives of λ and of Fᵀφ for the `keep` lowest modes, F (n, r), dF (θ, n, r).
+) -> tuple[Array, Array]:
+    """∂K (θ, k, k) and ∂(Fᵀφ) (θ, r, k) of the k = `keep` lowest modes, F (n, r), dF (θ, n, r).
 
     φ' = -½ φ φᵀM'φ - (K - λM)⁺ (K' - λM') φ, taken from the side of F:
     Fᵀφ' = -½ (Fᵀφ) φᵀM'φ - Zᵀ(K' - λM')φ, Z = (K - λM)⁺F, so that the number of θ costs nothing.
@@ -174,7 +166,7 @@ def slopes(
     for i in range(keep):
         rows = slice(keep + i * rank, keep + (i + 1) * rank)
         dU[:, :, i] -= dK[:, rows, i] - lam[i] * dM[:, rows, i]
-    return Slopes(out_K, dU)
+    return out_K, dU
 
 
 def _compress(F: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from ccd_casadi.case_studies.rib_stage.model import RibStage, discretisation, mo
 from ccd_casadi.case_studies.rib_stage.modes import sector_of
 from ccd_casadi.case_studies.rib_stage.symmetry import mirror_signs, swap_displacements
 from ccd_casadi.case_studies.rib_stage.truncation import ModeCount
-from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes, outer_faces
 from ccd_casadi.support.arrays import Array
 
 QUADRANTS = ((False, False), (True, False), (True, True), (False, True))
@@ -26,15 +26,15 @@ SHAPES = {  # by symmetry; the diagonal and the mirrors of the square tell them 
 WITHOUT = "bending"  # where point masses break the square, no mode has a symmetry
 ORDINALS = ("", "second", "third", "fourth", "fifth", "sixth")
 AT_CORNERS = "vertical at the corners (share of it)"
-# corners of a cell's six faces, counter-clockwise from outside, by (axis, side)
-FACES = {
-    (0, 1): ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
-    (0, -1): ((0, 0, 0), (0, 0, 1), (0, 1, 1), (0, 1, 0)),
-    (1, 1): ((0, 1, 0), (0, 1, 1), (1, 1, 1), (1, 1, 0)),
-    (1, -1): ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
-    (2, 1): ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
-    (2, -1): ((0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)),
-}
+# corners of a cell's six faces, counter-clockwise from outside
+FACES = (
+    ((1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 0, 1)),
+    ((0, 0, 0), (0, 0, 1), (0, 1, 1), (0, 1, 0)),
+    ((0, 1, 0), (0, 1, 1), (1, 1, 1), (1, 1, 0)),
+    ((0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)),
+    ((0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)),
+    ((0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)),
+)
 
 
 def mode_shapes(stage: RibStage, theta: Sequence[float], count: int = 6) -> ModeShapes:
@@ -82,20 +82,28 @@ def _surface(mesh: Mesh, theta: Array, stage: RibStage) -> tuple[Array, np.ndarr
             if min(nodes[node] - nodes[plan[-1]], nodes[end] - nodes[node]) >= least:
                 plan.append(node)
         plan.append(end)
-    levels = np.abs(mesh.height.positions(theta) - np.cumsum([0.0, theta[0], theta[4]])[:, None])
-    quarter, faces = mesh.coordinates(theta), surface_quads(mesh, plan, levels.argmin(axis=1))
+    ends = np.cumsum([0.0, theta[0], theta[4]])
+    levels = np.abs(mesh.height.positions(theta) - ends[:, None]).argmin(axis=1)
+    rib, high = (np.repeat(axis.rib, axis.orders) for axis in (mesh.plan, mesh.height))
+    rib, high = rib[plan[:-1]], high[levels[:-1]]
+    i, j, k = np.nonzero(~high | rib[:, None, None] | rib[:, None])
+    number = mesh.number[np.ix_(plan, plan, levels)]
+    cells = [[number[i + a, j + b, k + c] for a, b, c in corners] for corners in FACES]
+    quarter, faces = mesh.coordinates(theta), np.concatenate(cells, axis=1).T
     points, quads = [], []
-    for number, (left, below) in enumerate(QUADRANTS):
+    for place, (left, below) in enumerate(QUADRANTS):
         points.append(quarter * [-1.0 if left else 1.0, -1.0 if below else 1.0, 1.0])
         # one mirror turns the winding over, two do not
-        quads.append((faces[:, ::-1] if left != below else faces) + number * len(quarter))
+        quads.append((faces[:, ::-1] if left != below else faces) + place * len(quarter))
     everywhere = np.concatenate(points)
     used, inner = np.unique(np.concatenate(quads), return_inverse=True)
     # nodes on the mirror planes are there once in each quadrant
     _, first, same = np.unique(
         everywhere[used].round(9) + 0.0, axis=0, return_index=True, return_inverse=True
     )
-    return everywhere[used[first]], used[first], same.ravel()[inner].reshape(-1, 4)
+    seen, outer = np.unique(outer_faces(same.ravel()[inner].reshape(-1, 4)), return_inverse=True)
+    chosen = used[first[seen]]
+    return everywhere[chosen], chosen, outer.reshape(-1, 4)
 
 
 def _quadrant(stage: RibStage, theta: Array, flexible: int, left: bool, below: bool) -> Array:
@@ -113,24 +121,3 @@ def _quadrant(stage: RibStage, theta: Array, flexible: int, left: bool, below: b
             field = field[swap_displacements(disc.assembler.mesh)]
         out += field.reshape(-1, 3) * np.array(mirror_signs(symmetry, left, below))
     return out
-
-
-def surface_quads(mesh: Mesh, plan: Sequence[int], height: Sequence[int]) -> np.ndarray:
-    """(q, 4) node numbers of the quarter's outer surface between these places, no mirror planes."""
-    number = mesh.number
-    solid = np.zeros(tuple(n - 1 for n in number.shape), bool)
-    for block in mesh.blocks:
-        i, j, k = mesh.grid[block.nodes].T
-        solid[i.min() : i.max(), j.min() : j.max(), k.min() : k.max()] = True
-    number = number[np.ix_(plan, plan, height)]
-    inside = solid[np.ix_(plan[:-1], plan[:-1], height[:-1])]
-    padded = np.pad(inside, 1)
-    quads = []
-    for (axis, side), corners in FACES.items():
-        beyond = np.roll(padded, -side, axis)[1:-1, 1:-1, 1:-1]
-        i, j, k = np.nonzero(inside & ~beyond)
-        if axis < 2 and side < 0:
-            off_plane = (i, j)[axis] > 0  # the mirror plane is no surface
-            i, j, k = i[off_plane], j[off_plane], k[off_plane]
-        quads.append(np.stack([number[i + a, j + b, k + c] for a, b, c in corners], axis=1))
-    return np.concatenate(quads)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes, outer_faces
 from ccd_casadi.plants.cad.elements import Body
 from ccd_casadi.plants.eigenpairs import (
     Pencil,
@@ -97,10 +97,7 @@ def mode_shapes(body: Body, count: int, held: np.ndarray) -> ModeShapes:
     """The `count` lowest flexible modes on the body's surface; `held` as in `reduced`."""
     values, vectors = _solved(body, count, held)[-2:]
     faces = np.concatenate([body.tets[:, list(corners)] for corners in OUTWARD])
-    _, first, times = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    used, outer = np.unique(faces[first[times == 1]], return_inverse=True)
+    used, outer = np.unique(outer_faces(faces), return_inverse=True)
     modes = []
     for i in range(count):
         field = np.zeros(len(held))
