@@ -48,14 +48,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     tolerance_prices,
     worst_members,
 )
-from ccd_casadi.inner_problem.sections_search import (
-    ROUNDS,
-    joined,
-    least_from,
-    prepared,
-    race,
-    with_range,
-)
+from ccd_casadi.inner_problem.sections_search import joined, least_from, prepared, race, with_range
 from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.plants.plant import hardware_cost
@@ -149,6 +142,7 @@ def teller(label: str, quiet: bool) -> Callable[[str], None]:
 BETTER = 1e-3  # relative: what the search at the end has to gain to be worth another round
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
+CARRIED = 12  # joint searches at most, each on the worst plants that the one before has left
 FOLLOWED = 3  # times at most that a controller is taken along past a jump of ω_b*
 
 
@@ -282,7 +276,7 @@ def with_members(sampler: Sampler, kappa: Array, members: Sequence[Member]) -> S
 
 def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
     """`together` again with the worst plants of its end, until it settles and none is worse."""
-    for turn in range(ROUNDS):
+    for turn in range(CARRIED):
         sampler, best, settled = together(sampler, theta)
         if not best.feasible:
             break

@@ -39,7 +39,7 @@ from ccd_casadi.support.arrays import Array
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
-CYCLES = 10  # times at most that the plants are made anew before worse ones are looked for
+CYCLES = 5  # times at most that the plants are made anew before worse ones are looked for
 PENALTY = (
     6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
 )
