@@ -1,31 +1,71 @@
-"""The frequency at which the bound γ_jω is attained, to rounding, and what rounding leaves in it.
+"""The bound γ_jω along one direction: its gradient where it is attained, and what rounding leaves.
+
+    γ_jω² = (1 + δ²σ²)|W1|²E/(|W1|²σ² + E),   E = |W2|² + |W3|²σ²,  or |W2|² + |W3|² where δ > 0,
+
+with the least singular value σ of G(jω), or with δ > 0 the largest too. The answer of u to a
+reference in that direction, of the size that disturbance and reference have there together, costs
+at least that.
 
 The value of a maximum is insensitive to where it is taken, its gradient is not: next to a zero of
 damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the slope's root is sought.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import BACKWARD
 from ccd_casadi.kernels.generalized_plant import squared_weights
+from ccd_casadi.kernels.pullback import squared_weight_slopes
 
 EPS = 2.0**-52
 DEVIATIONS = 4.0  # standard deviations of the rounding that `bound_error` admits
 
 
-def _least_direction(A, B, C, ω):
-    """M = jω - A, M⁻¹B, and σ_p of G = C M⁻¹ B with its singular vectors u, v.
+class BoundTerms(NamedTuple):
+    """γ_jω² at one frequency, and its partial derivatives to σ, |W1|², |W2|², |W3|² and δ."""
 
-    With fewer inputs than outputs σ_p is 0, and so is v.
+    value: float
+    to_sigma: float
+    to_W1: float
+    to_W2: float
+    to_W3: float
+    to_delta: float
+
+
+def bound_terms(W1, W2, W3, sigma, delta):
+    """Of squared weights; monotone in σ, so that the largest and the least count."""
+    share = 1.0 if delta else sigma**2
+    effort = W2 + share * W3
+    size, total = 1.0 + (delta * sigma) ** 2, W1 * sigma**2 + effort
+    to_effort = size * W1**2 * (sigma / total) * (sigma / total)
+    to_sigma = -2.0 * sigma * W2 * (W1 / total) ** 2
+    if delta:
+        to_sigma = 2.0 * sigma * W1 * effort * (delta**2 * effort - W1) / total**2
+    return BoundTerms(
+        size * W1 * effort / total,
+        to_sigma,
+        size * (effort / total) ** 2,
+        to_effort,
+        share * to_effort,
+        2.0 * delta * sigma**2 * W1 * effort / total,
+    )
+
+
+def _direction(A, B, C, ω, least=True):
+    """M = jω - A, M⁻¹B, and the least (largest) σ of G = C M⁻¹ B with its singular vectors u, v.
+
+    With fewer inputs than outputs the least is 0, and so is v.
     """
     p, m = C.shape[0], B.shape[1]
+    i = p - 1 if least else 0
     M = 1j * ω * np.eye(A.shape[0]) - A
     right = np.linalg.solve(M, B)
     U, s, Vh = np.linalg.svd(C @ right)
-    if m < p:
-        return M, right, 0.0, U[:, p - 1], np.zeros(m, complex)
-    return M, right, s[p - 1], U[:, p - 1], Vh[p - 1].conj()
+    if i >= m:
+        return M, right, 0.0, U[:, i], np.zeros(m, complex)
+    return M, right, s[i], U[:, i], Vh[i].conj()
 
 
 def bound_error(A, B, C, w, ω):
@@ -38,7 +78,7 @@ def bound_error(A, B, C, w, ω):
     """
     T, B, C = prepare(A, B, C)
     n = T.shape[0]
-    M, right, σ, u, v = _least_direction(T, B, C, ω)
+    M, right, σ, u, v = _direction(T, B, C, ω)
     if σ == 0.0:
         return 0.0  # fewer inputs than outputs, or none that acts: the bound is |W1|
     left = np.linalg.solve(M.T, u.conj() @ C)
@@ -50,18 +90,29 @@ def bound_error(A, B, C, w, ω):
     return DEVIATIONS * W1 / (W1 + force + W3) * force / (force + W3) * dσ / σ
 
 
-def _bound_slope(A, B, C, w, ω):
-    """dγ_jω²(ω)/dω of γ_jω² = |W1|² R/(|W1|² + R), R = |W2|²/σ² + |W3|², dσ = Re(u* dG v)."""
-    M, right, σ, u, v = _least_direction(A, B, C, ω)
-    if σ == 0.0:  # the bound is |W1|
-        return squared_weight_rates(w, ω)[0]
-    dG = -1j * (C @ np.linalg.solve(M, right))
-    dσ = np.vdot(u, dG @ v).real
-    W1, W2, W3 = squared_weights(w, ω)
-    d1, d2, d3 = squared_weight_rates(w, ω)
-    R = W2 / σ**2 + W3
-    dR = d2 / σ**2 - 2.0 * W2 * dσ / σ**3 + d3
-    return (R / (W1 + R)) ** 2 * d1 + (W1 / (W1 + R)) ** 2 * dR
+def bound_slope(A, B, C, w, delta, ω, least=True):
+    """dγ_jω²(ω)/dω, dσ = Re(u* dG v)."""
+    M, right, σ, u, v = _direction(A, B, C, ω, least)
+    dσ = np.vdot(u, -1j * (C @ np.linalg.solve(M, right)) @ v).real
+    terms = bound_terms(*squared_weights(w, ω), σ, delta)
+    return terms.to_sigma * dσ + np.dot(terms[2:5], squared_weight_rates(w, ω))
+
+
+def bound_gradient(A, B, C, w, delta, ω, least=True):
+    """Gradients of γ_jω at its maximising ω (envelope) to A, B, C, the weight vector (8,) and δ."""
+    M, right, σ, u, v = _direction(A, B, C, ω, least)
+    terms = bound_terms(*squared_weights(w, ω), σ, delta)
+    scale = 0.5 / np.sqrt(terms.value)
+    left, through = np.linalg.solve(M.T, u.conj() @ C), right @ v
+    factor = scale * terms.to_sigma
+    to_squares = scale * np.repeat(terms[2:5], [3, 2, 3])
+    return (
+        factor * np.outer(left, through).real,
+        factor * np.outer(left, v).real,
+        factor * np.outer(u.conj(), through).real,
+        to_squares * squared_weight_slopes(w, ω),
+        scale * terms.to_delta,
+    )
 
 
 def squared_weight_rates(w, ω):
@@ -75,9 +126,9 @@ def squared_weight_rates(w, ω):
     )
 
 
-def bound_peak(A, B, C, w, start):
+def bound_peak(A, B, C, w, delta, start, least=True):
     """The maximiser next to `start`; `start` itself where the slope has no root within 1 %."""
-    return slope_root(lambda ω: _bound_slope(A, B, C, w, ω), start)
+    return slope_root(lambda ω: bound_slope(A, B, C, w, delta, ω, least), start)
 
 
 def slope_root(slope, start):

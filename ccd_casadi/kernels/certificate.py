@@ -4,9 +4,8 @@ Nothing here comes from the synthesis but the controller's matrices: the loop is
 plant and controller, the weights enter as transfer functions in the frequency sweep and as
 their own states in the Hamiltonian test.
 
-With disturbances it is ‖[W1 I; W2 K; W3 K] S [I  δG]‖∞ on a refined grid and by the weighted loop's
-Hamiltonian: neither the filter's solution nor the spectral factor is used. That part is plain NumPy
-around compiled responses and eigenvalues.
+With disturbances (δ > 0) it is ‖[W1 I; W2 K; W3 K] S [I  δG]‖∞: neither the filter's solution nor
+the spectral factor is used.
 """
 
 import numpy as np
@@ -20,21 +19,23 @@ from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenva
 
 REFINED_FROM = 0.95  # of the largest gain on the grid: a peak this high is refined in any case
 REFINEMENTS = 40  # trials a peak; some six are used
-ZOOMS, POINTS = 8, 9  # each narrows the bracket of a peak to a quarter
 
 
 @compiled
-def _stack(g, k, Dk, w, ω):
-    """σ_max of [W1 S; W2 K S; W3 T] from the responses of plant and controller at one ω."""
+def _stack(g, k, Dk, w, delta, ω):
+    """σ_max of the stack from the responses of plant and controller at one ω."""
     W1, W2, W3 = squared_weights(w, ω)
-    p = g.shape[0]
+    p, m = g.shape
     if p == 1:
-        T, u2 = 0.0j, 0.0
-        for i in range(k.shape[0]):
-            u = k[i, 0] + Dk[i, 0]
+        T, u2, g2 = 0.0j, 0.0, 0.0
+        for i in range(m):
+            u, v = k[i, 0] + Dk[i, 0], g[0, i]
             u2 += u.real**2 + u.imag**2
-            T += g[0, i] * u
+            g2 += v.real**2 + v.imag**2
+            T += v * u
         T2, D2 = T.real**2 + T.imag**2, (1.0 + T.real) ** 2 + T.imag**2
+        if delta > 0.0:
+            return np.sqrt((W1 + (W2 + W3) * u2) * (1.0 + delta**2 * g2) / D2)
         return np.sqrt((W1 + W2 * u2 + W3 * T2) / D2)
     k = add_real(k, Dk)
     L = multiply(g, k)
@@ -42,34 +43,44 @@ def _stack(g, k, Dk, w, ω):
     for i in range(p):
         M[i, i] += 1.0
     S = invert(M)
-    Z = np.zeros((p, p), np.complex128)
+    last = L
+    if delta > 0.0:
+        SG, last = multiply(S, g), k
+        wide = np.zeros((p, p + m), np.complex128)
+        for i in range(p):
+            for j in range(p):
+                wide[i, j] = S[i, j]
+            for j in range(m):
+                wide[i, p + j] = delta * SG[i, j]
+        S = wide
+    Z = np.zeros((S.shape[1], S.shape[1]), np.complex128)
     add_gram(Z, S, W1)
     add_gram(Z, multiply(k, S), W2)
-    add_gram(Z, multiply(L, S), W3)
+    add_gram(Z, multiply(last, S), W3)
     return np.sqrt(largest_eigenvalue(Z))
 
 
 @compiled
-def stack_gain(G, K, Dk, w, ω):
-    """σ_max of [W1 S; W2 K S; W3 T](jω), from the transfer functions."""
-    return _stack(response(G, ω), response(K, ω), Dk, w, ω)
+def stack_gain(G, K, Dk, w, delta, ω):
+    """σ_max of [W1 S; W2 K S; W3 T](jω), or of the four blocks, from the transfer functions."""
+    return _stack(response(G, ω), response(K, ω), Dk, w, delta, ω)
 
 
 @compiled
-def stack_gains(G, K, Dk, w, ω):
+def stack_gains(G, K, Dk, w, delta, ω):
     """The stack's gain at every ω of an array."""
     g, k = responses(G, ω), responses(K, ω)
     out = np.empty(ω.size)
     for i in range(ω.size):
-        out[i] = _stack(g[i], k[i], Dk, w, ω[i])
+        out[i] = _stack(g[i], k[i], Dk, w, delta, ω[i])
     return out
 
 
 @compiled
-def stack_norm(G, K, Dk, w, grid):
+def stack_norm(G, K, Dk, w, delta, grid):
     """sup over ω of the stack's gain: the grid, then successive parabolas at its top peaks."""
     n = grid.size
-    values = stack_gains(G, K, Dk, w, grid)
+    values = stack_gains(G, K, Dk, w, delta, grid)
     best, at = 0.0, 0.0
     for i in range(n):
         if not values[i] <= best:
@@ -90,7 +101,7 @@ def stack_norm(G, K, Dk, w, grid):
             new, room = next_trial(a, fa, x, fx, b, fb, 1e-9)
             if room == 0.0:
                 break
-            f = stack_gain(G, K, Dk, w, np.exp(new))
+            f = stack_gain(G, K, Dk, w, delta, np.exp(new))
             a, fa, x, fx, b, fb = narrow(a, fa, x, fx, b, fb, new, f)
         if fx > best:
             best, at = fx, np.exp(x)
@@ -98,7 +109,7 @@ def stack_norm(G, K, Dk, w, grid):
 
 
 @compiled
-def level_test(G, K, Dk, w, loop, level):
+def level_test(G, K, Dk, w, delta, loop, level):
     """Whether the Hamiltonian of the weighted loop shows no gain above `level`.
 
     Eigenvalues near the imaginary axis are candidates only; the gain in the intervals that
@@ -119,7 +130,7 @@ def level_test(G, K, Dk, w, loop, level):
         return False
     n = candidates.size
     if n == 0:
-        return stack_gain(G, K, Dk, w, 1.0) <= level
+        return stack_gain(G, K, Dk, w, delta, 1.0) <= level
     # Between two neighbouring candidates the sign of gain - level cannot change.
     for i in range(n + 1):
         if i == 0:
@@ -128,53 +139,13 @@ def level_test(G, K, Dk, w, loop, level):
             ω = 2.0 * candidates[n - 1]
         else:
             ω = np.sqrt(candidates[i - 1] * candidates[i])
-        if not stack_gain(G, K, Dk, w, ω) <= level:
+        if not stack_gain(G, K, Dk, w, delta, ω) <= level:
             return False
     # A candidate beside the axis may stand at a narrow crossing; on it the gain is the level.
-    for i in range(n):  # noqa: SIM110 (numba has no all())
-        if not stack_gain(G, K, Dk, w, candidates[i]) <= level * (1.0 + 1e-9):
+    for i in range(n):
+        if not stack_gain(G, K, Dk, w, delta, candidates[i]) <= level * (1.0 + 1e-9):
             return False
     return True
-
-
-def four_block_gains(G, K, Dk, w, delta, omega):
-    """σ_max of the stack at every ω (k,), from the transfer functions of prepared G and K."""
-    g, k = responses(G, omega), responses(K, omega) + Dk
-    W1, W2, W3 = squared_weights(w, omega)
-    if g.shape[1:] == (1, 1):
-        g, k = g[:, 0, 0], k[:, 0, 0]
-        effort = W1 + (W2 + W3) * np.abs(k) ** 2
-        return np.sqrt(effort * (1.0 + np.abs(delta * g) ** 2)) / np.abs(1.0 + g * k)
-    one = np.broadcast_to(np.eye(g.shape[1]), (len(g), g.shape[1], g.shape[1]))
-    right = np.linalg.solve(one + g @ k, np.concatenate([one, delta * g], axis=2))
-    error, force = np.sqrt(W1)[:, None, None], np.sqrt(W2 + W3)[:, None, None]
-    stack = np.concatenate([error * right, force * (k @ right)], axis=1)
-    return np.linalg.norm(stack, 2, axis=(1, 2))
-
-
-def four_block_norm(G, K, Dk, w, delta, grid):
-    """sup over ω of the stack's gain, and where: the grid, its highest peaks zoomed into."""
-    values = four_block_gains(G, K, Dk, w, delta, grid)
-    i = int(np.argmax(values))
-    best, at = float(values[i]), float(grid[i])
-    top, x = best, np.log(grid)
-    left, here, right = values[:-2], values[1:-1], values[2:]
-    for i in np.flatnonzero((here >= left) & (here > right)):
-        # as in `certificate.stack_norm`: no parabola is trusted with the highest peaks
-        room = promised(x[i], left[i], x[i + 1], here[i], x[i + 2], right[i])
-        if here[i] < REFINED_FROM * top and here[i] + 2.0 * room < 0.9999 * top:
-            continue
-        low, high = grid[i], grid[i + 2]
-        for _ in range(ZOOMS):
-            trial = np.linspace(low, high, POINTS)
-            found = four_block_gains(G, K, Dk, w, delta, trial)
-            k = int(np.clip(found.argmax(), 1, POINTS - 2))
-            low, high = trial[k - 1], trial[k + 1]
-            if found[k] > best:
-                best, at = float(found[k]), float(trial[k])
-            elif found[k] - found.min() < 1e-10 * best:
-                break
-    return best, at
 
 
 def four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta):
@@ -198,23 +169,3 @@ def four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta):
     ])  # fmt: skip
     Dz = np.vstack([d * through for d, (_, through) in zip(f[:, 3], signals, strict=True)])
     return Az, Bz, Cz, Dz
-
-
-def four_block_level_test(G, K, Dk, w, delta, loop, level):
-    """Whether the Hamiltonian of the weighted loop shows no gain above `level`.
-
-    As in `certificate.level_test`: eigenvalues near the axis are candidates, the gain decides.
-    """
-    Dz = loop[3]
-    if np.linalg.norm(Dz, 2) >= level:
-        return False
-    candidates, info = axis_frequencies(*loop, level)
-    if info != 0:
-        return False
-    if not candidates.size:
-        return bool(four_block_gains(G, K, Dk, w, delta, np.ones(1))[0] <= level)
-    between = np.sqrt(candidates[:-1] * candidates[1:])
-    between = np.concatenate([[0.5 * candidates[0]], between, [2.0 * candidates[-1]]])
-    gains = four_block_gains(G, K, Dk, w, delta, np.concatenate([between, candidates]))
-    allowed = level * np.repeat([1.0, 1.0 + 1e-9], [between.size, candidates.size])
-    return bool((gains <= allowed).all())

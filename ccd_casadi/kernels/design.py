@@ -5,13 +5,7 @@ from math import exp, isnan, log, nan
 import numpy as np
 
 from ccd_casadi.kernels.blocks import ascending, place
-from ccd_casadi.kernels.certificate import (
-    four_block_level_test,
-    four_block_loop,
-    four_block_norm,
-    level_test,
-    stack_norm,
-)
+from ccd_casadi.kernels.certificate import four_block_loop, level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import (
     loop_matrices,
     pole_rounding,
@@ -71,7 +65,7 @@ def _closed(A, B, C, Ak, Bk, Ck, Dk, row):
 def _stack_proof(G, K, Dk, w, grid, gamma, matrices, loop):
     """The norm, where, whether it and the Hamiltonian stay below γ, and the least r to e."""
     A, B, C, Ak, Bk, Ck = matrices
-    norm, at = stack_norm(G, K, Dk, w, grid)
+    norm, at = stack_norm(G, K, Dk, w, 0.0, grid)
     n, N = A.shape[0], Ak.shape[0]
     if not norm <= gamma:
         return norm, at, False, loop
@@ -81,7 +75,7 @@ def _stack_proof(G, K, Dk, w, grid, gamma, matrices, loop):
         Cs = np.zeros((C.shape[0], N))
         place(Cs, 0, 0, -1.0, C)
         loop = (whole[0], whole[1], Cs)
-    return norm, at, level_test(G, K, Dk, w, whole, gamma), loop
+    return norm, at, level_test(G, K, Dk, w, 0.0, whole, gamma), loop
 
 
 @compiled
@@ -120,9 +114,9 @@ def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
         return code
     grid = certificate_grid(*poles)
     if delta:
-        norm, at = four_block_norm(G, K, Dk, w, delta, grid)
+        norm, at = stack_norm(G, K, Dk, w, delta, grid)
         whole = four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta)
-        held = norm <= gamma and four_block_level_test(G, K, Dk, w, delta, whole, gamma)
+        held = norm <= gamma and level_test(G, K, Dk, w, delta, whole, gamma)
     else:
         matrices = (A, B, C, Ak, Bk, Ck)
         norm, at, held, loop = _stack_proof(G, K, Dk, w, grid, gamma, matrices, loop)

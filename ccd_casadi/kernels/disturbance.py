@@ -16,15 +16,12 @@ Its solution is X̂ = X(I - YX/γ²)⁻¹ with X of the four-block problem, so t
 Plain NumPy around the compiled search.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
-from ccd_casadi.kernels.bound_peak import slope_root, squared_weight_rates
+from ccd_casadi.kernels.bound_peak import bound_terms
 from ccd_casadi.kernels.frequency import prepare, responses
 from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
 from ccd_casadi.kernels.lapack import stable_subspace
-from ccd_casadi.kernels.pullback import squared_weight_slopes
 
 EDGE = 0.95  # squared: a peak of the bound below this share of the highest is not refined
 AT_REST = np.concatenate([[0.0], np.geomspace(1e-9, 5e-6, 8)])  # over ω₀: where W1 is largest
@@ -70,33 +67,6 @@ def innovations_plant(A, B, C, w, Y):
 # ---- what no controller passes ------------------------------------------------------------------
 
 
-class BoundTerms(NamedTuple):
-    """γ_jω² at one frequency, and its partial derivatives to σ, |W1|², |W2|² + |W3|² and δ."""
-
-    value: float
-    to_sigma: float
-    to_W1: float
-    to_effort: float
-    to_delta: float
-
-
-def bound_terms(W1, effort, sigma, delta):
-    """(1 + δ²σ²)|W1|²R/(|W1|² + R), R = (|W2|² + |W3|²)/σ², along an output direction of G.
-
-    The answer of u to a reference in that direction, of the size that disturbance and reference
-    have there together, costs at least that; monotone in σ, so the largest and least σ count.
-    """
-    size, total = 1.0 + (delta * sigma) ** 2, W1 * sigma**2 + effort
-    value = size * W1 * effort / total
-    return BoundTerms(
-        value,
-        2.0 * sigma * W1 * effort * (delta**2 * effort - W1) / total**2,
-        size * (effort / total) ** 2,
-        size * W1**2 * (sigma / total) * (sigma / total),
-        2.0 * delta * sigma**2 * W1 * effort / total,
-    )
-
-
 def _bounds(G, w, delta, omega):
     """γ_jω² (2, k) along the directions of the largest and least gain of G."""
     g = responses(G, omega)
@@ -104,7 +74,7 @@ def _bounds(G, w, delta, omega):
     p, m = G[2].shape[0], G[1].shape[1]
     ends = np.array([sigma[:, 0], sigma[:, -1] if m >= p else np.zeros(omega.size)])
     W1, W2, W3 = squared_weights(w, omega)
-    return bound_terms(W1, W2 + W3, ends, delta).value
+    return bound_terms(W1, W2, W3, ends, delta).value
 
 
 def disturbance_bound(A, B, C, w, delta, grid):
@@ -126,42 +96,3 @@ def disturbance_bound(A, B, C, w, delta, grid):
             if found[k] > best[0]:
                 best = float(found[k]), float(trial[k]), bool(branch)
     return float(np.sqrt(best[0])), *best[1:]
-
-
-def disturbance_bound_gradient(A, B, C, w, delta, omega, least):
-    """Gradients of γ_jω at its peak beside ω to A, B, C, the weight vector (8,) and δ."""
-    index = C.shape[0] - 1 if least else 0
-
-    def direction(at):
-        M = 1j * at * np.eye(len(A)) - A
-        right, left = np.linalg.solve(M, B), np.linalg.solve(M.T, C.T).T
-        U, s, Vh = np.linalg.svd(C @ right)
-        return left.T @ U[:, index].conj(), right @ Vh[index].conj(), U[:, index], Vh[index], s
-
-    def slope(at):
-        ul, rv, _, _, s = direction(at)
-        terms = bound_terms(*_weights_at(w, at)[:2], s[index], delta)
-        rates = squared_weight_rates(w, at)
-        return (
-            terms.to_sigma * (-1j * (ul @ rv)).real
-            + terms.to_W1 * rates[0] + terms.to_effort * (rates[1] + rates[2])
-        )  # fmt: skip
-
-    at = slope_root(slope, omega)
-    ul, rv, u, vh, s = direction(at)
-    terms = bound_terms(*_weights_at(w, at)[:2], s[index], delta)
-    scale = 0.5 / np.sqrt(terms.value)
-    factor = scale * terms.to_sigma
-    to_squares = scale * np.repeat([terms.to_W1, terms.to_effort], [3, 5])
-    return (
-        factor * np.outer(ul, rv).real,
-        factor * np.outer(ul, vh.conj()).real,
-        factor * np.outer(u.conj(), rv).real,
-        to_squares * squared_weight_slopes(w, at),
-        scale * terms.to_delta,
-    )
-
-
-def _weights_at(w, omega):
-    W1, W2, W3 = squared_weights(w, omega)
-    return W1, W2 + W3

@@ -27,25 +27,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccd_casadi.kernels.bound_peak import bound_peak
-from ccd_casadi.kernels.design import design
-from ccd_casadi.kernels.disturbance import (
-    disturbance_bound,
-    disturbance_bound_gradient,
-    filter_solution,
-    innovations_plant,
-)
+from ccd_casadi.kernels.bound_peak import bound_gradient, bound_peak
+from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, innovations_plant
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
-from ccd_casadi.kernels.pullback import (
-    FourBlockPullback,
-    MixedPullback,
-    PlantGradients,
-    bound_gradient,
-)
+from ccd_casadi.kernels.pullback import FourBlockPullback, MixedPullback, PlantGradients
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
 from ccd_casadi.support.arrays import Array
 
@@ -107,8 +96,9 @@ def _riccati_terms(T11, U1, U2, L, gp, t):
     return of_plant, -(V * (V @ L)).sum((1, 2))
 
 
-def gamma_gradient(gp, H0, back, gamma_opt):
+def gamma_gradient(posed, gamma_opt):
     """Gradients of γ_opt = γ_X to A, B, C and the weights; whether the Hamiltonian splits there."""
+    gp, H0, back = posed
     _, B1, _, C1, _, d1, _ = gp
     t = gamma_opt**2 - d1**2
     _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t, NOISE)
@@ -223,73 +213,46 @@ def _contract(cotangents, changes):
     return np.array([change @ row for row, change in zip(rows, flat, strict=True)])
 
 
-def figure_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
+def figure_gradients(design_plant: DesignPlant, row: Array, grid: Array, sigma: Array,
+                     loops: Sequence[Loop]) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
     """Gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt), of ω_b with K held, and σ's gaps.
 
-    The first (4, n_θ + n_w), to θ and to the weights; `loops` are where ω_b, the peak and ω_low
-    are taken. A fourth loop's ln σ stands before γ_opt. The fixed-K gradient (n_θ) is the paper's.
-    With them whether the Hamiltonian splits; everything is NaN where it does not.
+    The first (4, n_θ + n_w), to θ, then to the scaled weights with δ behind them where δ > 0;
+    `row` is the synthesis on the design plant, `grid` and `sigma` its frequencies and gains. In
+    `loops` ω_b, the peak and ω_low are taken, on that plant or others; a fourth loop's ln σ stands
+    before γ_opt. The fixed-K gradient (n_θ) is the paper's. After the gaps comes γ_opt's own
+    gradient, and whether the Hamiltonian splits. NaN where it does not, where the design is not
+    certified or there are no loops, and where it needed balanced coordinates: gradients are taken
+    in the plant's own.
     """
-    found, held, slopes, gains, gaps, ok = loop_gradients(
-        design_plant, posed, gamma_opt, gamma_slope, loops
-    )
-    # ω_b by the implicit function theorem; a peak's own frequency drops out (envelope)
-    scale = np.array([-slopes[0], *gains[1:]])
-    out = np.vstack([found / scale[:, None], gamma_slope if ok else np.full_like(gamma_slope, nan)])
-    return out, -held[0] / slopes[0], gaps, ok
-
-
-def design_with_gradients(
-    A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC, channels=(), delta=0.0
-):
-    """A design, and the gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt).
-
-    Returns the row, A_K, B_K, C_K, G (4, n_θ + n_w): derivatives to θ then to the scaled weight
-    vector, with δ behind it where δ > 0; fixed (n_θ): the paper's dω_b/dθ with K held; gaps (3) of
-    σ_max at the frequencies. The gradients are NaN where the design is not certified, and where it
-    needed balanced coordinates: they are taken in the plant's own.
-    """
-    plant = DesignPlant(A, B, C, dA, dB, dC, w, backoff, delta)
-    numbers = (backoff, omega_low, guess)
-    row, Ak, Bk, Ck = design(A, B, C, w, grid, sigma, *numbers, channels, delta)
-    none = _no_gradients(plant)
+    count = design_plant.dA.shape[0]
+    total = count + design_plant.w.size + (design_plant.delta > 0.0)
+    none = (np.full((len(loops) + 1, total), nan), np.full(count, nan), np.full(len(loops), nan))
+    to_gamma = np.full(total, nan)
     if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED]:
-        return row, Ak, Bk, Ck, *none
-    points = row[Figure.BANDWIDTH], row[Figure.PEAK_FREQUENCY], omega_low
-    loops = [Loop(A, B, C, dA, dB, dC, float(point)) for point in points]
+        return *none, to_gamma, True
     with np.errstate(all="ignore"):  # an undefined number is seen in the result
-        gamma_opt, found, ok = float(row[Figure.GAMMA_OPT]), none, True
-        posed = _posed(plant)
+        posed, gamma_opt, ok = _posed(design_plant), float(row[Figure.GAMMA_OPT]), True
         if row[Figure.LIMITED_BY_BOUND] > 0.5:
-            *slopes, w_ = _bound_gradient(plant, grid, sigma)
+            *slopes, to_weights = _bound_gradient(design_plant, grid, sigma)
         else:
-            *slopes, w_, ok = gamma_gradient(*posed, gamma_opt)
-        if ok:
-            to_theta = _contract([part[None] for part in slopes], [(dA, dB, dC)])[0]
-            gamma_slope = np.concatenate([to_theta, w_])
-            *found, ok = figure_gradients(plant, posed, gamma_opt, gamma_slope, loops)
-    if not ok and channels:  # rounding put the blocks' γ_opt below the whole plant's: from that
-        return design_with_gradients(
-            A, B, C, w, grid, sigma, *numbers, dA, dB, dC, delta=delta
-        )  # fmt: skip
-    return row, Ak, Bk, Ck, *(found if ok else none)
-
-
-def off_design_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Array,
-                         loops: Sequence[Loop]) -> tuple[Array, Array, Array]:  # fmt: skip
-    """What `figure_gradients` gives but the last, with loops closed on other plants.
-
-    `row` is the synthesis on the design plant, `gamma_slope` the gradient of its γ_opt. NaN
-    where there are no loops, or the synthesis has no gradients.
-    """
-    none = _no_gradients(design_plant)
-    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED] or not loops:
-        return none
-    with np.errstate(all="ignore"):
-        out, fixed, gaps, ok = figure_gradients(
-            design_plant, _posed(design_plant), float(row[Figure.GAMMA_OPT]), gamma_slope, loops
+            *slopes, to_weights, ok = gamma_gradient(posed, gamma_opt)
+        if not ok:
+            return *none, to_gamma, False
+        changes = (design_plant.dA, design_plant.dB, design_plant.dC)
+        to_theta = _contract([part[None] for part in slopes], [changes])[0]
+        to_gamma = np.concatenate([to_theta, to_weights])
+        if not loops:
+            return *none, to_gamma, True
+        found, held, slopes, gains, gaps, ok = loop_gradients(
+            design_plant, posed, gamma_opt, to_gamma, loops
         )
-    return (out, fixed, gaps) if ok else none
+        if not ok:
+            return *none, to_gamma, False
+        # ω_b by the implicit function theorem; a peak's own frequency drops out (envelope)
+        scale = np.array([-slopes[0], *gains[1:]])
+        out = np.vstack([found / scale[:, None], to_gamma])
+        return out, -held[0] / slopes[0], gaps, to_gamma, True
 
 
 def peak_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Array,
@@ -305,22 +268,15 @@ def peak_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Array,
     return found / gains[:, None] if ok else found
 
 
-def _no_gradients(plant):
-    """NaN in the place of gradients, of the fixed-K gradient and of the gaps."""
-    count = plant.dA.shape[0]
-    total = count + plant.w.size + (plant.delta > 0.0)
-    return np.full((4, total), nan), np.full(count, nan), np.full(3, nan)
-
-
 def _bound_gradient(plant, grid, sigma):
     """Gradients of γ_jω to A, B, C and the weights, at its peak."""
     A, B, C, w, delta = plant.A, plant.B, plant.C, plant.w, plant.delta
+    near, least = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[1], True
     if delta:
-        _, at, least = disturbance_bound(A, B, C, w, delta, grid)
-        *parts, w_, to_delta = disturbance_bound_gradient(A, B, C, w, delta, at, least)
-        return *parts, np.append(w_, to_delta)
-    at = bound_peak(A, B, C, w, gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[1])
-    return bound_gradient(A, B, C, w, at)
+        _, near, least = disturbance_bound(A, B, C, w, delta, grid)
+    at = bound_peak(A, B, C, w, delta, near, least)
+    *parts, w_, to_delta = bound_gradient(A, B, C, w, delta, at, least)
+    return *parts, np.append(w_, to_delta) if delta else w_
 
 
 def _posed(plant):

@@ -1,4 +1,4 @@
-"""Gradients of the generalized plant, and of the bound γ_jω, pulled back to plant and weights.
+"""Gradients of the generalized plant, pulled back to plant and weights.
 
 Of the four-block problem back to δ too: the filter's solution Y stands in B1 = -YCᵀ. With Ȳ the
 gradient to it, one adjoint equation
@@ -126,28 +126,6 @@ def squared_weight_slopes(w, ω):
             2.0 * ω_T * ((A_u / A_l) ** 2 - 1.0) * (ω / b3) ** 2,
         ]
     )
-
-
-def bound_gradient(A, B, C, w, ω):
-    """Gradient of γ_jω at its maximising ω (envelope of the closed form)."""
-    n, p = A.shape[0], C.shape[0]
-    M = 1j * ω * np.eye(n) - A
-    right, left = np.linalg.solve(M, B), np.linalg.solve(M.T, C.T).T
-    U, s, Vh = np.linalg.svd(C @ right)
-    u, v, σ = U[:, p - 1].conj(), Vh[p - 1].conj(), s[p - 1]
-    W1, W2, W3 = squared_weights(w, ω)
-    R = W2 / σ**2 + W3
-    total = W1 + R
-    gamma = np.sqrt(W1 * R / total)
-    to_W1 = (R / total) ** 2 / (2.0 * gamma)  # dγ/d|W1|²
-    to_R = (W1 / total) ** 2 / (2.0 * gamma)
-    factor = to_R * (-2.0 * W2 / σ**3)
-    ul, rv = u @ left, right @ v
-    A_ = factor * np.outer(ul, rv).real
-    B_ = factor * np.outer(ul, v).real
-    C_ = factor * np.outer(u, rv).real
-    to_squares = np.repeat([to_W1, to_R / σ**2, to_R], [3, 2, 3])
-    return A_, B_, C_, to_squares * squared_weight_slopes(w, ω)
 
 
 class FourBlockPullback:

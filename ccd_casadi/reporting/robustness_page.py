@@ -88,8 +88,7 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         step = f"{1e6 * run.sampling.period:.5g} µs"
         words.append(
             f"A controller in discrete time, a step every {step}, hold and "
-            "delay exact at the instants; noise and the structured singular value are of "
-            "continuous ones."
+            "delay exact at the instants; the structured singular value is of continuous ones."
         )
     return words
 
@@ -180,7 +179,7 @@ def _gains(run: FinishedRun, found: Study) -> Section:
     share = 1e-9 if d.sensor == 1.0 else 1.0
     sensor = f"{1e9 * share * d.sensor:.4g} nm/√Hz"
     force = f"{d.disturbance:g} N/√Hz"
-    rms = () if n is None else (
+    rms = (
         ("position by sensor noise", 1e9 * share * n.position_by_noise, f"nm RMS for {sensor}"),
         ("force by sensor noise", share * n.force_by_noise, f"N RMS for {sensor}"),
         ("position by force noise", 1e6 * n.position_by_disturbance, f"µm RMS for {force}"),
@@ -192,7 +191,7 @@ def _gains(run: FinishedRun, found: Study) -> Section:
         run, found, "Sensitivity, complementary sensitivity, position by a force at the actuators "
         "(GS), and force by sensor noise (KS).",
     )  # fmt: skip
-    white = (Heading("White noise (one-sided density)"), Facts(facts)) if facts else ()
+    white = (Heading("White noise (one-sided density)"), Facts(facts))
     body = (drawn, Facts(tuple(tops)), Words(found.statics.words), *white)
     return Section("Disturbance and noise", body)
 

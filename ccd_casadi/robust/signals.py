@@ -1,8 +1,6 @@
 """From disturbance force and sensor noise to position and force: responses and RMS values.
 
-    y = G S_i d - T n,   u = S_i d - K S n    (r = 0, S_i = (I + KG)⁻¹, e = -y - n)
-
-White noise of one-sided density s (unit/√Hz) through H has the variance s² ‖H‖₂²/2.
+y = G S_i d - T n,   u = S_i d - K S n    (r = 0, S_i = (I + KG)⁻¹, e = -y - n)
 """
 
 from collections.abc import Callable
@@ -11,10 +9,13 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_continuous_lyapunov
 
+from ccd_casadi.budget.derivatives import covariance
+from ccd_casadi.budget.loops import process
+from ccd_casadi.budget.sources import Kind, ShapedSpectrum, Source
 from ccd_casadi.lti.closed_loop import ClosedLoop, largest, responses_of
 from ccd_casadi.lti.grid import climbed
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.support.arrays import Array
 
@@ -61,21 +62,16 @@ def _of_row(gain: Callable[[Array], Array], row: int, omega: float) -> float:
     return float(gain(np.array([omega]))[row, 0])
 
 
-def noise(loop: ClosedLoop, sensor: float, disturbance: float) -> Noise:
-    """RMS values for white sensor noise (m/√Hz) and white force at every input (N/√Hz)."""
-    by_noise = _covariance(loop.A, loop.B_r, sensor)
-    by_force = _covariance(loop.A, loop.B_d, disturbance)
-    force = _rms(loop.C_u, by_noise)
-    if loop.D_u.any():  # white noise straight to the force has no finite variance
-        force = np.full_like(force, np.inf)
-    return Noise(
-        _rms(loop.C_y, by_noise), force, _rms(loop.C_y, by_force), _rms(loop.C_u, by_force)
-    )
+def noise(loop: Loop, sensor: float, disturbance: float) -> Noise:
+    """RMS values for white sensor noise (m/√Hz) and white force at every input (N/√Hz).
 
-
-def _covariance(A: Array, B: Array, density: float) -> Array:
-    return solve_continuous_lyapunov(A, -0.5 * density**2 * (B @ B.T))
-
-
-def _rms(C: Array, X: Array) -> Array:
-    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", C, X, C), 0.0))
+    They are those of an error budget of both sources: of a sampled loop at its instants.
+    """
+    found = []
+    for kind, density in ((Kind.SENSOR_NOISE, sensor), (Kind.FORCE, disturbance)):
+        of = process(loop, Source(kind.value, kind, ShapedSpectrum(density**2))).balanced()
+        P = covariance(of.A, of.noise, sampled=of.sampled)
+        position, force = (np.einsum("ij,jk,ik->i", C, P, C) for C in (of.C, of.F))
+        force = np.full_like(force, np.inf) if of.infinite_force else force + (of.V**2).sum(1)
+        found += [np.sqrt(np.maximum(position, 0.0)), np.sqrt(np.maximum(force, 0.0))]
+    return Noise(*found)

@@ -43,8 +43,8 @@ class Study:
     the frequencies in rad/s (0: at rest), which the grid does not decide; `moves` the move without
     and with feedforward.
 
-    `structured` is None where no flexible mode is in the loop. Of a controller in discrete time
-    there is no `noise` and no `structured` bound.
+    `structured` is None where no flexible mode is in the loop, and of a controller in discrete
+    time.
     """
 
     demands: Demands
@@ -52,7 +52,7 @@ class Study:
     gains: Array
     peaks: tuple[tuple[float, float], ...]
     margins: Margins
-    noise: Noise | None
+    noise: Noise
     statics: Statics
     shift: Line
     damping: Line
@@ -96,7 +96,7 @@ def robustness(
         gains=sizes(HZ * hz),
         peaks=highest(sizes, HZ * hz) if sampled else norms(loop.closed),
         margins=margins(loop.responses, hz),
-        noise=None if sampled else noise(loop.closed, d.sensor, d.disturbance),
+        noise=noise(loop, d.sensor, d.disturbance),
         statics=statics(
             run.plant.plant_si(),
             run.controller,
@@ -143,7 +143,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
     peaks = [item.peak for item in hard.judged if item.stable]
     quantiles = np.quantile(peaks, [0.5, 0.95, 1.0]) if peaks else ()
     margins, at, S_max = found.margins, found.statics, run.problem.inner.S_max
-    noise = None if found.noise is None else {
+    noise = {
         "sensor_density": d.sensor, "force_density": d.disturbance,
         **{f"rms_{key}": value.tolist() for key, value in vars(found.noise).items()},
     }  # fmt: skip

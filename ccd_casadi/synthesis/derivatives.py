@@ -8,13 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ccd_casadi.kernels.design import failed_row
-from ccd_casadi.kernels.gradients import (
-    DesignPlant,
-    Loop,
-    design_with_gradients,
-    off_design_gradients,
-)
+from ccd_casadi.kernels.design import design, failed_row
+from ccd_casadi.kernels.gradients import DesignPlant, Loop, figure_gradients
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import Shown
@@ -72,7 +67,6 @@ def sensitivities(
     *,
     omega_low: float,
     gamma_backoff: float = 1.02,
-    guess: float = 0.0,
     compliance: bool = False,
 ) -> Sensitivities:
     """Synthesise, certify and differentiate at one point; gradients are NaN if not certified.
@@ -81,47 +75,45 @@ def sensitivities(
     With a family the peak is the largest on any of it, its gradient that of the plant that has it;
     so is ‖GS‖∞, which is among the values where `compliance` asks for it.
     """
-    w0 = plant.omega_0
-    w = weights.scaled(w0)
+    w0, count = plant.omega_0, plant.dA.shape[0]
     made_on = plant if plant.family is None else plant.family.design
-    arguments = (made_on.A, made_on.B, made_on.C, w, made_on.grid, made_on.gain, gamma_backoff)
-    slopes = (made_on.dA, made_on.dB, made_on.dC)
-    count = plant.dA.shape[0]
     names = _WEIGHTS + (("disturbance",) if weights.delta else ())
-    scaled = np.append(w, weights.delta)
-    figures = made = None
+    scaled = np.append(weights.scaled(w0), weights.delta)
+    made_at = DesignPlant(made_on.A, made_on.B, made_on.C, made_on.dA, made_on.dB, made_on.dC,
+                          weights.scaled(w0), gamma_backoff, weights.delta)  # fmt: skip
+    made = None
     try:
-        row, *controller, gradient, fixed, gaps = design_with_gradients(
-            *arguments, omega_low / w0, guess, *slopes, made_on.channels, weights.delta
-        )
-        made = Made(row, (controller[0], controller[1], controller[2]), gradient[3].copy())
-        if plant.family is not None or compliance:
-            figures, worst = over_family(plant, weights, row, made.controller, omega_low)
-            made = replace(made, worst=[at is worst for at in plant.members].index(True))
+        # Rounding may put the blocks' γ_opt below the whole plant's: it is then made from that.
+        for channels in (made_on.channels, ()) if made_on.channels else ((),):
+            row, *controller = design(*made_at[:3], made_at.w, made_on.grid, made_on.gain,
+                                      gamma_backoff, omega_low / w0, 0.0, channels,
+                                      weights.delta)  # fmt: skip
+            K = (controller[0], controller[1], controller[2])
+            figures, worst = over_family(plant, weights, row, K, omega_low)
             places = [
                 (plant, figures.bandwidth, False),
                 (worst, figures.sensitivity_peak_frequency, False),
                 (plant, omega_low, False),
             ]
             if compliance and figures.certified:
-                most = compliance_over_family(plant, plant.controller_si(*controller))
+                most = compliance_over_family(plant, plant.controller_si(*K))
                 figures = replace(figures, compliance=most.gain)
                 places.append((most.plant, most.omega, True))
             loops = [
                 Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega / w0, of_force)
                 for at, omega, of_force in places
             ]
-            made_at = DesignPlant(*arguments[:3], *slopes, w, gamma_backoff, weights.delta)
-            gradient, fixed, gaps = off_design_gradients(
-                made_at, row, gradient[3], loops if figures.certified else []
+            gradient, fixed, gaps, to_gamma, whole = figure_gradients(
+                made_at, row, made_on.grid, made_on.gain, loops if figures.certified else []
             )
+            if whole:
+                break
+        made = Made(row, K, to_gamma, [at is worst for at in plant.members].index(True))
     except np.linalg.LinAlgError:
-        row, gradient = failed_row(), np.full((4, count + len(names)), np.nan)
-        fixed, gaps = np.full(count, np.nan), np.full(3, np.nan)
+        figures = figures_from_row(failed_row(), weights.omega_S, weights.omega_T, w0)
+        gradient, fixed = np.empty((0, count + len(names))), np.full(count, np.nan)
     if len(gradient) != 4 + compliance:
-        gradient = np.full((5, gradient.shape[1]), np.nan)
-    if figures is None:
-        figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+        gradient, gaps = np.full((4 + compliance, gradient.shape[1]), np.nan), np.full(3, np.nan)
     if figures.certified and not np.isfinite(gradient).all():
         figures = replace(figures, outcome=Outcome.NO_DERIVATIVES)
     gradient[0] *= w0

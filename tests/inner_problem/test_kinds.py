@@ -36,7 +36,7 @@ from ccd_casadi.synthesis import derivatives, synthesis
 
 KINDS = kinds()
 SYNTHESISE = [  # every way to a controller
-    (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design_with_gradients"),
+    (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design"),
     (sections_bandwidth, "synthesise"), (sections_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design

@@ -149,8 +149,8 @@ def norms(plant: ScaledPlant, controller: StateSpace, weights: Weights):
     """The norm by the refined grid, and the level test as a function of the claim."""
     G, K, Dk, w, loop = kernels_of(plant, controller, weights)
     poles = np.linalg.eigvals(loop[0])
-    norm, _ = stack_norm(G, K, Dk, w, certificate_grid(poles.real.copy(), poles.imag.copy()))
-    return norm, lambda claim: level_test(G, K, Dk, w, loop, claim)
+    norm, _ = stack_norm(G, K, Dk, w, 0.0, certificate_grid(poles.real.copy(), poles.imag.copy()))
+    return norm, lambda claim: level_test(G, K, Dk, w, 0.0, loop, claim)
 
 
 @few(max_examples=40)

@@ -21,8 +21,7 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.synthesis.weights import Weights
 
-to_plant, bound_gradient = pullback.to_plant, pullback.bound_gradient
-bound_slope = bound_peak._bound_slope
+to_plant = pullback.to_plant
 # what is compiled takes floating-point numbers only
 plain_weights = getattr(squared_weights, "py_func", squared_weights)
 seeds = st.integers(0, 10**6)
@@ -90,7 +89,7 @@ def test_the_gradient_of_the_bound_at_one_frequency(seed: int, p: int, at: float
         gain = plant_gain(A + x * dA, B + x * dB, C + x * dC, np.array([omega]))[0]
         return float(np.sqrt(lower_bound_squared(moved, gain, omega)))
 
-    A_, B_, C_, w_ = bound_gradient(A, B, C, w, omega)
+    A_, B_, C_, w_, _ = bound_peak.bound_gradient(A, B, C, w, 0.0, omega)
     found = np.sum(A_ * dA) + np.sum(B_ * dB) + np.sum(C_ * dC)
     size = bound(0.0)
     assert found == pytest.approx(difference(bound, 1e-5), rel=1e-5, abs=1e-7 * size)
@@ -110,7 +109,7 @@ def test_the_slope_of_the_bound_over_frequency(seed: int, p: int, at: float) -> 
         gain = plant_gain(plant.A, plant.B, plant.C, np.array([x]))[0]
         return float(lower_bound_squared(w, gain, x))
 
-    slope = bound_slope(plant.A, plant.B, plant.C, w, omega) * omega
+    slope = bound_peak.bound_slope(plant.A, plant.B, plant.C, w, 0.0, omega) * omega
     assert slope == pytest.approx(difference(squared, 1e-5), rel=1e-6, abs=1e-7 * squared(0.0))
 
 
@@ -122,12 +121,15 @@ def test_the_place_of_the_bound_is_found_from_either_side(off: float) -> None:
     start = gamma_lower_bound(
         prepare(*arguments[:3]), arguments[3], case.plant.grid, case.plant.gain
     )[1]
-    top = bound_peak.bound_peak(*arguments, start)
-    curve = (
-        bound_slope(*arguments, top * (1.0 + 1e-7)) - bound_slope(*arguments, top * (1.0 - 1e-7))
-    ) / 2e-7
+    top = bound_peak.bound_peak(*arguments, 0.0, start)
+    above, here, below = (
+        bound_peak.bound_slope(*arguments, 0.0, top * (1.0 + h)) for h in (1e-7, 0.0, -1e-7)
+    )
+    curve = (above - below) / 2e-7
     assert curve < 0.0  # dslope/dln ω
-    assert abs(bound_slope(*arguments, top)) < 1e-10 * abs(curve)
+    assert abs(here) < 1e-10 * abs(curve)
     near = 1e-2 * off  # the peak is some 1e-3 of its frequency wide
-    assert bound_peak.bound_peak(*arguments, top * (1.0 + near)) == pytest.approx(top, rel=1e-10)
-    assert bound_peak.bound_peak(*arguments, 0.2 * top) == 0.2 * top
+    assert bound_peak.bound_peak(*arguments, 0.0, top * (1.0 + near)) == pytest.approx(
+        top, rel=1e-10
+    )
+    assert bound_peak.bound_peak(*arguments, 0.0, 0.2 * top) == 0.2 * top

@@ -123,8 +123,10 @@ def test_the_gain_of_the_stack_is_that_of_the_si_loop(seed: int, p: int, m: int)
         plant.plant_si(), in_time_unit(K, 1.0 / plant.omega_0, 1.0 / plant.force), weights,
         omega * plant.omega_0,
     )  # fmt: skip
-    np.testing.assert_allclose(certificate.stack_gains(G, k, K.D, w, omega), expected, rtol=1e-8)
-    one = [certificate.stack_gain(G, k, K.D, w, at) for at in omega]
+    np.testing.assert_allclose(
+        certificate.stack_gains(G, k, K.D, w, 0.0, omega), expected, rtol=1e-8
+    )
+    one = [certificate.stack_gain(G, k, K.D, w, 0.0, at) for at in omega]
     np.testing.assert_allclose(one, expected, rtol=1e-8)
 
 
@@ -151,16 +153,16 @@ def test_a_gain_above_the_level_at_a_candidate_is_not_passed() -> None:
     w = np.array([2.0, 1e-3, 1e-3, 1.0, 1.0, 1.0, 1.0, 1.0])  # |W1| is 1/2 but far below
     Dk = 0.3 * one
     level = 0.65
-    assert certificate.stack_gain(G, K, Dk, w, omega) > 1.1 * level
+    assert certificate.stack_gain(G, K, Dk, w, 0.0, omega) > 1.1 * level
     for beside in (0.5, 0.99, 1.01, 2.0):
-        assert certificate.stack_gain(G, K, Dk, w, beside * omega) < level
+        assert certificate.stack_gain(G, K, Dk, w, 0.0, beside * omega) < level
     # a loop that has its one candidate there: |a/(jω + a)| = level
     a = omega / np.sqrt(level**-2 - 1.0) * one
     loop = (-a, one, a, 0.0 * one)
     assert sensitivity.axis_frequencies(*loop, level)[0] == pytest.approx([omega], rel=1e-9)
-    assert not certificate.level_test(G, K, Dk, w, loop, level)
+    assert not certificate.level_test(G, K, Dk, w, 0.0, loop, level)
     flat = frequency.prepare(-one, one, 0.0 * one)
-    assert certificate.level_test(flat, K, Dk, w, loop, level)
+    assert certificate.level_test(flat, K, Dk, w, 0.0, loop, level)
 
 
 def test_the_loop_of_s_is_the_inverse_of_one_plus_gk() -> None:

@@ -15,6 +15,7 @@ from scipy.integrate import trapezoid
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
@@ -120,7 +121,7 @@ def test_every_gain_inside_the_joint_disk_keeps_a_2_x_2_loop() -> None:
 
 
 def test_rms_values_against_integrals_over_frequency(run: FinishedRun) -> None:
-    found = noise(closed_loop(run.plant.plant_si(), run.controller), 1e-9, 2e-3)
+    found = noise(Loop(run.plant.plant_si(), run.controller), 1e-9, 2e-3)
     hz = np.unique(np.concatenate([np.geomspace(1e-4, 1e5, 20001), np.linspace(100, 300, 20001)]))
     G, K, S = responses(run.plant, run.controller, HZ * hz)
     T, GS = (G @ K @ S)[:, 0, 0], (S @ G)[:, 0, 0]
