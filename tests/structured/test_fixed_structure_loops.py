@@ -205,8 +205,9 @@ def test_derivatives_of_the_peaks(seed: int, sampling: Sampling | None) -> None:
     assert (np.abs(slopes(moved, theta, 2e-3) - exact) / scale).max() < 1e-5
 
 
-def test_the_hessian_of_every_peak_moves_with_the_peak() -> None:
-    problem, kappa = loop(2, Structure(), FAST)
+@pytest.mark.parametrize("seed", [1, 4])  # of loops well inside stability: a needle's differences
+def test_the_hessian_of_every_peak_moves_with_the_peak(seed: int) -> None:  # are not exact
+    problem, kappa = loop(seed, Structure(), FAST)
     tau = -2.2
     peaks = assess(problem, kappa, tau).peaks
     assert peaks is not None
