@@ -15,7 +15,11 @@ from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant, with_sections
+from ccd_casadi.inner_problem.sections_plant_set import (
+    nearby,
+    uncertain_plant,
+    with_sections,
+)
 from ccd_casadi.inner_problem.sections_search import with_range
 from ccd_casadi.plants.plant import mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
@@ -55,7 +59,8 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
 ) -> None:
     """Of peaks that move, along random directions, the frequency of each found anew."""
     omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
-    model = JointModel(built(), Place((60.0, 60.0), stored, omega), 0.1)
+    problem, theta = built(), (60.0, 60.0)
+    model = JointModel(problem, nearby(problem, [theta], theta), Place(theta, stored, omega), 0.1)
     family, start = model.loops, model.start
     z, kappa, tau = model.parts(start)
     loops = family(z)
@@ -94,7 +99,7 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         sampler = Sampler(problem, store, Workers(1))
         first = sampler.bandwidths(np.array(problem.start))[0]
         at = Place(first.theta, first.kappa, first.bandwidth)
-        promised = proposed(problem, at, 0.05)
+        promised = proposed(problem, nearby(problem, [at.theta], at.theta), at, 0.05)
         assert promised.gain > 0.0
         last, best, settled = together(sampler, np.array(problem.start))
         assert settled
