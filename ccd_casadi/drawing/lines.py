@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -132,7 +132,7 @@ def _draw(axes: "Axes", panel: Panel) -> None:
             axes.set_ylim(low, high * (high / low) ** labels.share(names))
             labels = _labels(axes, panel)
             where, _ = labels.corner(names)
-        axes.legend(loc=where, borderaxespad=0.2)
+        axes.legend(loc=cast(Any, where), borderaxespad=0.2)
         labels.take_corner(names, where)
     for mark in panel.marks:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
@@ -147,7 +147,8 @@ def _labels(axes: "Axes", panel: Panel) -> Labels:
         labels.avoid_curve(curve.x, curve.y, joined=bool(curve.line))
     for level in panel.levels:
         one, ends = [level.value] * 2, axes.get_ylim() if level.vertical else axes.get_xlim()
-        labels.avoid_curve(*((one, ends) if level.vertical else (ends, one)), apart=4.0 * APART)
+        x, y = (one, ends) if level.vertical else (ends, one)
+        labels.avoid_curve(x, y, apart=4.0 * APART)
     for mark in panel.marks:
         labels.avoid(mark.x, mark.y)
     return labels
