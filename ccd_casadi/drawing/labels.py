@@ -143,8 +143,8 @@ class Labels:
     def _held(self, x: float | None, y: float | None) -> str:
         """The point, or the line, that words belong to in pt of the picture, for its script."""
         a, b = self._at(self._axes.get_xlim()[0] if x is None else x,
+                        self._axes.get_ylim()[0] if y is None else y)  # fmt: skip
         tall = 72.0 * self._axes.figure.bbox.height / self._axes.figure.dpi
-        tall = 72.0 * self._axes.figure.get_size_inches()[1]  # type: ignore[union-attr]
         return f"at:{'' if x is None else f'{a:.1f}'},{'' if y is None else f'{tall - b:.1f}'}"
 
     def _best(self, boxes: Sequence[Box]) -> int | None:
