@@ -140,9 +140,7 @@ def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOpt
     return tuple(found)
 
 
-def _climbed(
-    problem: LoopProblem, running: Sequence[Runner], workers: Pool
-) -> list[Runner]:
+def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool) -> list[Runner]:
     """All of them some steps further, in their order."""
     tasks = [(i, problem, r.point, r.radius) for i, r in enumerate(running)]
     ends = dict(workers.map_unordered(_climb, tasks))
