@@ -25,6 +25,7 @@ import json, sys, time
 sys.path.insert(0, sys.argv[1])
 from random_sections import case
 from ccd_casadi.fixed_structure.design import synthesise_sections
+assert sys.modules["ccd_casadi"].__file__.startswith(sys.argv[2])
 for line in sys.stdin:
     seed = int(line)
     asked = case(seed)
@@ -41,8 +42,8 @@ for line in sys.stdin:
 def process(tree: Path) -> subprocess.Popen[str]:
     """One that answers seeds with the package of a tree."""
     return subprocess.Popen(
-        [sys.executable, "-c", CODE, str(HERE)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True, env=os.environ | {"PYTHONPATH": str(tree)},
+        [sys.executable, "-c", CODE, str(HERE), str(tree)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        text=True, cwd=tree, env=os.environ | {"PYTHONPATH": str(tree)},
     )  # fmt: skip
 
 

@@ -285,7 +285,7 @@ def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
             break
         design, tell = value_at(sampler, best).design, teller("on the way", sampler.quiet)
         members = worst_members(sampler.problem, best.theta, design, turn, tell)[1]
-        if settled and not members:
+        if not members and (settled or np.array_equal(best.theta, theta)):
             break
         theta = np.array(best.theta)
         sampler = with_members(sampler, design.kappa, members) if members else sampler
