@@ -138,9 +138,7 @@ def solve_nested(
     best = _best(problem, sampler.latest(samples))
     message = "" if agreed else "prediction and truth did not agree within the budget"
     surrogates = () if surrogate is None else (surrogate,)
-    return FormulationResult(
-        best.joint, None, tuple(iterates), surrogates, solution, agreed, message
-    )
+    return FormulationResult(best.joint, tuple(iterates), surrogates, solution, agreed, message)
 
 
 def fit_bandwidth(

@@ -194,10 +194,9 @@ def load_version(run: Path, name: str) -> tuple[GaussianProcess, ...]:
     if name not in known:
         words = f"known are {known[0]} to {known[-1]}" if known else "there are none yet"
         raise SurrogateFileError(f"{path}: there is no such version; {words}")
-    members = load(path)[0]
-    processes = tuple(m for m in members if isinstance(m, GaussianProcess))
-    if len(processes) != len(members) or not processes:
-        raise SurrogateFileError(f"{path}: holds other surrogates than Gaussian processes")
+    processes = load(path)[0]
+    if not processes:
+        raise SurrogateFileError(f"{path}: holds no surrogate")
     return processes
 
 

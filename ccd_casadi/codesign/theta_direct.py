@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.optim.pieces import FIRST, Local, descend
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
-from surrogates import design
 
 SETTLED = 1e-7  # of J: what steps promise less than that is not looked for
 FAR = 0.1  # of the box: the first radius where the optimum is not known to be near by
@@ -38,27 +36,6 @@ class TrueBandwidth:
     def known(self) -> list[BandwidthSample]:
         """What is known by now of all that were asked for."""
         return self.sampler.latest(list(self.asked.values()))
-
-
-def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:
-    """From the case's start, and by long steps from each of a Sobol set beside it (`pieces_from`).
-
-    From one start alone it is the polish that follows.
-    """
-    problem = sampler.problem
-    points = np.array(problem.start)[None, :]
-    if starts > 1:
-        points = np.vstack([points, design("sobol", *box(problem), starts - 1, seed)])
-    truth = TrueBandwidth(sampler, "direct")
-    good = [one for one in truth.all_at(points) if np.isfinite(one.gradient).all()]
-    good = [one for one in good if np.isfinite(objective_of(problem, one))]
-    if not good:
-        message = f"none of {len(points)} starting designs is certified"
-        return FormulationResult(message=message)
-    if starts > 1:
-        good = [pieces_from(truth, one, SETTLED, FAR) for one in good]
-    best = min(good, key=lambda one: objective_of(problem, one))
-    return FormulationResult(np.array(best.theta), None, (), (), None, True, "")
 
 
 def pieces_from(
