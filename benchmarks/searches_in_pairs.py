@@ -2,8 +2,8 @@
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/searches_in_pairs.py --other TREE [--problems N]
 
-The problems are those of benchmarks/structured_peers.py, each searched from the same 12 starts. TREE
-is another checkout, in which only what is compared should differ. Every problem runs in a process
+The problems are those of benchmarks/structured_peers.py, each searched from the same 12 starts.
+TREE is another checkout, in which only what is compared should differ. Every problem runs in a process
 of each tree, one after the other, so that both meet the same load. What --out holds is not run
 again.
 """
@@ -42,14 +42,15 @@ for line in sys.stdin:
 def process(tree: Path) -> subprocess.Popen[str]:
     """One that answers seeds with the package of a tree."""
     return subprocess.Popen(
-        [sys.executable, "-c", CODE, str(HERE), str(tree)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True, cwd=tree, env=os.environ | {"PYTHONPATH": str(tree)},
+        [sys.executable, "-c", CODE, str(HERE), str(tree)], stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE, text=True, cwd=tree, env=os.environ | {"PYTHONPATH": str(tree)},
     )  # fmt: skip
 
 
 def answer(worker: subprocess.Popen[str], seed: int) -> dict[str, Any]:
     """Of one process to a seed."""
-    assert worker.stdin and worker.stdout
+    assert worker.stdin
+    assert worker.stdout
     print(seed, file=worker.stdin, flush=True)
     row: dict[str, Any] = json.loads(worker.stdout.readline())
     return row
