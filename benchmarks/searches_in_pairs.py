@@ -3,9 +3,9 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/searches_in_pairs.py --other TREE [--problems N]
 
 The problems are those of benchmarks/structured_peers.py, each searched from the same 12 starts.
-TREE is another checkout, in which only what is compared should differ. Every problem runs in a process
-of each tree, one after the other, so that both meet the same load. What --out holds is not run
-again.
+TREE is another checkout, in which only what is compared should differ. Every problem runs in a
+process of each tree, one after the other, so that both meet the same load. What --out holds is not
+run again.
 """
 
 import argparse
