@@ -46,7 +46,8 @@ from surrogates import GaussianProcess, design, quality_of
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
 BASIN = 1e-4  # residual of an end whose basin is not searched again
-COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
+# Of left-out samples, for surrogates to rule anything out: Q², and within their 95 % bands.
+EXPLAINED, COVERAGE = 0.99, 0.8
 NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
 
 
@@ -175,8 +176,8 @@ class MixedOuter(Outer):
         if len(processes) < 2 or self._may_jump(x):
             return ()
         middle = 0.5 * (processes[0].lower + processes[0].upper)
-        found = [quality_of(process, middle, seed=seed) for process in processes]
-        sound = all(q.smooth_enough and q.coverage >= COVERAGE for q in found)
+        found = [quality_of(process, middle) for process in processes]
+        sound = all(q.loo.q2 >= EXPLAINED and q.coverage >= COVERAGE for q in found)
         return processes if sound else ()
 
     def _may_jump(self, x: Array) -> bool:

@@ -134,7 +134,7 @@ def concluded(
         return Solution(result, outcome, None)
     with sampler.spent.on("checks"):
         verified = outer.verified(found.end, found.rounds)
-    quality = surrogate_quality(outcome.surrogates, verified, seed, quiet=sampler.quiet)
+    quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
     result = result_dict(
         formulation, outcome, verified, tolerance=tolerance, spent=sampler.spent.by_purpose,
         seconds=perf_counter() - began, seed=seed, quality=quality, look=found.look,

@@ -29,7 +29,6 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     sections_of_problem,
     structure_of,
     uncertain_plant,
-    with_sections,
 )
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
 from ccd_casadi.plants.plant import hardware_cost, to_first_order
@@ -68,12 +67,12 @@ class Proposal:
     gain: float
 
 
-def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample, bool]:
-    """From θ towards where the joint search promises no more: the sampler of the problem whose
-    anchor is the controller there, its true sample, and whether no more is promised."""
+def together(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, bool]:
+    """From θ towards where the joint search promises no more: the true sample there, and whether no
+    more is promised."""
     problem, first = sampler.problem, sampler.bandwidths(theta, "polishing")[0]
     if not np.isfinite(objective_of(problem, first)):
-        return sampler, first, True
+        return first, True
     best, J = Place(first.theta, first.kappa, first.bandwidth), objective_of(problem, first)
     reach, stretch, settled = REACH, 1.0, False
     for _ in range(CYCLES):
@@ -96,12 +95,11 @@ def together(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample, 
         elif gained < POOR * found.gain:
             reach *= 0.3
     if best.theta == first.theta:
-        return sampler, first, settled
-    other = sampler.of(with_sections(problem, anchors=(best.kappa,)))
-    last = other.bandwidths(np.array(best.theta), "polishing")[0]
+        return first, settled
+    last = sampler.climbed(best.theta, best.kappa)
     if objective_of(problem, last) < objective_of(problem, first):
-        return other, last, settled
-    return sampler, first, True
+        return last, settled
+    return first, True
 
 
 def stretched(problem: CoDesignProblem, here: Place, there: Place, factor: float) -> Place:

@@ -94,12 +94,13 @@ def synthesise_sections(
     rng = np.random.default_rng(seed)
     begun_at = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
     pool = kept(problem, np.reshape(begun_at, (-1, len(structure.names))))
+    known = len(pool)
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     tell = progress or (lambda words: None)
     if not len(pool):
         return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
-    runners = run_race(problem, pool, tell, workers)
+    runners = run_race(problem, pool, tell, workers, known=known)
     for _ in range(0 if only_initial else REDRAWS):
         best = runners[0].merit
         fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)

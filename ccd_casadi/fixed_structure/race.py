@@ -26,6 +26,7 @@ WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahea
 MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
 LOWERED = 6  # steps at most to the bandwidth of a controller
+NEWTON = 8  # and to that of one that is known
 WITHIN = 1e-4  # ln: a violation that the end of a search may have
 
 
@@ -65,13 +66,16 @@ def run_race(
     tell: Callable[[str], None],
     workers: Pool | None = None,
     before: Sequence[Runner] = (),
+    known: int = 0,
 ) -> list[Runner]:
     """All searches from the starts `pool` (N, n), the best first.
 
-    Those of searches `before` are in the field too: they climb no more, but have to be overtaken.
+    The first `known` of these are controllers that searches have ended with. Those of searches
+    `before` are in the field too: they climb no more, but have to be overtaken.
     """
     field = [replace(runner, running=False) for runner in before]
-    field += [Runner(started(problem, kappa)) for kappa in pool]
+    field += [Runner(at_its_bandwidth(problem, kappa)) for kappa in pool[:known]]
+    field += [Runner(started(problem, kappa)) for kappa in pool[known:]]
     scale = problem.plants.omega_0 / (2.0 * np.pi)
     for turn in range(ROUNDS):
         running = [runner for runner in field if runner.running]
@@ -107,6 +111,25 @@ def started(problem: LoopProblem, kappa: Array) -> Point:
             break
         point = Point(kappa, tau, assess(problem, kappa, tau))
     return first
+
+
+def at_its_bandwidth(problem: LoopProblem, kappa: Array) -> Point:
+    """A known controller at the largest ω_b that the shape and -3 dB leave it.
+
+    From below a climb would first make another controller of it, and end in another optimum.
+    """
+    tau = problem.begin(kappa)
+    for _ in range(NEWTON):
+        point = Point(kappa, tau, assess(problem, kappa, tau))
+        peaks = point.assessment.peaks
+        if peaks is None:
+            break
+        rising = peaks.to_tau > 0.0
+        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=1.0))
+        if abs(room) < WITHIN:
+            break
+        tau += float(np.clip(room, -1.0, 1.0))
+    return point
 
 
 def finished(runners: Sequence[Runner]) -> list[Runner]:
