@@ -113,7 +113,7 @@ def overview(folder: Path) -> str:
     runs = [path.parent for path in sorted(folder.glob("*/result.json"))]
     runs += [path.parent for path in sorted(folder.glob("*/*/result.json"))]
     lines += ["", "cases here", *(f"  ccd solve {path}" for path in cases)] if cases else []
-    lines += ["", "runs here", *(f"  ccd robustness {path}" for path in runs)] if runs else []
+    lines += ["", "finished runs", *(f"  ccd robustness {path}" for path in runs)] if runs else []
     if not cases:
         lines += ["", "no case file here; begin with: ccd new my_stage"]
     return "\n".join(lines)

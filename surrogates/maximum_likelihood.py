@@ -7,7 +7,7 @@ from scipy.linalg import cho_solve
 
 from surrogates.covariance import Hyperparameters, Kernel
 from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
-from surrogates.interface import Array, SurrogateFitError
+from surrogates.interface import Array, SurrogateFitError, errors
 from surrogates.likelihood import (
     LENGTH_BOUNDS,
     NOISE_BOUNDS,
@@ -16,7 +16,6 @@ from surrogates.likelihood import (
     maximised,
 )
 from surrogates.samples import Samples
-from surrogates.validation import errors
 
 # The likelihood costs O(N³) a look. Several starts are tried on at most START_ORDER
 # observations, the best polished on at most POLISH_ORDER: hyperparameters hardly
@@ -45,7 +44,7 @@ def fit_process(
     if samples.observations > EXACT_LIMIT:
         raise SurrogateFitError(
             f"{samples.observations} observations are more than the {EXACT_LIMIT} an exact "
-            "Gaussian process holds: use kind='polynomial', or fewer samples"
+            "Gaussian process holds: take fewer samples, or leave gradients out"
         )
     parameters = estimate(samples, kernel, seed, starts)
     process = conditioned(parameters, samples, kernel, uneven_noise(samples))

@@ -150,7 +150,7 @@ class OuterSection:
     """
 
     starts: int = key(count(1), 16, says="starts of IPOPT on the surrogates")
-    direct_starts: int = key(count(1), 4, says="starts of IPOPT on the true problem")
+    direct_starts: int = key(count(1), 4, says="local solves on the true problem")
     tolerance: float = key(
         FRACTION, 1e-3, says="largest relative difference of prediction and truth"
     )

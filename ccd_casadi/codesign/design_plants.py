@@ -59,7 +59,7 @@ def continued(sampler: Sampler, x: Array) -> tuple[FormulationResult | None, flo
     if held < 1.0:
         return None, held
     words = "reached by continuation from narrower ranges"
-    return FormulationResult(x, sampler.truth.at(x), agreed=True, message=words), 1.0
+    return FormulationResult(x, agreed=True, message=words), 1.0
 
 
 def best_over_design_plants(

@@ -1,21 +1,12 @@
-"""The direct formulation: IPOPT on the true quantities, and the polish that every solve ends with.
+"""The direct formulation, and the polish of a mixed-sensitivity design that every solve ends with.
 
-Nothing is approximated: each iteration is a certified synthesis with its total derivatives.
+Nothing is approximated: each step is a certified synthesis with its total derivatives.
 """
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import kkt_certificate, newton_step
-from ccd_casadi.codesign.outer_problem import (
-    OuterFailure,
-    lifted_bounds,
-    lifted_program,
-    solve_program,
-)
 from ccd_casadi.codesign.peak_constraints import other_peaks
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective, objective_terms
@@ -24,7 +15,6 @@ from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
-from surrogates import design
 
 ON_EDGE = 1e-4  # ln: so close to a kink or a jump IPOPT, which knows one gradient alone, stalls
 STATIONARY = 1e-7  # scaled KKT residual below which a descent has nothing to do
@@ -35,8 +25,9 @@ LEVEL = 1e-8  # of the terms of J, which may cancel: what ω_b is good to
 
 @dataclass(frozen=True)
 class Direct:
-    """Options of the direct formulation: IPOPT's `starts`; `tolerance` is of the inner problem.
+    """Options of the direct formulation: local solves on the truth go from so many `starts`.
 
+    They are the case's own and a Sobol set over the box. `tolerance` is of the inner problem;
     `box_points` true inner problems over the box are looked at in the end (`box_look`).
 
     >>> Direct(starts=2).starts
@@ -46,34 +37,6 @@ class Direct:
     starts: int = 4
     tolerance: float = 1e-3
     box_points: int = 32
-
-
-def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> FormulationResult:
-    """IPOPT on the true problem from the case's start and a Sobol set of starts."""
-    problem = sampler.problem
-    quantities = sampler.truth
-    program = lifted_program(problem, quantities, exact_hessian=False)
-    lower, upper = lifted_bounds(problem)
-    middle = 0.5 * (lower + upper)
-    first = np.array([*problem.start, *middle[-2:]])
-    points = first[None, :]
-    if options.starts > 1:
-        points = np.vstack([points, design("sobol", lower, upper, options.starts - 1, seed)])
-    certified = [x for x in points if quantities.at(x).figures.certified]
-    if not certified:
-        reason = quantities.at(first).figures.outcome.value
-        message = f"none of {len(points)} starting designs is certified; the first: {reason}"
-        return FormulationResult(message=message)
-    try:
-        solution = solve_program(program, np.array(certified))
-    except OuterFailure as error:
-        return FormulationResult(message=str(error))
-    for optimum in solution.optima:
-        if acceptable(problem, optimum.x, quantities.at(optimum.x)):
-            chosen = quantities.at(optimum.x)
-            return FormulationResult(optimum.x, chosen, (), (), solution, True, "")
-    message = "IPOPT's optima are not certified or not feasible"
-    return FormulationResult(None, None, (), (), solution, False, message)
 
 
 def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities]:

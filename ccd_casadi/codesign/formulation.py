@@ -5,7 +5,6 @@ from typing import Any
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.derivatives import Sensitivities
 from surrogates import GaussianProcess
 
 
@@ -32,12 +31,10 @@ class FormulationResult:
     """x = (θ, ln ω_S, ln ω_T) of the best verified design (None: infeasible) and the way there.
 
     `surrogates` are the processes of ω_b* (nested) or of ω_b, ln‖S‖∞, ln|S(jω_low)| (lifted),
-    none for direct, which has a `design` of its own instead; `agreed` tells whether prediction and
-    truth met the tolerance at the end.
+    none for direct; `agreed` tells whether prediction and truth met the tolerance at the end.
     """
 
     x: Array | None = None
-    design: Sensitivities | None = None
     iterates: tuple[Iterate, ...] = ()
     surrogates: tuple[GaussianProcess, ...] = ()
     outer: OuterSolution | None = None

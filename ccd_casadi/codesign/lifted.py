@@ -101,9 +101,7 @@ def solve_lifted(
         try:
             solution = solve_program(program, spread)
         except OuterFailure as error:
-            return FormulationResult(
-                None, None, tuple(iterates), processes, None, False, str(error)
-            )
+            return FormulationResult(None, tuple(iterates), processes, None, False, str(error))
         x = solution.best.x
         predicted = np.array([float(process.predict(x[None, :])[0]) for process in processes])
         with sampler.spent.on("rounds"):
@@ -121,10 +119,10 @@ def solve_lifted(
             break
     if incumbent is None:
         message = "no design near the predicted optima meets " + ", ".join(problem.inner.bounds)
-        return FormulationResult(None, None, tuple(iterates), processes, solution, False, message)
+        return FormulationResult(None, tuple(iterates), processes, solution, False, message)
     x = np.array(incumbent.x)
     message = "" if agreed else "prediction and truth did not agree within the budget"
-    return FormulationResult(x, None, tuple(iterates), processes, solution, agreed, message)
+    return FormulationResult(x, tuple(iterates), processes, solution, agreed, message)
 
 
 def fit_quantities(

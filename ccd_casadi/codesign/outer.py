@@ -12,9 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
+from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Solution, Verified
@@ -23,7 +27,10 @@ from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
-from surrogates import GaussianProcess
+from ccd_casadi.support.units import counted
+from surrogates import GaussianProcess, design
+
+BASIN = 1e-2  # of the box: ends of local solves on the truth that are closer are of one optimum
 
 
 @dataclass(frozen=True)
@@ -88,11 +95,41 @@ class Outer(ABC):
         """With what the run in a folder ended with, where its kind needs that."""
         return self
 
-    @abstractmethod
     def formulated(
         self, formulation: Formulation, seed: int, given: Surrogates | None = None
     ) -> FormulationResult:
         """One formulation, from the surrogates that are given where there are any."""
+        if isinstance(formulation, Direct):
+            with self.sampler.spent.on("search"):
+                return self.climbed(formulation.starts, seed)
+        return self.fitted(formulation, seed, given)
+
+    @abstractmethod
+    def fitted(
+        self, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None
+    ) -> FormulationResult:
+        """A formulation on surrogates, from those that are given where there are any."""
+
+    def climbed(self, starts: int, seed: int) -> FormulationResult:
+        """The direct formulation: local solves from the case's start and a Sobol set beside it.
+
+        From one start that has a design it is the polish that follows.
+        """
+        problem, (lower, upper) = self.problem, box(self.problem)
+        thetas = np.vstack([problem.start, design("sobol", lower, upper, starts, seed)])[:starts]
+        begun = self.sampler.bandwidths(thetas, "direct")
+        if starts == 1 and begun[0].feasible:
+            return FormulationResult(begun[0].joint, agreed=True)
+        places: list[Place] = []
+        for sample in begun:
+            place = self.solved_from(sample, places)
+            places += [] if place is None else [place]
+        if not places:
+            words = f"no design meets its constraints from {counted(starts, 'start')}"
+            return FormulationResult(message=words)
+        lower, upper = self.bounds
+        ends = distinct([(one.objective, one.x) for one in places], upper - lower, starts, BASIN)
+        return FormulationResult(ends.best.x, outer=ends, agreed=True)
 
     @abstractmethod
     def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
-from ccd_casadi.codesign.direct import Direct, acceptable, polish, solve_direct, true_objective
+from ccd_casadi.codesign.direct import Direct, acceptable, polish, true_objective
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.kinked import SETTLED, descend
@@ -46,7 +46,8 @@ from surrogates import GaussianProcess, design, quality_of
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
 BASIN = 1e-4  # residual of an end whose basin is not searched again
-COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
+# Of left-out samples, for surrogates to rule anything out: Q², and within their 95 % bands.
+EXPLAINED, COVERAGE = 0.99, 0.8
 NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
 
 
@@ -69,16 +70,12 @@ class MixedOuter(Outer):
     def bounds(self) -> tuple[Array, Array]:
         return lifted_bounds(self.problem)
 
-    def formulated(
-        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+    def fitted(
+        self, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None
     ) -> FormulationResult:
-        sampler = self.sampler
         if isinstance(formulation, Nested):
-            return solve_nested(sampler, formulation, seed=seed, given=given)
-        if isinstance(formulation, Lifted):
-            return solve_lifted(sampler, formulation, seed=seed, given=given)
-        with sampler.spent.on("search"):
-            return solve_direct(sampler, formulation, seed=seed)
+            return solve_nested(self.sampler, formulation, seed=seed, given=given)
+        return solve_lifted(self.sampler, formulation, seed=seed, given=given)
 
     def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """The true inner problem at a few θ tells an infeasible case from a formulation that
@@ -91,7 +88,7 @@ class MixedOuter(Outer):
         if not feasible:
             assert self.sampler.nearest is not None
             words = self.sampler.nearest.shortfall
-            return FormulationResult(None, None, outcome.iterates, (), None, False, words)
+            return FormulationResult(iterates=outcome.iterates, message=words)
         best = max(feasible, key=lambda sample: sample.bandwidth)
         return replace(outcome, x=best.joint, agreed=False)
 
@@ -133,7 +130,7 @@ class MixedOuter(Outer):
     ) -> FormulationResult:
         sampler = self.sampler
         if isinstance(formulation, Direct):
-            return replace(outcome, x=x, design=None, agreed=True)
+            return replace(outcome, x=x, agreed=True)
         if isinstance(formulation, Nested):
             thetas = np.unique(np.array([*sampler.solved, tuple(self.theta_of(x))]), axis=0)
             found = solve_nested(sampler, formulation, seed=seed, given=Surrogates((), thetas, ()))
@@ -159,7 +156,8 @@ class MixedOuter(Outer):
         self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem, truth = self.problem, self.sampler.truth
-        begin = sample.joint
+        # where no design is feasible it goes from the middle of the weights' frequencies
+        begin = np.where(np.isfinite(sample.joint), sample.joint, np.mean(self.bounds, axis=0))
         basins = [(place.x, place.objective) for place in known if place.stationary]
         settled = SETTLED if settled is None else settled
         end = descend(problem, truth, begin, ended=basins, settled=settled)
@@ -178,8 +176,8 @@ class MixedOuter(Outer):
         if len(processes) < 2 or self._may_jump(x):
             return ()
         middle = 0.5 * (processes[0].lower + processes[0].upper)
-        found = [quality_of(process, middle, seed=seed) for process in processes]
-        sound = all(q.smooth_enough and q.coverage >= COVERAGE for q in found)
+        found = [quality_of(process, middle) for process in processes]
+        sound = all(q.loo.q2 >= EXPLAINED and q.coverage >= COVERAGE for q in found)
         return processes if sound else ()
 
     def _may_jump(self, x: Array) -> bool:

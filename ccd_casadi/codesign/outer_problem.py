@@ -4,9 +4,10 @@
 
 `nested` puts the surrogate ω_b*(θ) for ω_b; `lifted` has ω_S and ω_T as variables too, with
 ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low and ‖GS‖∞ <= compliance_max as explicit constraints on
-surrogates; `direct` is the lifted problem on the true quantities.
+surrogates; `direct` has no programme: it is local solves on the truth.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,7 +51,7 @@ class NonlinearProgram:
 
 @dataclass(frozen=True)
 class LocalOptimum:
-    """Where so many `starts` of IPOPT ended."""
+    """Where local solves from so many `starts` ended."""
 
     x: Array
     objective: float
@@ -90,11 +91,7 @@ def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> Nonlinea
 
 
 def lifted_program(
-    problem: CoDesignProblem,
-    quantities: ca.Function,
-    *,
-    exact_hessian: bool = True,
-    margin: float = MARGIN,
+    problem: CoDesignProblem, quantities: ca.Function, *, margin: float = MARGIN
 ) -> NonlinearProgram:
     """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln of what is bounded."""
     plant = plant_of(problem)
@@ -112,7 +109,7 @@ def lifted_program(
         g=ca.vertcat(q[1 : 1 + len(levels)] - levels, lam),
         lower=lower,
         upper=upper,
-        exact_hessian=exact_hessian and plant.exact_hessian,
+        exact_hessian=plant.exact_hessian,
     )
 
 
@@ -136,10 +133,6 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
     options = OPTIONS.copy()
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
-        # The true quantities carry rounding: there is no use in chasing the last digits.
-        options["ipopt.acceptable_iter"] = 4
-        # Where it has not converged by then it goes to and fro over a kink; `kinked` does not.
-        options["ipopt.max_iter"] = 100
     solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)
     begun = np.clip((np.atleast_2d(starts) - program.lower) / width, 0.0, 1.0)
     ends, verdicts = [], []
@@ -153,17 +146,22 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
             ends.append((float(result["f"]), np.clip(np.array(result["x"]).ravel(), 0.0, 1.0)))
     if not ends:
         raise OuterFailure(f"IPOPT converged from none of {len(begun)} starts: {verdicts[0]}")
-    kept: list[Array] = []
+    return distinct([(J, program.lower + width * end) for J, end in ends], width, len(begun))
+
+
+def distinct(
+    ends: Sequence[tuple[float, Array]], width: Array, starts: int, apart: float = APART
+) -> OuterSolution:
+    """Ends (J, x) of local solves from so many starts, those of one optimum together."""
     optima: list[LocalOptimum] = []
-    for objective, end in sorted(ends, key=lambda item: item[0]):
-        near = [i for i, other in enumerate(kept) if np.abs(end - other).max() < APART]
-        if near:
-            same = optima[near[0]]
-            optima[near[0]] = replace(same, starts=same.starts + 1)
+    for objective, x in sorted(ends, key=lambda item: item[0]):
+        away = [float(np.abs((x - other.x) / width).max()) for other in optima]
+        same = next((i for i, far in enumerate(away) if far < apart), None)
+        if same is None:
+            optima.append(LocalOptimum(x, objective))
         else:
-            kept.append(end)
-            optima.append(LocalOptimum(program.lower + width * end, objective))
-    return OuterSolution(tuple(optima), len(begun))
+            optima[same] = replace(optima[same], starts=optima[same].starts + 1)
+    return OuterSolution(tuple(optima), starts)
 
 
 def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:

@@ -13,17 +13,12 @@ import numpy as np
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.theta_direct import (
-    FAR,
-    SETTLED,
-    TrueBandwidth,
-    pieces_from,
-    solve_direct_value,
-)
+from ccd_casadi.codesign.theta_direct import FAR, SETTLED, TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.optim.pieces import FIRST
@@ -39,13 +34,10 @@ class ThetaOuter(Outer, ABC):
     learns_from_others = False
     words = ""
 
-    def formulated(
-        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+    def fitted(
+        self, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None
     ) -> FormulationResult:
         """Nested; what is lifted are the exact gradients, as x is θ."""
-        if isinstance(formulation, Direct):
-            with self.sampler.spent.on("search"):
-                return solve_direct_value(self.sampler, formulation.starts, seed=seed)
         if isinstance(formulation, Nested):
             return solve_nested(self.sampler, formulation, seed=seed, given=given)
         options = Nested(
@@ -64,7 +56,7 @@ class ThetaOuter(Outer, ABC):
         """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
         problem, truth = self.problem, TrueBandwidth(self.sampler, "polishing")
         with self.sampler.spent.on("polish"):
-            best, _ = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
+            best = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
         kkt = theta_kkt(problem, best, truth)
         return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
 
@@ -90,7 +82,7 @@ class ThetaOuter(Outer, ABC):
         problem = self.problem
         truth = TrueBandwidth(self.sampler, "local solve")
         first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)
-        best, _ = pieces_from(truth, sample, least, first)
+        best = pieces_from(truth, sample, least, first)
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None

@@ -155,13 +155,12 @@ def optimal_line(
 def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float:
     """What the last surrogate says at a design x of its value, SI.
 
-    Without a surrogate: the truth at IPOPT's own optimum, or `value`, that of the design, where
-    IPOPT found none.
+    Without a surrogate it is `value`, that of the design.
     """
     if outcome.surrogates:
         process = outcome.surrogates[0]
         return float(process.predict(x[None, : process.lower.size])[0])
-    return value if outcome.design is None else outcome.design.figures.bandwidth
+    return value
 
 
 def infeasible_dict(

@@ -96,7 +96,7 @@ def _looked(
         ends = [end, *map(outer.ended, starts)]
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
         if isinstance(formulation, Direct):  # has no surrogate that could have promised another
-            outcome = replace(outcome, x=end.x, design=None)
+            outcome = replace(outcome, x=end.x)
     may_learn = rounds > 0 and end.feasible and bool(outcome.surrogates)
     if may_learn and _missed(outcome, end) > formulation.tolerance:
         outcome = outer.learnt(outcome, end)  # left out, it tells how they support the design
@@ -134,7 +134,7 @@ def concluded(
         return Solution(result, outcome, None)
     with sampler.spent.on("checks"):
         verified = outer.verified(found.end, found.rounds)
-    quality = surrogate_quality(outcome.surrogates, verified, seed, quiet=sampler.quiet)
+    quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
     result = result_dict(
         formulation, outcome, verified, tolerance=tolerance, spent=sampler.spent.by_purpose,
         seconds=perf_counter() - began, seed=seed, quality=quality, look=found.look,

@@ -117,12 +117,11 @@ def together(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    if best.theta == first.theta and problem is sampler.problem:
+    if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
-    other = asked.of(with_sections(problem, anchors=(best.kappa,)))
-    last = other.bandwidths(np.array(best.theta), "polishing")[0]
-    if problem is not sampler.problem or objective_of(problem, last) < objective_of(problem, first):
-        return other, last, settled
+    last = asked.climbed(best.theta, best.kappa)
+    if asked is not sampler or objective_of(problem, last) < objective_of(problem, first):
+        return asked, last, settled
     return sampler, first, True
 
 

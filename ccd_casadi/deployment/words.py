@@ -49,7 +49,7 @@ def deployed_line(run: FinishedRun, found: Deployment) -> Line:
 
 
 def order_words(run: FinishedRun, found: Deployment) -> str:
-    """`4 of 6 states (7 synthesised), and 1 of the lead`."""
+    """`4 of 6 states (7 synthesised), and 1 of the lead filter`."""
     orders = [item.chosen.order for item in found.orders]
     if kind_of(run.problem).as_designed:
         return f"{' + '.join(map(str, orders))} states, as designed"
@@ -57,7 +57,7 @@ def order_words(run: FinishedRun, found: Deployment) -> str:
         f"{order} of {item.rows[0].order}" for order, item in zip(orders, found.orders, strict=True)
     )
     more = len(found.realisation.system.A) - found.order if found.conversion.lead else 0
-    lead = f", and {more} of the lead" if more else ""
+    lead = f", and {more} of the lead filter" if more else ""
     return f"{words} states ({len(run.controller.A)} synthesised){lead}"
 
 
@@ -102,7 +102,7 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
     if over > 0.0:
         allowed = 100.0 * found.target.excess
         parts.append(
-            f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; a "
-            f"deployment may take {allowed:.2g} %"
+            f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; "
+            f"{allowed:.2g} % are allowed to a deployment"
         )
     return "; ".join(parts)

@@ -20,7 +20,10 @@ INDEX = "index.html"  # of a run's folder
 
 @dataclass(frozen=True)
 class Curve:
-    """y over x; `line` and `marker` as in matplotlib, either may be empty."""
+    """y over x; `line` and `marker` as in matplotlib, either may be empty.
+
+    hz: of each point, where the curve is a locus over frequency and not y of x.
+    """
 
     x: Array
     y: Array
@@ -29,6 +32,7 @@ class Curve:
     line: str = "-"
     marker: str = ""
     width: float = 1.3
+    hz: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
 SIZE = 9.0  # pt
 LETTER, LINE = 0.62 * SIZE, 1.25 * SIZE  # pt; DejaVu Sans, the widest that a page may take
+HANDLE = 3.6 * SIZE  # pt beside the words of a legend
 POINT = 3.0  # pt; half a marker
 # places beside a point, in pt, after the one that was asked for
 AROUND = ((0, 7), (8, 3), (-8, 3), (0, -7), (8, -5), (-8, -5), (0, 20), (12, 16), (-12, 16),
@@ -27,6 +28,11 @@ def inside(axes: "Axes") -> Box:
     return scale * box.x0, scale * box.y0, scale * box.x1, scale * box.y1
 
 
+def in_points(axes: "Axes", x: Any, y: Any) -> np.ndarray:
+    """Points (k, 2) of the data in pt, from the lower left corner of the figure."""
+    return axes.transData.transform(np.column_stack([x, y])) * 72.0 / axes.figure.dpi
+
+
 class Labels:
     """The labels of one pair of axes, whose ranges are final.
 
@@ -38,25 +44,50 @@ class Labels:
     def __init__(self, axes: "Axes") -> None:
         self._axes = axes
         axes.get_xlim(), axes.get_ylim()  # where they follow the data: settle them now
-        self._scale = 72.0 / axes.figure.dpi
         self._inside = inside(axes)
         self._taken: list[Box] = []
         self._curves = np.empty((0, 2))
+
+    def corner(self, names: Sequence[str]) -> tuple[str, float]:
+        """The place of a legend of these names that covers least, and how many points it covers."""
+        costs = {where: self._covered(box) + sum(_meet(box, one) for one in self._taken)
+                 for where, box in self._corners(names).items()}  # fmt: skip
+        where = min(costs, key=lambda each: costs[each])
+        return where, costs[where]
+
+    def take_corner(self, names: Sequence[str], where: str) -> None:
+        """Nothing is to lie over a legend there."""
+        self._taken.append(self._corners(names)[where])
+
+    def share(self, names: Sequence[str]) -> float:
+        """The height of a legend of these names over that of the axes above it."""
+        tall = LINE * (len(names) + 0.8)
+        return tall / max(self._inside[3] - self._inside[1] - tall, LINE)
+
+    def _corners(self, names: Sequence[str]) -> dict[str, Box]:
+        left, bottom, right, top = self._inside
+        wide = LETTER * max(map(len, names)) + HANDLE
+        tall = LINE * (len(names) + 0.8)
+        middle = 0.5 * (left + right - wide)
+        across = {"right": right - wide, "left": left, "center": middle}
+        up = {"upper": top - tall, "lower": bottom, "center": 0.5 * (bottom + top - tall)}
+        return {f"{v} {h}": (x, y, x + wide, y + tall) for v, y in up.items()
+                for h, x in across.items() if v != h}  # fmt: skip
 
     def avoid(self, x: float, y: float) -> None:
         """Nothing is to lie over this point."""
         a, b = self._at(x, y)
         self._taken.append((a - POINT, b - POINT, a + POINT, b + POINT))
 
-    def avoid_curve(self, x: Any, y: Any, joined: bool = True) -> None:
-        """Labels keep off this curve, or its points alone, where they can."""
-        points = self._axes.transData.transform(np.column_stack([x, y])) * self._scale
+    def avoid_curve(self, x: Any, y: Any, joined: bool = True, apart: float = APART) -> None:
+        """Labels keep off this curve, or its points alone; less off one with points far `apart`."""
+        points = in_points(self._axes, x, y)
         left, bottom, right, top = self._inside
         shown = np.isfinite(points).all(axis=1)
         points = np.clip(points[shown], (left - 99.0, bottom - 99.0), (right + 99.0, top + 99.0))
         if joined and len(points) > 1:  # as many points as are this far apart, along its length
             along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
-            at = np.arange(0.0, along[-1], APART)
+            at = np.arange(0.0, along[-1], apart)
             points = np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
         self._curves = np.vstack([self._curves, points])
 
@@ -73,7 +104,8 @@ class Labels:
         if found is not None:
             dx, dy = places[found][1]
             side = "center" if dx == 0 else "left" if dx > 0 else "right"
-            self._write(text, (dx, dy), (x, y), "data", ha=side, va=_above(dy), bbox=BEHIND)
+            held = self._held(x, y)
+            self._write(text, (dx, dy), (x, y), "data", held, ha=side, va=_above(dy), bbox=BEHIND)
 
     def along(self, value: float, text: str, vertical: bool) -> None:
         """A label at a line across the axes, upright beside a vertical one."""
@@ -101,11 +133,19 @@ class Labels:
         found = self._best([box for box, *_ in places])
         if found is not None:
             _, offset, place, coordinates, look = places[found]
-            self._write(text, offset, place, coordinates, **look)
+            held = self._held(value, None) if vertical else self._held(None, value)
+            self._write(text, offset, place, coordinates, held, **look)
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
-        a, b = self._axes.transData.transform((x, y)) * self._scale
+        a, b = in_points(self._axes, x, y)[0]
         return float(a), float(b)
+
+    def _held(self, x: float | None, y: float | None) -> str:
+        """The point, or the line, that words belong to in pt of the picture, for its script."""
+        a, b = self._at(self._axes.get_xlim()[0] if x is None else x,
+                        self._axes.get_ylim()[0] if y is None else y)  # fmt: skip
+        tall = 72.0 * self._axes.figure.bbox.height / self._axes.figure.dpi
+        return f"at:{'' if x is None else f'{a:.1f}'},{'' if y is None else f'{tall - b:.1f}'}"
 
     def _best(self, boxes: Sequence[Box]) -> int | None:
         """Which place to take: inside the axes, free of labels, and the least over curves."""
@@ -130,11 +170,11 @@ class Labels:
 
     def _write(
         self, text: str, offset: tuple[float, float], place: tuple[float, float],
-        coordinates: Any, **look: Any,
+        coordinates: Any, held: str, **look: Any,
     ) -> None:  # fmt: skip
         self._axes.annotate(
             text, place, xycoords=coordinates, xytext=offset, textcoords="offset points",
-            fontsize=SIZE, annotation_clip=False, zorder=6, **look,
+            fontsize=SIZE, annotation_clip=False, zorder=6, gid=held, **look,
         )  # fmt: skip
 
 

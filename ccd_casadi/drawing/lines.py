@@ -2,12 +2,12 @@
 
 import json
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
-from ccd_casadi.drawing.labels import Labels, inside
+from ccd_casadi.drawing.labels import APART, Labels, in_points, inside
 from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
 from ccd_casadi.drawing.turntable import modes_html
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LEAST_POINTS = 8  # of a curve that values are read off
+LEAST_SPAN = 1e-4  # of a value: an axis of less shows digits that nobody reads
 LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a panel
 
 
@@ -62,14 +63,12 @@ def _picture(panel: Panel, width: float, height: float, key: str, title: str) ->
 
 
 def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
-    """What the page's script needs to read values off the drawn curves; empty: none has y of x."""
+    """What the page's scripts need to read values off the drawn curves and to enlarge a part."""
     names = {
         i: curve.label
         for i, curve in enumerate(panel.curves)
         if curve.line and len(curve.x) >= LEAST_POINTS and (np.diff(curve.x) >= 0.0).all()
     }
-    if not names:
-        return ""
     box, tall = inside(axes), 72.0 * height
     ends = (
         (axes.get_xlim(), panel.log_x, box[0], box[2]),
@@ -77,20 +76,33 @@ def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
     )
     scales = [[*map(float, limits), int(log), round(a, 3), round(b, 3)]
               for limits, log, a, b in ends]  # fmt: skip
-    return json.dumps(
-        {"x": panel.x_label, "y": panel.y_label, "scales": scales, "names": names},
-        separators=(",", ":"), ensure_ascii=False,
-    )  # fmt: skip
+    found = {"x": panel.x_label, "y": panel.y_label, "scales": scales, "names": names}
+    found |= {"locus": points} if (points := _locus(axes, panel, tall)) else {}
+    return json.dumps(found, separators=(",", ":"), ensure_ascii=False)
+
+
+def _locus(axes: "Axes", panel: Panel, tall: float) -> list[list[float]]:
+    """Points (pt, pt, Hz) of the loci over frequency, as far as they are shown and lie apart."""
+    left, low, right, high = inside(axes)
+    found: list[list[float]] = []
+    for curve in panel.curves:
+        if curve.hz is None:
+            continue
+        for (x, y), hz in zip(in_points(axes, curve.x, curve.y), curve.hz, strict=True):
+            shown = left <= x <= right and low <= y <= high
+            if shown and not (found and abs(x - found[-1][0]) + abs(tall - y - found[-1][1]) < 1.0):
+                found.append([round(x, 1), round(tall - y, 1), float(f"{hz:.4g}")])
+    return found
 
 
 def _draw(axes: "Axes", panel: Panel) -> None:
-    for band in panel.bands:
+    for i, band in enumerate(panel.bands):
         axes.fill_between(
             band.x, band.low, band.high, color=band.colour, alpha=0.4, linewidth=0.6,
-            label=band.label or None,
+            label=band.label or None, gid=f"band{i}",
         )  # fmt: skip
-    for area in panel.forbidden:
-        axes.fill(area.x, area.y, color=area.colour, alpha=0.2, linewidth=0.0)
+    for i, area in enumerate(panel.forbidden):
+        axes.fill(area.x, area.y, color=area.colour, alpha=0.2, linewidth=0.0, gid=f"area{i}")
     for i, curve in enumerate(panel.curves):
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",
@@ -99,29 +111,47 @@ def _draw(axes: "Axes", panel: Panel) -> None:
             clip_on=not curve.marker or _leaves(panel, curve),
             gid=f"curve{i}",
         )  # fmt: skip
+    for i, mark in enumerate(panel.marks):
+        axes.plot(
+            [mark.x], [mark.y], mark.marker, color=mark.colour, markersize=5.0, zorder=5,
+            gid=f"mark{i}",
+        )  # fmt: skip
     axes.set_xlabel(panel.x_label)
     axes.set_ylabel(panel.y_label)
     if panel.title:
         axes.set_title(panel.title, loc="left")
     _ranges(axes, panel)
-    for level in panel.levels:
+    for i, level in enumerate(panel.levels):
         line = axes.axvline if level.vertical else axes.axhline
-        line(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)))
-    for mark in panel.marks:
-        axes.plot(
-            [mark.x], [mark.y], mark.marker, color=mark.colour, markersize=5.0, zorder=5,
-        )  # fmt: skip
-    labels = Labels(axes)
-    for curve in panel.curves:
-        labels.avoid_curve(curve.x, curve.y, joined=bool(curve.line))
-    for mark in panel.marks:
-        labels.avoid(mark.x, mark.y)
+        line(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)), gid=f"level{i}")
+    labels = _labels(axes, panel)
+    if panel.legend is not None and (names := axes.get_legend_handles_labels()[1]):
+        where, covered = labels.corner(names)
+        if covered and panel.log_y and panel.y_range is None:
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high * (high / low) ** labels.share(names))
+            labels = _labels(axes, panel)
+            where, _ = labels.corner(names)
+        axes.legend(loc=cast(Any, where), borderaxespad=0.2)
+        labels.take_corner(names, where)
     for mark in panel.marks:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
-    if panel.legend is not None and axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="best", borderaxespad=0.2)
+
+
+def _labels(axes: "Axes", panel: Panel) -> Labels:
+    """None yet, and what they keep off."""
+    labels = Labels(axes)
+    for curve in panel.curves:
+        labels.avoid_curve(curve.x, curve.y, joined=bool(curve.line))
+    for level in panel.levels:
+        one, ends = [level.value] * 2, axes.get_ylim() if level.vertical else axes.get_xlim()
+        x, y = (one, ends) if level.vertical else (ends, one)
+        labels.avoid_curve(x, y, apart=4.0 * APART)
+    for mark in panel.marks:
+        labels.avoid(mark.x, mark.y)
+    return labels
 
 
 def _leaves(panel: Panel, curve: Curve) -> bool:
@@ -144,6 +174,10 @@ def _ranges(axes: "Axes", panel: Panel) -> None:
         axes.set_ylim(*panel.y_range)
     if panel.y_step:
         axes.yaxis.set_major_locator(MultipleLocator(panel.y_step))
+    for name, log in (("x", panel.log_x), ("y", panel.log_y)):
+        low, high = getattr(axes, f"get_{name}lim")()
+        if not log and high - low < LEAST_SPAN * abs(low):  # one value, rounded
+            getattr(axes, f"set_{name}lim")(0.99 * low, 1.01 * high)
     if not panel.log_y:
         axes.ticklabel_format(axis="y", useOffset=False)
     if panel.equal:

@@ -16,7 +16,7 @@ from ccd_casadi.support.units import number
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request, no script but ours
 # Our scripts, in assets/, and what in a body needs them; some bring their style.
-SCRIPTS = {"cursor": " data-axes=", "steps": '<div class="steps">',
+SCRIPTS = {"cursor": " data-axes=", "zoom": " data-axes=", "steps": '<div class="steps">',
            "turntable": 'class="turntable"'}  # fmt: skip
 STYLED = ("steps", "turntable")
 MANY = 8  # columns of a table that is set smaller in print

@@ -170,7 +170,7 @@ def _minor_ticks(axis: Any, low: float, high: float) -> None:
     marker: Any = TICKDOWN if horizontal else TICKLEFT
     line = Line2D(
         values if horizontal else edge, edge if horizontal else values, linestyle="none",
-        marker=marker, markersize=2.0, markeredgewidth=0.4,
+        marker=marker, markersize=2.0, markeredgewidth=0.4, gid=f"ticks-{axis.axis_name}",
         markeredgecolor="#000000", clip_on=False, zorder=2.01,
         transform=axes.get_xaxis_transform() if horizontal else axes.get_yaxis_transform(),
     )  # fmt: skip

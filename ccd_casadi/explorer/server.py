@@ -73,11 +73,10 @@ class Explorer:
         kept = self._kept.setdefault(tab, Kept()) if tab else Kept()
         document.title = f"Explorer: {self.session.case.path.name}"
         document.template = Template(TEMPLATE.read_text(encoding="utf-8"))
-        document.template_variables["case"] = str(self.session.case.path)
-        document.template_variables["folder"] = str(self.session.folder)
-        document.template_variables["dark"] = dark
-        document.template_variables["css"] = f":root {{ {theme(int(dark))} }}"
-        document.template_variables["figures"] = FIGURES
+        document.template_variables.update(
+            case=self.session.case.path, folder=self.session.folder, dark=dark, figures=FIGURES,
+            css=f":root {{ {theme(int(dark))} }}", several=len(self.session.case.theta) > 1,
+        )  # fmt: skip
         shown = 'document.getElementById("lost").hidden = '
         document.js_on_event(ConnectionLost, CustomJS(code=f"{shown}false"))
         document.js_on_event(ClientReconnected, CustomJS(code=f"{shown}true"))

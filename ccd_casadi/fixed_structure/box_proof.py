@@ -115,8 +115,8 @@ def prove(
 
     Of plants with modal damping. The box is that of `uncertain`, all its options; the plant's
     modal data and κ count as exact. Of several channels or more than four parameters with
-    `SLACK_OF_MANY` by default, and of several channels the whole's bounds, those on |S| first: they
-    take fewest boxes.
+    `SLACK_OF_MANY` by default, and of several channels the whole's bounds; where the boxes do not
+    suffice for all of these, those on |S| alone.
     """
     names = uncertain.names
     several = isinstance(structure, ChannelStructure)
@@ -153,14 +153,12 @@ def prove(
     share = (most_boxes or MOST_BOXES) // len(models)
     if many and most_boxes is None:
         share = MOST_OF_MANY
-    if not several:
-        return _divide(families, uncertain.box, slack, share)
-    bare = replace(bounds, weighted_level=None, compliance_max=None)
-    first = _divide([replace(own, bounds=bare) for own in families], uncertain.box, slack, share)
-    if bare == bounds or not first.proven:
-        return replace(first, of_S=bare != bounds)
     whole = _divide(families, uncertain.box, slack, share)
-    return whole if whole.proven or whole.refuted else replace(first, of_S=True)
+    bare = replace(bounds, weighted_level=None, compliance_max=None)
+    if not several or bare == bounds or whole.proven or whole.refuted:
+        return whole
+    bared = [replace(own, bounds=bare) for own in families]
+    return replace(_divide(bared, uncertain.box, slack, share), of_S=True)
 
 
 def _divide(families: list[LoopFamily], box: Array, slack: float, share: int) -> Proof:

@@ -10,7 +10,11 @@ The mode with the largest disc is taken as it is (`rank_one`), the others at the
 y and K̂ differ by Δ in M and by a factor 1 + E of K̂, so that with M₁ = M + Δ
 
     S₁ - S = T - T₁ = M₁⁻¹(Δ_y T - Δ_GK S),   S₂ = (1 + T₁E)⁻¹S₁,   T₂ = T₁ + T₁E S₂,
+    M₁⁻¹ = W - W Δ W + W Δ W Δ M₁⁻¹,
     ‖Σ δ_i c_i b_iᵀ‖² <= ‖Σ r_i a_i c_i c_iᵀ‖ ‖Σ r_i/a_i b_i b_iᵀ‖   for all |δ_i| <= r_i, a_i > 0.
+
+To first order every disc counts along its own direction (`norm_with`), so that modes which move
+one channel leave the others alone; what is of higher order counts by its norm.
 
 y is that of `boxes`. Where M is regular on the whole axis for all of a connected set of plants, no
 pole crosses it: they are all stable or none is (zero exclusion).
@@ -23,7 +27,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.boxes import Axis, Boxes, Chart, axis_of, gain_of
 from ccd_casadi.fixed_structure.mode_discs import discs_of
-from ccd_casadi.fixed_structure.rank_one import Range, inverses, norm
+from ccd_casadi.fixed_structure.rank_one import Range, Turned, inverses, norm, norm_with
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
@@ -74,61 +78,93 @@ class LoopFamily:
             self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
         )
         gains, loose, faint = self._gains(axis)
-        known = np.isfinite(held.middle + held.radius + free.middle + free.radius)
-        good = known.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
+        finite = np.isfinite(held.middle + held.radius + free.middle + free.radius)
+        good = finite.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
         one = np.ones(len(good))
         y, moved, most = one, 0.0 * one, one
         if self._integrator:
             y, moved, most = axis.y.centre, axis.y.reach + axis.y.rest, axis.y.size
         K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
-        c, b = self.plant.reading, np.repeat(self.plant.drive[:, None], len(good), axis=1)
+        c, b = (
+            np.repeat(part[:, None], len(good), axis=1)
+            for part in (self.plant.reading, self.plant.drive)
+        )
         rows = np.einsum("iNm,Nmp->iNp", b, K)
         m, r = np.where(good, held.middle, 0.0), np.where(good, held.radius, 0.0)
-        size, at = np.linalg.norm(c, axis=1), np.arange(len(good))
-        weight = size[:, None] * np.linalg.norm(rows, axis=2)
+        weight, at = _sizes(c, rows), np.arange(len(good))
         strong = np.argmax(r * weight, axis=0)
         others = np.arange(len(c))[:, None] != strong
-        M = y[:, None, None] * np.eye(len(c.T)) + _total(others * m, c, rows)
+        unit = np.tile(np.eye(c.shape[2]), (len(good), 1, 1))
+        y_unit = y[:, None, None] * unit
+        M = y_unit + _total(others * m, c, rows)
         terms = np.abs(y) + (others * np.abs(m) * weight).sum(axis=0)
-        W = inverses(M, terms, c[strong], rows[strong, at], m[strong, at], r[strong, at])
+        W = inverses(M, terms, c[strong, at], rows[strong, at], m[strong, at], r[strong, at])
         w, T = W.norms(), W.from_one(y).norms()
-        # what is left: Δ, of which `faintly` by gains that are not followed, then E
+        # what is left: Δ, of which `known` by discs and `faintly` by gains not followed; then E
         grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
-        faintly = (size * np.linalg.norm(self.plant.drive, axis=1)) @ (np.abs(m) + r) * grain
-        delta = _left(others * r, c, rows) + faintly
-        off = delta + moved
+        faintly = (_sizes(c, b) * (np.abs(m) + r)).sum(axis=0) * grain
+        known = _left(others * r, c, rows)
+        off = known + faintly + moved
         good &= damped & W.good & (w[0] * off < 1.0)
         after = w[0] / np.where(good, 1.0 - w[0] * off, 1.0)  # ‖M₁⁻¹‖
-        more = 1.0 + after * off  # of M₁⁻¹ over W
-        apart = after * (np.abs(y) * w[0] * delta + T[0] * (moved + faintly))
         loose = loose * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
+        unknown = after * (np.abs(y) * w[0] * faintly + T[0] * moved)  # of S and T
+        apart = unknown + after * np.abs(y) * w[0] * known
         by = loose * (T[0] + apart)  # of T₁E
         good &= by < 1.0
         by = np.where(good, by, 0.0)
         over = after / (1.0 - by)
-        apart = apart + by * most * over
-        S = np.minimum(most * over, np.abs(y) * w[0] + apart), np.abs(y) * w[1] - apart
-        found = self._of_S(boxes, S, over)
+        unknown, apart = unknown + by * most * over, apart + by * most * over
+        # each disc along its own direction, W c_i and b_iᵀK̂W
+        u, v = np.einsum("Npq,iNq->iNp", W.middle, c), np.einsum("iNp,Npq->iNq", rows, W.middle)
+        radius = others * r
+        radius[strong, at] = W.reach / np.maximum(_sizes(u, v)[strong, at], 1e-300)
+
+        def near(A: Turned, left: np.ndarray, size: Array) -> Array:
+            """‖A - L W D W‖ of the discs' D, and what is of higher order; `size`: of L W."""
+            p = np.einsum("Nkp,iNp->iNk", left, u)
+            aside = (radius * _sizes(p, v))[strong, at]
+            rest = known * (aside * w[0] + size * (W.reach + w[0] * off * after))
+            return norm_with(A.middle, p, v, radius) + A.lost + rest
+
+        upper = near(W.between(y_unit, unit), y_unit, np.abs(y) * w[0]) + unknown
+        upper = np.fmin(upper, np.minimum(most * over, np.abs(y) * w[0] + apart))
+        found = self._of_S(boxes, (upper, np.abs(y) * w[1] - apart), over)
         if level is not None:
-            k = W.between(K, np.eye(len(c.T))).norms()
-            turned = loose * over * (norm(K) + k[0] * more * (most + faintly))  # of K̂T₁E M₂⁻¹
-            upper = (1.0 + loose) * (k[0] * more + turned) + grain * over
-            lower = (1.0 - loose) * (k[1] - k[0] * after * off - turned) - grain * over
-            found += self._weighted(boxes, level, (upper, lower), (T[0] + apart, T[1] - apart))
+            KW = W.between(K, unit)
+            k = KW.norms()
+            more = k[0] * after * off
+            turned = loose * over * (norm(K) + (k[0] + more) * (most + faintly))  # of K̂T₁E M₂⁻¹
+            upper = np.fmin(k[0] + more, near(KW, K, k[0]) + k[0] * after * (faintly + moved))
+            upper = (1.0 + loose) * (upper + turned) + grain * over
+            lower = (1.0 - loose) * (k[1] - more - turned) - grain * over
+            T_most = near(W.from_one(y), y_unit, np.abs(y) * w[0]) + unknown
+            T_most = np.fmin(T_most, T[0] + apart)
+            found += self._weighted(boxes, level, (upper, lower), (T_most, T[1] - apart))
         if compliance is not None:
             g, e = np.where(good, free.middle, 0.0), np.where(good, free.radius, 0.0)
-            h = W.between(np.eye(len(c.T)), _total(g, c, b)).norms()
-            change = most * after * _left(e, c, b)
-            change += (np.abs(y) * after * off + moved * more) * h[0]
+            WG = W.between(unit, _total(g, c, b))
+            h, apart = WG.norms(), most * after * _left(e, c, b)
+            apart += (np.abs(y) * after * off + moved * (1.0 + after * off)) * h[0]
+            p, q = (
+                np.concatenate([u, u]),
+                np.concatenate([b, np.einsum("iNp,Npm->iNm", rows, WG.middle)]),
+            )
+            upper = norm_with(WG.middle, p, q, np.concatenate([e, radius])) + WG.lost
+            upper += known * (W.reach * h[0] + w[0] * WG.reach) + w[0] * (faintly + moved) * h[0]
+            along = np.abs(np.einsum("iNp,Np->iN", c, v[strong, at]))
+            aside = (e * along * np.linalg.norm(b, axis=2)).sum(axis=0)  # of W's disc on those of G
+            aside *= (radius * np.linalg.norm(u, axis=2))[strong, at]
+            upper += aside + after * off * (w[0] * off * h[0] + _left(e, u, b) + aside)
+            upper = np.fmin(most * upper, np.abs(y) * h[0] + apart)
+            lower = np.abs(y) * h[1] - apart
             inside = compliance * self._inside(boxes)
-            upper = (np.abs(y) * h[0] + change) / (1.0 - by) / inside
-            lower = (np.abs(y) * h[1] - change) / (1.0 + by) / inside
-            found.append(("GS", upper, lower))
+            found.append(("GS", upper / (1.0 - by) / inside, lower / (1.0 + by) / inside))
         weight[strong, at] = np.where(
             W.good, W.reach / (w[0] ** 2 * np.maximum(r[strong, at], 1e-300)), weight[strong, at]
         )
         shares = np.where(np.isfinite(held.shares), held.shares, 0.0)
-        spread = np.einsum("iN,ikN->kN", np.where(known, weight, 1.0), shares)
+        spread = np.einsum("iN,ikN->kN", np.where(finite, weight, 1.0), shares)
         spread[0] += moved + most * loose
         names, most_at, least_at = zip(*found, strict=True)
         highest, lowest = np.array(most_at), np.array(least_at)
@@ -199,15 +235,20 @@ class LoopFamily:
         return np.inf if b.shape is None else b.S_max * np.sqrt(2.0) / b.shape * self.bandwidth
 
 
-def _total(g: np.ndarray, c: Array, rows: np.ndarray) -> np.ndarray:
-    """Σ g_i c_i row_iᵀ (N, p, q) of g (n, N), c (n, p) and rows (n, N, q)."""
-    return np.asarray(np.einsum("iN,ip,iNq->Npq", g, c, rows))
+def _total(g: np.ndarray, c: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Σ g_i c_i row_iᵀ (N, p, q) of g (n, N), c (n, N, p) and rows (n, N, q)."""
+    return np.asarray(np.einsum("iN,iNp,iNq->Npq", g, c, rows))
 
 
-def _left(radius: Array, c: Array, rows: np.ndarray) -> Array:
-    """Its norm at most for any |g_i| <= radius_i."""
-    share = np.linalg.norm(rows, axis=2) + 1e-30
-    share /= np.linalg.norm(c, axis=1)[:, None] + 1e-30
-    one = np.einsum("iN,ip,iq->Npq", radius * share, c, c)
-    two = np.einsum("iN,iNp,iNq->Npq", radius / share, rows.conj(), rows)
+def _left(radius: Array, p: np.ndarray, q: np.ndarray) -> Array:
+    """The norm of Σ g_i p_i q_iᵀ at most for any |g_i| <= radius_i."""
+    share = np.linalg.norm(q, axis=2) + 1e-30
+    share /= np.linalg.norm(p, axis=2) + 1e-30
+    one = np.einsum("iN,iNp,iNq->Npq", radius * share, p, p.conj())
+    two = np.einsum("iN,iNp,iNq->Npq", radius / share, q.conj(), q)
     return np.asarray(np.sqrt(norm(one) * norm(two)))
+
+
+def _sizes(p: np.ndarray, q: np.ndarray) -> Array:
+    """Of the matrices p_i q_iᵀ (n, N)."""
+    return np.asarray(np.linalg.norm(p, axis=2) * np.linalg.norm(q, axis=2))

@@ -42,13 +42,18 @@ class Turned:
         return replace(self, A=np.eye(A.shape[1]) - A, B=-B, lost=np.abs(y) * self.lost + GUARD)
 
     @property
+    def middle(self) -> np.ndarray:
+        """With γ in the middle of its disc."""
+        return np.asarray(self.A + self.gamma[:, None, None] * self.B)
+
+    @property
     def reach(self) -> Array:
         """How far from its middle it goes."""
         return np.asarray(self.radius * norm(self.B, loosely=True))
 
     def norms(self) -> Range:
         """σ_max, which is convex in γ: its largest value is at a corner of a polygon."""
-        size = norm(self.A + self.gamma[:, None, None] * self.B)
+        size = norm(self.middle)
         most = size + self.reach
         if min(self.A.shape[1:]) > 1:
             places = (self.gamma + CORNERS[:, None] * self.radius)[..., None, None]
@@ -77,6 +82,21 @@ def inverses(
     lost = (np.abs(gamma) + radius) * norm(B, loosely=True)
     lost = GUARD * (1.0 + terms * size) * (size + lost)
     return Turned(X, B, gamma, radius, lost, good)
+
+
+def norm_with(A: np.ndarray, p: np.ndarray, q: np.ndarray, radius: Array) -> Array:
+    """σ_max of A + Σ δ_i p_i q_iᵀ at most for all |δ_i| <= radius_i (n, N).
+
+        |xᴴAy| + Σ r_i |xᴴp_i||q_iᵀy| <= λ_max [[P, A], [Aᴴ, Q]],   |x| = |y| = 1,
+        P = Σ r_i a_i p_i p_iᴴ,   Q = Σ r_i/a_i q_i* q_iᵀ   for any a_i > 0
+
+    A (N, k, l), p (n, N, k), q (n, N, l). Terms that A keeps apart count apart.
+    """
+    share = (np.linalg.norm(q, axis=2) + 1e-30) / (np.linalg.norm(p, axis=2) + 1e-30)
+    P = np.einsum("iN,iNa,iNb->Nab", radius * share, p, p.conj())
+    Q = np.einsum("iN,iNa,iNb->Nab", radius / share, q.conj(), q)
+    values = np.linalg.eigvalsh(np.block([[P, A], [A.conj().transpose(0, 2, 1), Q]]))
+    return np.asarray(values[:, -1] + GUARD * np.abs(values).max(axis=1))
 
 
 def norm(M: np.ndarray, loosely: bool = False) -> Array:

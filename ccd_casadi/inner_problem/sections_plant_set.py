@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.decoupling import (
     given_decoupling,
 )
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.race import started
+from ccd_casadi.fixed_structure.race import at_its_bandwidth
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
@@ -195,7 +195,7 @@ def warm_starts(
         found = problem_for(set_of, own, bounds, sections.sampling, sections.frequencies)
         both = [kappa, moved(own, before, set_of[0], kappa)]
         merits = [
-            started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
+            at_its_bandwidth(found, np.clip(in_problem_units(found, one), *found.box)).merit()
             for one in both
         ]
         return both[int(np.argmax(merits))]

@@ -110,8 +110,8 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
     ends = [shown(each[-1], "N/m") for each in controllers]
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
-        f"up to half the sampling rate. There the controller's gain is {ends[2]} (reduced: "
-        f"{ends[1]}, full: {ends[0]}): that is what sensor noise and unmodelled resonances meet."
+        f"up to half the sampling rate. There the controller's gain, which sensor noise and "
+        f"unmodelled resonances meet, is {ends[2]} (reduced: {ends[1]}, full: {ends[0]})."
     )
     return Figure(Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption, (table,))
 
@@ -158,9 +158,9 @@ def _rates(found: Deployment) -> tuple[Block, ...]:
         )
         return (Words(words),)
     words = (
-        "The least rate from which on the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay "
-        "included. The lead makes up for the phase of hold and delay, and raises the gain at half "
-        "the sampling rate."
+        "At this rate and above, the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay "
+        "included. The lead filter makes up for the phase of hold and delay, and raises the gain "
+        "at half the sampling rate."
     )
     return Words(words), Table(("method", "needed rate, Hz", ""), rows)
 
@@ -180,7 +180,7 @@ def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
         words = f"Channel {item.channel.name}: {item.chosen.order} states, as designed."
         return (Words(words),)
     words = (
-        f"Channel {item.channel.name}: of {item.rows[0].order} states {item.chosen.order} are "
+        f"Channel {item.channel.name}: {item.chosen.order} of {item.rows[0].order} states are "
         f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
         f"above twice its bound; {item.strict.order} keep S_max itself."
     )
@@ -207,7 +207,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
     words = (
         f"Channel {item.channel.name}: gain {shown(found.gain, 'N/m', 4)} at s = 0, "
         f"{shown(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at s = 0."
-        " A negative ζ, or a negative frequency of a single root, is one in the right half plane."
+        " A negative ζ, or a negative frequency of a single root, is in the right half plane."
     )
     return Words(words), Table(head, rows)
 

@@ -25,8 +25,8 @@ def conclusion(result: Mapping[str, Any]) -> str:
         f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}, with a "
         f"closed-loop bandwidth of {number(result['bandwidth_hz'])} Hz at a hardware cost of "
         f"{cost_words(result)} (J = {number(result['objective'], 6)}), "
-        f"{proof}{_prediction(result)}, after {result['syntheses']} true syntheses in "
-        f"{number(result['seconds'], 2)} s."
+        f"{proof}. It took {result['syntheses']} true syntheses and "
+        f"{number(result['seconds'], 2)} s.{_prediction(result)}"
     )
 
 
@@ -37,8 +37,8 @@ def _prediction(result: Mapping[str, Any]) -> str:
         return ""
     if line.get("left_out") is not None:
         missed = number(100.0 * line["left_out"], 2)
-        return f", itself a sample of the surrogate, which misses it by {missed} % without that"
-    return f", predicted to {number(result['verification_error'], 2)} of the truth"
+        return f" It is a sample of the surrogate, which without it misses it by {missed} %."
+    return f" The prediction errs by {number(result['verification_error'], 2)} of the truth."
 
 
 def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:

@@ -15,8 +15,9 @@ MOST = 12  # designs that are drawn
 
 def front_walk(run: FinishedRun, front: Front) -> tuple[Steps, ...]:
     """From the lightest to the fastest."""
-    problem = run.problem
-    points = front.points
+    problem, points = run.problem, front.points
+    if len(points) == 1:  # the run's own
+        return ()
     chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
     shown = [points[i] for i in chosen]
     steps = tuple(

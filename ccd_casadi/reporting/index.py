@@ -14,10 +14,10 @@ from ccd_casadi.reporting.verdict import refreshed, run_head
 from surrogates.files import write_whole
 
 PAGES = {
-    "report.html": "the design: its machine, its loop, what binds, how it was found",
+    "report.html": "the machine, its loop, what binds, how it was found",
     "insight.html": "the front of cost against bandwidth, and what loosening each bound would gain",
     "robustness.html": "margins, plants off the model, hardware tolerances, a move",
-    "*/report.html": "a deployment: order, rate, code, the move on the machine",
+    "*/report.html": "order, rate, code, the move on the machine",
 }
 FILES = {
     "result.json": "every figure of the run", "report.json": "what the pages show",
@@ -25,7 +25,7 @@ FILES = {
     "case.toml": "the case as it was solved", "samples.sqlite": "every synthesis and design",
     "surrogate.json": "the surrogate", "insight.json": "the figures of insight.html",
     "robustness.json": "the figures of robustness.html", "plant.py": "the plant's own code",
-    "truth.json": "what retraining asks",
+    "truth.json": "the formulation, for retraining",
 }  # fmt: skip
 
 

@@ -112,6 +112,8 @@ def front_figure(
 def _caption(front: Front) -> str:
     """How many points, how well they are known, and what lies between them."""
     verified = sum(point.verified for point in front.points)
+    if len(front.points) == 1:
+        return f"One point, {front.syntheses} true syntheses: the lightest design and the fastest."
     between = (
         "Local solves found no weights that lead to a design between two of them."
         if front.whole

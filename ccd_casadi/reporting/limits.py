@@ -44,22 +44,22 @@ def limit_sentences(loop: LoopView) -> list[str]:
     order = np.argsort(found)[::-1]
     first, second = (f"{PARTS[i]} is at {100 * found[i]:.0f} %" for i in order[:2])
     words = [
-        f"At ω_b = {number(loop.bandwidth_hz, 4)} Hz {first} of its bound γ/|W|, and holds the "
-        f"loop; {second} of its own."
+        f"At ω_b = {number(loop.bandwidth_hz, 4)} Hz {first} of its bound γ/|W|, and limits "
+        f"the loop; {second} of its own."
     ]
     tops = [peak for peak in loop.peaks if peak[1] > 1.05]
     if tops:
         hz, gain = max(tops, key=lambda peak: peak[1])
         near = [
-            f"the nearest {kind} of the plant at {number(value, 4)} Hz"
+            f"the plant's nearest {kind} is at {number(value, 4)} Hz"
             for kind, value in (
                 ("resonance", _nearest(loop.resonances_hz, hz)),
                 ("transmission zero", _nearest(loop.antiresonances_hz, hz)),
             )
             if np.isfinite(value)
         ]
-        words.append(f"S is largest, {number(gain, 4)}, at {number(hz, 4)} Hz; " + ", ".join(near))
-        words[-1] = words[-1].rstrip("; ") + "."
+        top = f"S is largest, {number(gain, 4)}, at {number(hz, 4)} Hz"
+        words.append("; ".join(filter(None, (top, " and ".join(near)))) + ".")
     below = [f for f in loop.resonances_hz if f < loop.bandwidth_hz]
     close = [f for f in loop.resonances_hz if loop.bandwidth_hz <= f < 2.0 * loop.bandwidth_hz]
     if below or close:

@@ -157,8 +157,7 @@ def modes_table(modal: ModalPlant) -> Table:
         hz = "rigid" if modal.rigid[i] else f"{number(omega / HZ, 4)} Hz"
         zeta = "" if modal.rigid[i] else f"{100.0 * modal.D[i, i] / (2.0 * omega):.3g} %"
         rows.append((hz, zeta, f"{b[i] / b.max():.2g}", f"{c[i] / c.max():.2g}"))
-    share = "(share of the strongest)"
-    return Table(("mode", "damping", f"driven {share}", f"measured {share}"), tuple(rows))
+    return Table(("mode", "damping", "driven (most: 1)", "measured (most: 1)"), tuple(rows))
 
 
 def mode_shape_figure(shapes: ModeShapes) -> Figure:

@@ -46,7 +46,7 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
     "settled after, ms": lambda m: 1e3 * m.settled,
     "RMS error, µm": lambda m: 1e6 * m.rms_error,
     "peak error, µm": lambda m: 1e6 * m.peak_error,
-    "last error, µm": lambda m: 1e6 * m.last_error(WATCHED),
+    "largest error of the last quarter, µm": lambda m: 1e6 * m.last_error(WATCHED),
     "peak force, N": lambda m: float(m.peak_force.max()),
     "at the limit, %": lambda m: 100.0 * m.saturated,
 }
@@ -73,9 +73,10 @@ def move_figure(
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
-    several = " on every plant of the set (band), the largest of all in words and numbers"
+    several = " on every plant of the set (band; words and numbers are of the worst)"
     words = (
-        f"{number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in {number(1e3 * end, 4)} ms"
+        f"The move: {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
+        f"{number(1e3 * end, 4)} ms"
         f"{several if len(loops) > 1 else ''}, "
         f"{'without the suspension' if model.free else 'on the soft suspension'} "
         f"({'continuous loop' if loops[0].sampling is None else 'hold and delay exact'}; {other})."
@@ -194,8 +195,8 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
     )
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
-        f"{ends[:1].upper()}{ends[1:]}. Settled is what stays within {shown(first.window, 'm')}; "
-        f"the last error in the data below is the largest over the last quarter. {words}"
+        f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
+        f"{shown(first.window, 'm')}. {words}"
     )
     table = over_time(("ms", *numbers), ms, *numbers.values())
     return Figure(lines, caption, (Table(("way", *FIGURES), rows), table))
@@ -230,7 +231,7 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
 def _limit_words(found: OnHardware) -> str:
     words = "" if found.forward is not None else "The plant holds no position: no feedforward. "
     if len(found.ways) < 3:
-        return words + "Give --saturation to see the move with the force that there is."
+        return words + "With --saturation the move is simulated with a limited force too."
     if np.isnan(found.least_limit):
         return words + (
             "The unlimited move itself does not end in its window within the time watched: ask for "

@@ -27,8 +27,8 @@ def nyquist_panel(
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     circle = np.exp(1j * angle)
     curves = [
-        Curve(line.real, line.imag, names[1] * (i == 1), others, width=1.0) if i
-        else Curve(line.real, line.imag, names[0] * (len(loci) > 1), width=1.6)
+        Curve(line.real, line.imag, names[1] * (i == 1), others, width=1.0, hz=hz) if i
+        else Curve(line.real, line.imag, names[0] * (len(loci) > 1), width=1.6, hz=hz)
         for i, line in reversed(list(enumerate(loci)))
     ]  # fmt: skip
     disk = -1.0 + circle / S_max

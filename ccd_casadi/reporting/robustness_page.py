@@ -27,7 +27,7 @@ def robustness_page(
     head = head_of(
         f"Robustness: {run.case.path.parent.name}", found.survives,
         "stable on all plants" if found.survives else "not stable on all plants",
-        "that were tried; nothing is said of others",
+        "that were tried; others were not examined",
         f"{theta_words(run.result)} · seed {seed}", lead, run.result if own else {},
         "" if own else given_decision(found),
     )  # fmt: skip
@@ -199,7 +199,7 @@ def _gains(run: FinishedRun, found: Study) -> Section:
 def _perturbed(run: FinishedRun, found: Study) -> Section:
     caption = (
         "Above: all flexible frequencies shifted together, mode shapes kept. Below: all damping "
-        "multiplied. The controller stays. A gap in a curve is an unstable loop; where a curve "
+        "multiplied. The controller stays the same. A gap in a curve is an unstable loop; where it "
         f"leaves at the top, the peak exceeds {figures.SHOWN_PEAK:g} S_max."
     )
     drawn = figures.perturbed(run, found, caption)

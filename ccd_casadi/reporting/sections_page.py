@@ -115,7 +115,7 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
     ]
     words = (
         "The first row is a certified bound under the same bounds on S, KS, T and GS. The others "
-        "are ends of climbs from the design, without other starts: at least that is reached."
+        "are local searches that began at the design: at least these bandwidths are reached."
     )
     return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), Words(
         f"{words}{tolerance_words(costs.get('tolerances_hz', {}))}"
@@ -157,8 +157,8 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),
         ("Over the box", "passed" if robust["passed"] else "FAILED",
-         f"{robust['words']}; the worst that was searched is {100 * robust['worst_excess']:+.2g} % "
-         f"of a bound; {r['proof']['words']}"),
+         f"{robust['words']}, the worst searched by {-100 * robust['worst_excess']:.2g} %; "
+         f"{r['proof']['words']}"),
         ("Optimality (KKT residual)", number(kkt, 2),
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
          "controller"),

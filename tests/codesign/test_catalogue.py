@@ -410,7 +410,7 @@ def test_what_sections_spend_is_counted_over_all_nodes(
 
     def formulated(outer: SectionsOuter, *_: object) -> FormulationResult:
         outer.sampler._spend("a design", 5, (60.0, 60.0), 12.0)
-        return FormulationResult(None, None, (), (), None, False, "nothing is feasible")
+        return FormulationResult(message="nothing is feasible")
 
     monkeypatch.setattr(SectionsOuter, "formulated", formulated)
     monkeypatch.setattr(outer_sections, "seeded_and_prepared", lambda _, own, *__: (own, ""))

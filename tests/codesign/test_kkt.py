@@ -1,5 +1,7 @@
 """The KKT certificate of the true problem: small at the optimum, large elsewhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import HZ, few, problem
@@ -23,7 +25,7 @@ START = point(57.0, 56.5, 1700.0, 30.0)
 
 def solved(case: CoDesignProblem, start: np.ndarray) -> tuple[OuterSolution, TrueQuantities]:
     quantities = TrueQuantities(case)
-    program = lifted_program(case, quantities, exact_hessian=False)
+    program = replace(lifted_program(case, quantities), exact_hessian=False)
     return solve_program(program, start), quantities
 
 

@@ -50,7 +50,7 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     process = fit(X, 1.0 + X[:, 0], lower=[0.0], upper=[1.0])
     end = End(np.array([0.5]), 2.5, -1.0, KktCertificate(0.0, 0.0, 0.0, {}, (), None, ()), 0.0)
     spent = (SimpleNamespace(),) * (rounds + 1)
-    outcome = FormulationResult(end.x, None, spent, (process,), None, False, "")  # type: ignore[arg-type]
+    outcome = FormulationResult(end.x, spent, (process,), None, False, "")  # type: ignore[arg-type]
     outer = SimpleNamespace(
         sampler=SimpleNamespace(spent=Spent()), kkt_level=1e-4,
         samples_of=lambda end, inputs: (np.array([end.value]), np.full((1, 1), np.nan)),

@@ -107,10 +107,11 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         assert objective_of(problem, best) < objective_of(problem, first) - 0.5 * promised.gain
         assert best.theta == pytest.approx((55.0, 55.0), abs=1e-6)
         assert best.bandwidth >= 0.99 * 2.0 * np.pi * STORED["bandwidth_hz"]
-        spent = last.spent.total
-        again = together(Sampler(problem, store, Workers(1)), np.array(problem.start))[1]
+        spent = sampler.spent.total
+        other = Sampler(problem, store, Workers(1))
+        again = together(other, np.array(problem.start))[1]
         assert (again.theta, again.kappa) == (best.theta, best.kappa)  # all from the store
-        assert last.spent.total == spent
+        assert other.spent.total == spent
 
 
 def test_where_each_theta_is_dear_none_is_sampled() -> None:

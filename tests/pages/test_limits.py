@@ -30,7 +30,7 @@ def test_no_share_exceeds_the_certified_norm(loop: LoopView) -> None:
 def test_the_words_name_the_zero_that_limits_case_a(loop: LoopView) -> None:
     words = " ".join(limit_sentences(loop))
     assert "At ω_b = 55.66 Hz |S| is at 98 % of its bound" in words
-    assert "transmission zero of the plant at 147.9 Hz" in words
+    assert "nearest transmission zero is at 147.9 Hz" in words
     table = table_limits(loop)
     places = [row[0] for row in table.rows]
     assert places[:2] == ["half the bandwidth", "bandwidth ω_b"]

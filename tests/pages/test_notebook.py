@@ -99,7 +99,7 @@ def test_inner_designs_show_their_figures() -> None:
 
 
 def test_a_solution_without_a_design_says_why() -> None:
-    outcome = FormulationResult(None, None, (), (), None, False, "")
+    outcome = FormulationResult()
     spent = {"spent": {"samples": 1}, "seconds": 1.0, "seed": 0}
     text = shown(Solution(infeasible_dict("lifted", "too <heavy>", **spent), outcome, None))
     assert "No feasible design: too <heavy>" in text

@@ -65,7 +65,7 @@ def test_what_varies_is_shown_as_a_range_and_not_as_a_value() -> None:
 
 def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
     result = result_of()
-    assert "predicted to 6.3e-12 of the truth" in conclusion(result)
+    assert "prediction errs by 6.3e-12 of the truth" in conclusion(result)
     result["verdict"]["predicted"] |= {"left_out": 0.022}
     assert "6.3e-12" not in conclusion(result)
     assert "misses it by 2.2 %" in conclusion(result)

@@ -1,9 +1,12 @@
 """The pages of a run in a real browser: quiet, readable narrow and dark, whole in print, linked."""
 
+import json
 import re
 import shutil
+from io import BytesIO
 
 import pytest
+from PIL import Image
 
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Head, Lines, Page, Section, Steps, Table
@@ -113,6 +116,70 @@ def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
     # read off different pictures: |L| = |G| |K|
     product = read(r"\|G\|") * read(r"\|K\|")
     assert read(r"\|L\|") == pytest.approx(product, rel=0.03)
+
+
+def test_the_cursor_of_a_nyquist_plot_reads_its_frequency(browser, solved):
+    page = browser.new_page(viewport={"width": 1300, "height": 900})
+    page.goto((solved("lifted") / "report.html").as_uri())
+    plot = page.locator("svg[aria-label='At a glance: Im L (–)']")
+    plot.scroll_into_view_if_needed()
+    d = json.loads(plot.get_attribute("data-axes"))
+    middle = sum(d["scales"][1][3:]) / 2.0
+    x, y, hz = max(d["locus"], key=lambda point: abs(point[1] - middle))
+    box, (*_, wide, _) = plot.bounding_box(), map(float, plot.get_attribute("viewBox").split())
+    page.mouse.move(box["x"] + x * box["width"] / wide, box["y"] + y * box["width"] / wide)
+    words = plot.locator(".readout").text_content()
+    found = re.fullmatch(r"(\S+) Hz · L (\S+) ([−+]) (\S+) i · (\S+) from −1", words)
+    assert float(found[1]) == pytest.approx(hz, rel=0.01)
+    L = complex(float(found[2]), float(found[4]) * (-1) ** (found[3] == "−"))
+    assert abs(1.0 + L) == pytest.approx(float(found[5]), abs=0.02)
+    others = [text for text in page.locator("svg .readout:visible").all_text_contents() if text]
+    assert len(others) > 5
+    assert {text.split(" · ")[0] for text in others} == {f"{found[1]} Hz"}  # one frequency on all
+    size = next(text.split(" · ")[1] for text in others if " · |L| " in text)
+    assert float(size.removeprefix("|L| ")) == pytest.approx(abs(L), rel=0.05, abs=0.02)
+
+
+def test_a_part_of_a_figure_is_enlarged_and_the_whole_shown_again(browser, solved):
+    page = browser.new_page(viewport={"width": 1300, "height": 900})
+    heard = complaints(page)
+    page.goto((solved("lifted") / "report.html").as_uri())
+    plot = page.locator("svg[aria-label='At a glance: |S| (–)']")
+    plot.scroll_into_view_if_needed()
+    box, before = plot.bounding_box(), plot.screenshot()
+    low, high, _, left, right = json.loads(plot.get_attribute("data-axes"))["scales"][0]
+    scale = box["width"] / float(plot.get_attribute("viewBox").split()[2])
+
+    def at(share, down):
+        return box["x"] + (left + share * (right - left)) * scale, box["y"] + down * box["height"]
+
+    page.mouse.move(*at(0.5, 0.3))
+    page.mouse.down()
+    page.mouse.move(*at(0.9, 0.6), steps=3)
+    page.mouse.up()
+    page.mouse.move(*at(0.25, 0.4))
+    hz = float(plot.locator(".readout").text_content().split(" Hz")[0])
+    assert hz == pytest.approx(low * (high / low) ** (0.5 + 0.25 * 0.4), rel=0.02)
+    assert plot.locator(".scale text").count() >= 4  # scales written anew
+    assert not plot.locator("[id*=xtick_1]").is_visible()
+    page.mouse.dblclick(*at(0.25, 0.4))
+    page.mouse.move(0.0, 0.0)
+    assert plot.screenshot() == before
+    assert not heard
+
+
+@pytest.mark.parametrize("width", [390, 1300])
+def test_a_table_that_goes_on_has_a_shadow_there(browser, tmp_path, width):
+    place = tmp_path / "page.html"
+    wide = Table(tuple(f"a column {i}" for i in range(9)), (tuple(range(9)),))
+    head = Head("a page", "good", "", "", "", "")
+    place.write_text(painted(Page(head, (Section("A table", (wide,)),))), encoding="utf-8")
+    page = browser.new_page(viewport={"width": width, "height": 500}, color_scheme="light")
+    page.goto(place.as_uri())
+    box = page.locator(".table").bounding_box()
+    right = {"x": box["x"] + box["width"] - 4, "y": box["y"] + 4, "width": 4, "height": 4}
+    shown = Image.open(BytesIO(page.screenshot(clip=right))).convert("L").getextrema()[0]
+    assert (shown < 200) == (width == 390)  # a grey there, and else white
 
 
 @pytest.mark.slow

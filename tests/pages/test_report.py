@@ -297,7 +297,7 @@ def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
     kept = ("formulation", "syntheses", "seconds", "seed", "versions")
     result = {key: solution.result[key] for key in kept}
     result |= {"status": "infeasible", "reason": "S_max cannot be met by <0.1>"}
-    nothing = FormulationResult(None, None, (), (), None, False, "")
+    nothing = FormulationResult()
     text = painted(solve_page(tmp_path, case, problem, Solution(result, nothing, None)))
     Document(text)
     assert "S_max cannot be met by &lt;0.1&gt;" in text

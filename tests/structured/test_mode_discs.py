@@ -15,6 +15,7 @@ from ccd_casadi.fixed_structure.certificate_responses import Responses
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.mode_discs import quotient
+from ccd_casadi.fixed_structure.rank_one import norm_with
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.plants.plant import Mechanics
@@ -169,6 +170,31 @@ def test_a_disc_holds_a_quotient_even_where_its_denominator_may_be_nought() -> N
         )
         value = (N.centre + (N.slope * t).sum(0)) / (D.centre + (D.slope * t).sum(0))
         assert (np.abs(value - centre) <= radius * (1.0 + 1e-9)).all()
+
+
+def test_the_norm_with_discs_holds_and_keeps_apart_what_is_apart() -> None:
+    rng, count, n = np.random.default_rng(11), 30, 5
+
+    def wild(*shape: int) -> np.ndarray:
+        return np.asarray(rng.normal(size=shape) + 1j * rng.normal(size=shape))
+
+    A, p, q, radius = (
+        wild(count, 3, 2),
+        wild(n, count, 3),
+        wild(n, count, 2),
+        rng.random((n, count)),
+    )
+    most = norm_with(A, p, q, radius)
+    for _ in range(300):
+        turned = radius * np.exp(2j * np.pi * rng.random((n, count)))
+        moved = A + np.einsum("iN,iNa,iNb->Nab", turned, p, q)
+        assert (np.linalg.norm(moved, 2, axis=(1, 2)) <= most).all()
+    # two channels: the largest of theirs, each the sum of its sizes
+    two = np.zeros((1, 2, 2), complex)
+    two[0] = np.diag([2.0, 1.0])
+    units = np.eye(2)[:, None, :] + 0j
+    found = norm_with(two, units, units, np.array([[0.3], [0.9]]))
+    assert found == pytest.approx([2.3], rel=1e-9)
 
 
 def test_every_figure_of_several_channels_is_proven_where_the_boxes_suffice() -> None:

@@ -107,7 +107,7 @@ def test_what_cannot_be_had_is_said() -> None:
 def test_it_is_a_constraint_of_the_outer_problem() -> None:
     case = bounded(2.7e-5)
     quantities = TrueQuantities(case)
-    program = lifted_program(case, quantities, exact_hessian=False)
+    program = lifted_program(case, quantities)
     x = np.array([*THETA, *np.log(POINT)])
     design = quantities.at(x)
     assert program.g.shape[0] == 3
