@@ -15,11 +15,7 @@ from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import (
-    nearby,
-    uncertain_plant,
-    with_sections,
-)
+from ccd_casadi.inner_problem.sections_plant_set import nearby, uncertain_plant, with_sections
 from ccd_casadi.inner_problem.sections_search import with_range
 from ccd_casadi.plants.plant import mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
