@@ -97,7 +97,7 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         at = Place(first.theta, first.kappa, first.bandwidth)
         promised = proposed(problem, nearby(problem, [at.theta], at.theta), at, 0.05)
         assert promised.gain > 0.0
-        last, best, settled = together(sampler, np.array(problem.start))
+        _, best, settled = together(sampler, np.array(problem.start))
         assert settled
         assert best.feasible
         assert objective_of(problem, best) < objective_of(problem, first) - 0.5 * promised.gain
