@@ -33,7 +33,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
-CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
+CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 REDRAWS = 2  # searches at most from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
 POOL = 12  # random starts tried for stability for each one that is kept
