@@ -31,8 +31,10 @@ class Direct:
     ----------
     starts : int
         The case's own and a Sobol set over the box.
-    tolerance, box_points : float, int
-        Of the inner problem; true inner problems over the box in the global check at the end.
+    tolerance : float
+        Of the inner problem.
+    box_points : int
+        True inner problems over the box in the global check at the end.
 
     Examples
     --------

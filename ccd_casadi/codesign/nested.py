@@ -35,8 +35,10 @@ class Nested:
 
     Parameters
     ----------
-    plan, points : str, int
-        "grid", "sobol" or "lhs" over θ; points along each axis of a grid, else in all.
+    plan : str
+        "grid", "sobol" or "lhs" over θ.
+    points : int
+        Along each axis of a grid, else in all.
     starts : int
         Of IPOPT in a round.
     tolerance, max_refinements : float, int

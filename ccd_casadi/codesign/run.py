@@ -46,12 +46,18 @@ def solve(
 
     Parameters
     ----------
-    problem, formulation : CoDesignProblem; Nested, Lifted or Direct
-        As `problem_of` gives it. By default lifted, and direct with more than 12 parameters.
-    seed, workers : int
-        Of every random choice; processes (more than one: behind `if __name__ == "__main__":`).
-    store, quiet : path, bool
-        File of the samples, which a later call resumes from; whether without progress on stderr.
+    problem : CoDesignProblem
+        As `problem_of` gives it.
+    formulation : Nested, Lifted or Direct
+        By default lifted, and direct with more than 12 parameters.
+    seed : int
+        Of every random choice.
+    workers : int
+        Processes; with more than one, call it behind `if __name__ == "__main__":`.
+    store : path
+        File of the samples, which a later call resumes from.
+    quiet : bool
+        Whether to show no progress on stderr.
 
     Returns
     -------

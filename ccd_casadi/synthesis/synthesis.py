@@ -117,8 +117,10 @@ def synthesise(
         W1, W2, W3.
     omega_low : float
         Where |S| is reported, rad/s.
-    gamma_backoff, guess : float
-        The controller is made at this multiple of γ_opt; a nearby γ_opt, 0: none.
+    gamma_backoff : float
+        The controller is made at this multiple of γ_opt.
+    guess : float
+        A nearby γ_opt; 0: none.
     compliance : bool
         Whether ‖GS‖∞ is among the figures.
 

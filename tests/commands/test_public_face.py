@@ -35,20 +35,19 @@ def test_importing_it_loads_nothing_that_can_wait(module: str, heavy: tuple[str,
     )
     assert json.loads(found.stdout) == []
 # whose docstrings are prose still
-PROSE = set(
-    """
-    Bounds CoDesignProblem Errors Extrapolation GaussianProcess Hyperparameters Plant Quality
-    Samples Sampling SectionsDesign Solution StateSpace Structure SurrogateRegressor
-    TrueQuantities Tuned build_plant certify checked compare condition corners deploy design
-    errors extrapolation fit_outputs grid latin_hypercube load loo_errors plant_from_control
-    quality_of read_frequency_response read_run robustness samples_frame save scaled_plant
-    sobol synthesise_sections tune verify
-    """.split()
-)
+PROSE = {
+    "Bounds", "CoDesignProblem", "Errors", "Extrapolation", "GaussianProcess", "Hyperparameters",
+    "Plant", "Quality", "Samples", "Sampling", "SectionsDesign", "Solution", "StateSpace",
+    "Structure", "SurrogateRegressor", "TrueQuantities", "Tuned", "build_plant", "certify",
+    "checked", "compare", "condition", "corners", "deploy", "design", "errors", "extrapolation",
+    "fit_outputs", "grid", "latin_hypercube", "load", "loo_errors", "plant_from_control",
+    "quality_of", "read_frequency_response", "read_run", "robustness", "samples_frame", "save",
+    "scaled_plant", "sobol", "synthesise_sections", "tune", "verify",
+}  # fmt: skip
 
 
 def documented(module: ModuleType) -> list[tuple[str, object]]:
-    """What of a package takes parameters: functions, and classes that are no enumeration or error."""
+    """What of a package takes parameters: no enumerations and errors."""
     found = ((name, getattr(module, name)) for name in module.__all__)
     return [(name, each) for name, each in found if callable(each)
             and not (isinstance(each, type) and issubclass(each, Exception | Enum))]  # fmt: skip
@@ -58,10 +57,8 @@ def documented(module: ModuleType) -> list[tuple[str, object]]:
 def test_sections_of_a_docstring_name_what_the_signature_does(module: ModuleType) -> None:
     wrong = {}
     for name, each in documented(module):
-        sections = {
-            section.kind.value: section.value
-            for section in griffe.Docstring(inspect.getdoc(each) or "").parse("numpy", warnings=False)
-        }
+        parsed = griffe.Docstring(inspect.getdoc(each) or "").parse("numpy", warnings=False)
+        sections = {section.kind.value: section.value for section in parsed}
         signature = inspect.signature(each)
         named = sorted(item.name for item in sections.get("parameters", []))
         if named != sorted(signature.parameters):
