@@ -94,6 +94,7 @@ def solve_nested(
     surrogate: GaussianProcess | None = None
     solution: OuterSolution | None = None
     for round_number in range(options.max_refinements + 1):
+        samples, raised = sampler.latest(samples), sampler.raised
         best = _best(problem, samples)
         low, high = _region(problem, best, radius)
         local = _local(samples, low, high, upper - lower)
@@ -123,6 +124,8 @@ def solve_nested(
         settled = abs(iterate.objective - value_of(best)) <= options.tolerance * abs(
             iterate.objective
         )
+        if sampler.raised > raised:
+            continue  # fitted to worse controllers than are known now
         if agreed and (iterate.step <= STEP or settled):
             break
         if not agreed:
@@ -132,7 +135,7 @@ def solve_nested(
             radius *= 0.5
         elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone
             radius = min(1.0, 2.0 * radius)
-    best = _best(problem, samples)
+    best = _best(problem, sampler.latest(samples))
     message = "" if agreed else "prediction and truth did not agree within the budget"
     surrogates = () if surrogate is None else (surrogate,)
     return FormulationResult(best.joint, tuple(iterates), surrogates, solution, agreed, message)

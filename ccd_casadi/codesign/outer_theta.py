@@ -54,7 +54,7 @@ class ThetaOuter(Outer, ABC):
         """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
         problem, truth = self.problem, TrueBandwidth(self.sampler, "polishing")
         with self.sampler.spent.on("polish"):
-            best, _ = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
+            best = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
         kkt = theta_kkt(problem, best, truth)
         return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
 
@@ -64,7 +64,7 @@ class ThetaOuter(Outer, ABC):
         problem = self.problem
         truth = TrueBandwidth(self.sampler, "local solve")
         first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)
-        best, _ = pieces_from(truth, sample, least, first)
+        best = pieces_from(truth, sample, least, first)
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None

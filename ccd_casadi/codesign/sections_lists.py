@@ -21,8 +21,8 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
-from ccd_casadi.codesign.outer_sections import SectionsOuter, by_pieces
-from ccd_casadi.codesign.theta_direct import FAR, TrueBandwidth
+from ccd_casadi.codesign.outer_sections import SectionsOuter
+from ccd_casadi.codesign.theta_direct import FAR, TrueBandwidth, pieces_from
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.inner_problem.objective import objective_of
@@ -105,8 +105,7 @@ class ListedSections:
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by."""
     truth = TrueBandwidth(sampler, "near by")
-    truth, best = by_pieces(truth, truth.at(theta), SETTLED, FAR)
-    return _found(truth.sampler.problem, best)
+    return _found(sampler.problem, pieces_from(truth, truth.at(theta), SETTLED, FAR))
 
 
 def carried(

@@ -18,7 +18,7 @@ import numpy as np
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.sampling.rows import Sample, problem_hash
+from ccd_casadi.sampling.rows import Sample, hashes_of
 from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -73,8 +73,7 @@ def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[A
     Designs that were not certified are among them.
     """
     lower, upper = lifted_bounds(problem)
-    key = problem_hash(problem.identity())
-    keys = store.keys_with_gradients(key)
+    keys = store.keys_with_gradients(hashes_of(problem)[0])
     known = store.get(keys)
     slack = SAME * (upper - lower)
     found = []
@@ -96,9 +95,7 @@ def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[A
 def stored_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
     """Every θ (n, n_θ) inside the box whose inner problem was solved, oldest first."""
     lower, upper = box(problem)
-    designs = problem_hash(problem.identity())
-    key = problem_hash({"problem": designs, "inner": problem.inner_identity()})
-    thetas = store.thetas(key)
+    thetas = store.thetas(hashes_of(problem)[1])
     if any(len(theta) != len(lower) for theta in thetas):
         raise store.damaged()
     X = np.array(thetas, dtype=float).reshape(-1, len(lower))

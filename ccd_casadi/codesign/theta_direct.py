@@ -4,13 +4,14 @@ import numpy as np
 
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
-from ccd_casadi.optim.pieces import FIRST, Local, descend, jumps
+from ccd_casadi.optim.pieces import FIRST, Local, descend
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 
 SETTLED = 1e-7  # of J: what steps promise less than that is not looked for
 FAR = 0.1  # of the box: the first radius where the optimum is not known to be near by
+FOLLOWED = 3  # descents at most, each with the better controllers that the one before has found
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 
@@ -19,7 +20,7 @@ class TrueBandwidth:
 
     def __init__(self, sampler: Sampler, label: str) -> None:
         self.sampler, self.label = sampler, label
-        self.known: dict[bytes, BandwidthSample] = {}
+        self.asked: dict[tuple[float, ...], BandwidthSample] = {}  # as they were when asked for
 
     def at(self, theta: Array) -> BandwidthSample:
         """The sample at θ; repeated points cost nothing."""
@@ -27,18 +28,23 @@ class TrueBandwidth:
 
     def all_at(self, thetas: Array) -> list[BandwidthSample]:
         """Those at several θ (k, n), over the workers."""
-        keys = [np.asarray(theta, float).tobytes() for theta in thetas]
-        new = [i for i, key in enumerate(keys) if key not in self.known]
-        if new:
-            samples = self.sampler.bandwidths(np.asarray(thetas)[new], self.label)
-            self.known |= {keys[i]: sample for i, sample in zip(new, samples, strict=True)}
-        return [self.known[key] for key in keys]
+        samples = self.sampler.bandwidths(thetas, self.label)
+        self.asked |= {sample.theta: sample for sample in samples}
+        return samples
+
+    @property
+    def known(self) -> list[BandwidthSample]:
+        """What is known by now of all that were asked for."""
+        return self.sampler.latest(list(self.asked.values()))
 
 
 def pieces_from(
     truth: TrueBandwidth, best: BandwidthSample, settled: float, first: float = FIRST
-) -> tuple[BandwidthSample, bool]:
-    """The best sample of one function ω_b*, and whether that jumps beside it."""
+) -> BandwidthSample:
+    """From a sample, and what was asked for near it, to where the pieces of J promise no more.
+
+    Again from the best where a better controller was found on the way for what had been known.
+    """
     problem = truth.sampler.problem
     lower, upper = box(problem)
     width = upper - lower
@@ -56,13 +62,16 @@ def pieces_from(
         found = hardware_at(problem, lower + width * z)
         return found.constraints, found.slopes
 
-    start = local(best)
-    if start is None:
-        return best, False
-    others = [found for found in map(local, truth.known.values()) if found is not None]
     steps = STEPS * len(lower)
-    end = descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
-    met = (found for found in map(local, truth.known.values()) if found is not None)
-    jumped = any(found.value > end.value and jumps(end, found) for found in met)
-    found = (best, *truth.known.values())  # where nothing is promised nothing was asked for
-    return min(found, key=lambda sample: objective_of(problem, sample)), jumped
+    for _ in range(FOLLOWED):
+        start, raised = local(best), truth.sampler.raised
+        if start is None:
+            break
+        others = [found for found in map(local, truth.known) if found is not None]
+        descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
+        # where nothing is promised nothing was asked for
+        found = (*truth.sampler.latest([best]), *truth.known)
+        best = min(found, key=lambda sample: objective_of(problem, sample))
+        if truth.sampler.raised == raised:
+            break
+    return best

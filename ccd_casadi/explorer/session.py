@@ -26,7 +26,7 @@ from ccd_casadi.explorer.words import surface_modes_html
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.machine import lumped
-from ccd_casadi.sampling.rows import problem_hash, sample_key
+from ccd_casadi.sampling.rows import hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import unit_of
@@ -148,7 +148,7 @@ class Session:
             if optimum is not None and optimum.to_theta.shape[1] != len(look.theta):
                 self.store.put(rows, key)  # of matrices without derivatives: no sample of ω_b*(θ)
                 continue
-            inner = problem_hash({"problem": key, "inner": look.problem.inner_identity()})
+            inner = hashes_of(look.problem)[1]
             unit = (sample_key(inner, look.theta, 0.0, 0.0), inner, look.theta, payload)
             self.store.put_unit(rows, unit, key)
 
