@@ -66,17 +66,11 @@ class Lifted:
 
 
 def solve_lifted(
-    sampler: Sampler,
-    options: Lifted,
-    *,
-    seed: int,
-    given: Surrogates | None = None,
-    incumbent: QuantitySample | None = None,
+    sampler: Sampler, options: Lifted, *, seed: int, given: Surrogates | None = None
 ) -> FormulationResult:
     """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
 
-    With `given` surrogates the rounds start from those and what they were fitted to, with an
-    `incumbent` from that design.
+    With `given` surrogates the rounds start from those and what they were fitted to.
     """
     problem = sampler.problem
     lower, upper = lifted_bounds(problem)
@@ -90,6 +84,7 @@ def solve_lifted(
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)
     iterates: list[Iterate] = []
+    incumbent: QuantitySample | None = None
     processes: tuple[GaussianProcess, ...] = () if given is None else given.processes
     solution: OuterSolution | None = None
     agreed, fitted = False, len(samples) if processes else 0
