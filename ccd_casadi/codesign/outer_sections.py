@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +25,7 @@ from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
-from ccd_casadi.codesign.theta_joint import together
+from ccd_casadi.codesign.theta_joint import together, with_members
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
@@ -143,7 +143,6 @@ def teller(label: str, quiet: bool) -> Callable[[str], None]:
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
-CARRIED = 12  # joint searches at most, each on the worst plants that the one before has left
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -214,7 +213,8 @@ class SectionsOuter(ThetaOuter):
         end = cast(SectionsEnd, end)
         if not end.members:
             return None
-        return SectionsOuter(with_members(end.asked, end.found.design.kappa, end.members))
+        anchored = joined(end.asked.problem, end.found.design.kappa, ())
+        return SectionsOuter(with_members(end.asked.of(anchored), end.members))
 
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)
@@ -269,29 +269,6 @@ def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: SectionsValue) 
     return problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
 
 
-def with_members(sampler: Sampler, kappa: Array, members: Sequence[Member]) -> Sampler:
-    """The sampler of the problem with more plants: on these what was found before is worth
-    nothing."""
-    trace = sampler.trace
-    trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
-    return sampler.of(joined(sampler.problem, kappa, members))
-
-
-def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
-    """`together` again with the worst plants of its end, until it settles and none is worse."""
-    for turn in range(CARRIED):
-        best, settled = together(sampler, theta)
-        if not best.feasible:
-            break
-        design, tell = value_at(sampler, best).design, teller("on the way", sampler.quiet)
-        members = worst_members(sampler.problem, best.theta, design, turn, tell)[1]
-        if not members and (settled or np.array_equal(best.theta, theta)):
-            break
-        theta = np.array(best.theta)
-        sampler = with_members(sampler, design.kappa, members) if members else sampler
-    return sampler, best
-
-
 def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more plants, where worse ones were found.
@@ -300,7 +277,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     pieces (`pieces`), which know kinks.
     """
     if sampler.problem.figure is BANDWIDTH:
-        sampler, best = carried(sampler, theta)
+        sampler, best, _ = together(sampler, theta, teller("on the way", sampler.quiet))
         if best.feasible and _stationary(sampler, best):
             return sampler, best
         theta = np.array(best.theta)

@@ -10,9 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
@@ -59,22 +57,6 @@ class ThetaOuter(Outer, ABC):
             best = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
         kkt = theta_kkt(problem, best, truth)
         return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
-
-    def resumed(
-        self,
-        formulation: Formulation,
-        outcome: FormulationResult,
-        x: Array,
-        sampled: Sequence[tuple[float, ...]],
-        seed: int,
-    ) -> FormulationResult:
-        if isinstance(formulation, Direct):
-            return replace(outcome, x=x, agreed=True)
-        thetas = np.unique(np.array([*sampled, tuple(x)]), axis=0)
-        found = self.formulated(formulation, seed, Surrogates((), thetas, ()))
-        if found.x is None:
-            return replace(outcome, x=x)
-        return replace(found, iterates=(*outcome.iterates, *found.iterates))
 
     def solved_from(
         self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None

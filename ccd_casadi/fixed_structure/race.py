@@ -17,8 +17,8 @@ from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 
-ROUNDS = (15, 30, 60, 60, 60, 60, 60, 60)  # steps of each
-HALVINGS = 3  # rounds after which the better half goes on
+ROUNDS, STEPS = 27, 15  # at most, steps of each
+HALVINGS = (0, 2, 6)  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
@@ -67,22 +67,25 @@ def run_race(
     workers: Pool | None = None,
     before: Sequence[Runner] = (),
     known: int = 0,
+    last: bool = True,
 ) -> list[Runner]:
     """All searches from the starts `pool` (N, n), the best first.
 
     The first `known` of these are controllers that searches have ended with. Those of searches
-    `before` are in the field too: they climb no more, but have to be overtaken.
+    `before` are in the field too and have to be overtaken. Where this race is not the `last` one,
+    a search that goes on alone and gains little does so in the next.
     """
-    field = [replace(runner, running=False) for runner in before]
+    field = list(before)
     field += [Runner(at_its_bandwidth(problem, kappa)) for kappa in pool[:known]]
     field += [Runner(started(problem, kappa)) for kappa in pool[known:]]
     scale = problem.plants.omega_0 / (2.0 * np.pi)
-    for turn, steps in enumerate(ROUNDS):
+    for turn in range(ROUNDS):
         running = [runner for runner in field if runner.running]
-        if not running:
+        alone = len(running) == 1 and turn > 0 and running[0].gained < SAME
+        if not running or (alone and not last):
             break
         others = [runner for runner in field if not runner.running]
-        field = others + _climbed(problem, running, steps, workers or Workers(1))
+        field = others + _climbed(problem, running, workers or Workers(1))
         field = _merged(problem, sorted(field, key=lambda runner: -runner.merit))
         field = _going_on(field, turn)
         lead = field[0].point
@@ -163,11 +166,9 @@ def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOpt
     return tuple(found)
 
 
-def _climbed(
-    problem: LoopProblem, running: Sequence[Runner], steps: int, workers: Pool
-) -> list[Runner]:
+def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool) -> list[Runner]:
     """All of them some steps further, in their order."""
-    tasks = [(i, problem, r.point, r.radius, steps) for i, r in enumerate(running)]
+    tasks = [(i, problem, r.point, r.radius) for i, r in enumerate(running)]
     ends = dict(workers.map_unordered(_climb, tasks))
     found = []
     for i, runner in enumerate(running):
@@ -179,9 +180,9 @@ def _climbed(
     return found
 
 
-def _climb(task: tuple[int, LoopProblem, Point, float, int]) -> tuple[int, Ascent]:
-    index, problem, point, radius, steps = task
-    return index, ascend(problem, point, iterations=steps, radius=radius)
+def _climb(task: tuple[int, LoopProblem, Point, float]) -> tuple[int, Ascent]:
+    index, problem, point, radius = task
+    return index, ascend(problem, point, iterations=STEPS, radius=radius)
 
 
 def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
@@ -202,15 +203,15 @@ def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
 def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
     """The field, best first, with those stopped that lost, or will not meet the bounds."""
     running = [i for i, runner in enumerate(field) if runner.running]
-    most = max(LAST, len(running) // 2) if turn < HALVINGS else len(running)
+    most = max(LAST, len(running) // 2) if turn in HALVINGS else len(running)
     lead, found = field[0].merit, list(field)
     for place, i in enumerate(running):
         runner = field[i]
         behind = lead - runner.merit
         lost = place >= most or behind + WORTH > OVERTAKING * runner.gained
-        lost = lost or (turn >= HALVINGS - 1 and behind > BEHIND)
+        lost = lost or (turn >= HALVINGS[-1] and behind > BEHIND)
         missing = PENALTY * runner.point.assessment.violation
-        hopeless = turn >= HALVINGS - 1 and missing > OVERTAKING * runner.gained
+        hopeless = turn >= HALVINGS[-1] and missing > OVERTAKING * runner.gained
         if hopeless or (lost and i):
             found[i] = replace(runner, running=False)
     return found
