@@ -86,11 +86,7 @@ class ListedSections:
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
             return _nothing("no theta within the constraints was found")
-        carried_on = carried(known, problem, self.members)
-        found = _climbed(sampler.of(with_sections(carried_on, starts=0)), theta)
-        if np.isfinite(found.result.get("objective", np.inf)):
-            return found
-        return _climbed(sampler.of(with_sections(carried_on, anchors=())), theta)
+        return _climbed(sampler.of(carried(known, problem, self.members)), theta)
 
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
