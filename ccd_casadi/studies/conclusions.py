@@ -3,6 +3,7 @@
 from typing import Any
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.support.units import counted
 
 EQUAL = 1e-6  # relative difference of J that counts as none
 LABELS = {
@@ -65,13 +66,13 @@ def _descent(
         "last_gradient": run["history"][-1]["gradient"],
     }
     words = [
-        f"S{LABELS[name][1:]} (best of {run['runs']} runs) ends at J = "
+        f"S{LABELS[name][1:]} (best of {counted(run['runs'], 'run')}) ends at J = "
         f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, "
         f"{ratio:.0f} times as many; all its runs together took {run['syntheses_of_all_runs']}."
     ]
     if gap > EQUAL * abs(best["objective"]):
         words.append(
-            f"It stopped because of: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
+            f"It stopped: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
             "from the best one."
         )
     return found, words
