@@ -27,16 +27,28 @@ def to_casadi(
     name: str = "surrogate",
     std: bool = True,
 ) -> ca.Function:
-    """Return the CasADi function x (d) -> mean (k), or -> (mean, std) with `std`.
+    """The CasADi function x (d) -> mean (k), or -> (mean, std) with `std`; equal to `predict`.
 
-    k is the number of surrogates given (1 for a single one), which must share their
-    inputs; x is in input units. Agrees with `predict` to rounding, and value,
-    gradient and Hessian are finite and exact everywhere, at the samples too. The
-    deviation costs O(n²) a look against O(n) for the mean: leave it out of an
-    optimisation that does not use it.
+    Value, gradient and Hessian are exact and finite everywhere, at the samples too.
 
-    Raises:
-        ValueError: no surrogates, or surrogates of different numbers of inputs.
+    Parameters
+    ----------
+    surrogate : GaussianProcess or sequence
+        One, or k of the same inputs.
+    name : str
+        Of the function.
+    std : bool
+        Whether to return deviations: O(n²) an evaluation, where the mean takes O(n).
+
+    Returns
+    -------
+    casadi.Function
+        In input and output units.
+
+    Raises
+    ------
+    ValueError
+        No surrogates, or surrogates of different numbers of inputs.
     """
     members = list(surrogate) if isinstance(surrogate, Sequence) else [surrogate]
     inputs = {member.lower.size for member in members}

@@ -26,18 +26,33 @@ def fit(
     seed: int = 0,
     starts: int = 5,
 ) -> GaussianProcess:
-    """Fit a Gaussian process to samples of one output, with gradients if there are any.
+    """Fit a process to samples of one output, with gradients if there are any.
 
-    X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X. `lower`, `upper` (d,)
-    scale the inputs; left out, they are the range of X. The hyperparameters are those of
-    largest likelihood, from `starts` seeded starts.
+    Parameters
+    ----------
+    X, Y : array (n, d), array (n,)
+        Places and values of the samples, in input and output units.
+    dY : array (n, d), optional
+        Gradients ∂Y/∂X.
+    lower, upper : array (d,), optional
+        Box that scales the inputs; left out, the range of X.
+    kernel : Kernel or str
+        Covariance.
+    noise : float or array (n,), optional
+        Standard deviation of Y, in output units; 0 interpolates, None estimates it.
+    seed, starts : int
+        Of the search for hyperparameters.
 
-    `noise` is the standard deviation of Y in output units, one for all or one to each
-    sample (n,); 0 interpolates, None estimates it.
+    Returns
+    -------
+    GaussianProcess
+        The surrogate, with its leave-one-out errors.
 
-    Raises:
-        SurrogateFitError: wrong shapes, values that are not finite, negative noise, an unknown
-            kernel, or samples that no process can take; the sentence says what to do.
+    Raises
+    ------
+    SurrogateFitError
+        Wrong shapes, values that are not finite, negative noise, or an unknown kernel; the sentence
+        says what to do.
     """
     samples = checked(X, Y, lower, upper, dY, noise)
     if starts < 1:

@@ -33,11 +33,23 @@ STEP = 1e-3  # share of the box below which a step counts as small
 class Nested:
     """Options of the nested formulation; the defaults are those of a case file.
 
-    `plan`: "grid" (`points` an axis), "sobol" or "lhs" (`points` in all) over θ. `starts` of IPOPT
-    a round; prediction and truth agree within `tolerance` (relative) or after `max_refinements`
-    rounds at the latest. `kernel`: "matern52", "rbf", or "auto", which predicts left-out samples
-    best. `box_points` true inner problems over the box are looked at in the end (`box_look`).
+    Parameters
+    ----------
+    plan : str
+        "grid", "sobol" or "lhs" over θ.
+    points : int
+        Along each axis of a grid, else in all.
+    starts : int
+        Of IPOPT in a round.
+    tolerance, max_refinements : float, int
+        Prediction and truth agree within it (relative), or after this many rounds at the latest.
+    kernel : str
+        "matern52", "rbf", or "auto", which predicts left-out samples best.
+    box_points : int
+        True inner problems over the box in the global check at the end.
 
+    Examples
+    --------
     >>> Nested(plan="sobol", points=24).starts
     16
     """

@@ -67,14 +67,6 @@ def named_surrogate(
     return Surrogates(processes, X[:, :-2], _quantities(processes, X))
 
 
-def fitted_quantities(processes: tuple[GaussianProcess, ...]) -> tuple[QuantitySample, ...]:
-    """The samples that the lifted formulation's processes were fitted to; none without them."""
-    if not processes:
-        return ()
-    X = processes[0].lower + processes[0].X * (processes[0].upper - processes[0].lower)
-    return _quantities(processes, X)
-
-
 def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Array, Sample]]:
     """Designs with derivatives inside the box as (x, row), x = (θ, ln ω_S, ln ω_T), oldest first.
 

@@ -179,7 +179,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     """J over its `unit`, w2 ω_b in the middle, on the plants to first order around a place; over
     x = (z, κ, τ), with the loops at x."""
 
-    corrected = True
+    corrected = bending = True
 
     def __init__(
         self, problem: CoDesignProblem, models: Sequence[Evaluate], place: Place, reach: float

@@ -100,7 +100,7 @@ def synthesise_sections(
     tell = progress or (lambda words: None)
     if not len(pool):
         return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
-    runners = run_race(problem, pool, tell, workers, known=known)
+    runners = run_race(problem, pool, tell, workers, known=known, last=only_initial)
     for _ in range(0 if only_initial else REDRAWS):
         best = runners[0].merit
         fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)

@@ -67,19 +67,22 @@ def run_race(
     workers: Pool | None = None,
     before: Sequence[Runner] = (),
     known: int = 0,
+    last: bool = True,
 ) -> list[Runner]:
     """All searches from the starts `pool` (N, n), the best first.
 
     The first `known` of these are controllers that searches have ended with. Those of searches
-    `before` are in the field too: they climb no more, but have to be overtaken.
+    `before` are in the field too and have to be overtaken. Where this race is not the `last` one,
+    a search that goes on alone and gains little does so in the next.
     """
-    field = [replace(runner, running=False) for runner in before]
+    field = list(before)
     field += [Runner(at_its_bandwidth(problem, kappa)) for kappa in pool[:known]]
     field += [Runner(started(problem, kappa)) for kappa in pool[known:]]
     scale = problem.plants.omega_0 / (2.0 * np.pi)
     for turn in range(ROUNDS):
         running = [runner for runner in field if runner.running]
-        if not running:
+        alone = len(running) == 1 and turn > 0 and running[0].gained < SAME
+        if not running or (alone and not last):
             break
         others = [runner for runner in field if not runner.running]
         field = others + _climbed(problem, running, workers or Workers(1))
