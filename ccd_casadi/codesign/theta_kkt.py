@@ -9,6 +9,9 @@ same, and its conditions hold for one μ and ν:
 
     rowsᵀ μ = goal,   w1 ∇f + w2 (direct + to_thetaᵀ μ) + Aᵀν = 0,   μ, ν >= 0        (`Envelope`)
 
+Rows within 1e-3 of their bounds may carry μ too, and then count by μ times what is left
+(complementary slackness): a search of θ and controller ends where a kink's rows meet to 1e-5 or so.
+
 Where they are met a convex combination of the sides' gradients is balanced by A (stationary in the
 sense of Clarke), and no direction of θ, κ and τ that the bounds allow makes J fall to first order.
 All that is by derivatives at the design, of its controller and what that can be moved to. Whether
@@ -39,7 +42,7 @@ from ccd_casadi.support.arrays import Array
 # The envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3: a residual
 # below that says nothing of a kink.
 SMOOTH = 1e-3
-EQUATION = 1e3  # weight of the controller's own conditions, which no θ may pay for
+EQUATION = 10.0  # weight of the controller's own conditions, which no θ may pay for
 BESIDE = 10.0 * STEP  # of the box: differences of true values and gradients
 
 
@@ -94,7 +97,8 @@ def joint_residual(
         rowsᵀ μ = goal,   direct + to_thetaᵀ μ + Aᵀν = 0,   μ, ν >= 0
 
     `direct` (n,), `to_theta` (m, n) and A (k, n) are of J per share of the box. The residual is
-    the larger of both, over ‖goal‖∞ and over `size`.
+    the largest of both, over ‖goal‖∞ and over `size`, and of Σ μ slack over ‖goal‖∞: what is to be
+    had, to first order, from rows that do not quite bind.
     """
     count, k = len(envelope.rows), len(A)
     unit = float(np.abs(envelope.goal).max())
@@ -102,12 +106,13 @@ def joint_residual(
     ends = np.zeros((len(direct), count - len(to_theta)))
     outer = np.hstack([to_theta.T, ends, A.T]) / size
     goals = envelope.goal / unit, -direct / size
+    loose = np.pad(envelope.slack / unit, (0, k))
     found, _ = nnls(
-        np.vstack([EQUATION * inner, outer]),
-        np.concatenate([EQUATION * goals[0], goals[1]]),
+        np.vstack([EQUATION * inner, outer, np.diag(loose)]),
+        np.concatenate([EQUATION * goals[0], goals[1], np.zeros(count + k)]),
         maxiter=100 * (count + k),
     )
-    off = (inner @ found - goals[0], outer @ found - goals[1])
+    off = (inner @ found - goals[0], outer @ found - goals[1], [loose @ found])
     return max(float(np.abs(part).max()) for part in off), found[:count], found[count:]
 
 

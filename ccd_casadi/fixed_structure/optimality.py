@@ -19,6 +19,7 @@ from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.support.arrays import Array
 
 ACTIVE = 1e-5  # ln of the share of its bound within which a constraint binds
+NEAR = 1e-3  # the same within which it may bind at a kink that the search has not quite reached
 RESIDUAL = 1e-3  # of ∇τ, which is 1: above it there is no envelope gradient
 
 
@@ -30,7 +31,8 @@ class Envelope:
 
     over what binds; `rows` (M, n + 1) are slopes to (κ, τ), `multipliers` (M,) one such μ.
     `to_theta` (m, n_θ) is of the m constraints, which come first and are named by kind: the ends of
-    κ's box have none.
+    κ's box have none. `slack` (M,): by how much a constraint is off its bound, in logarithms; with
+    μ slack a row counts that all but binds.
     """
 
     names: tuple[str, ...]
@@ -39,6 +41,7 @@ class Envelope:
     rows: Array
     goal: Array
     multipliers: Array
+    slack: Array
 
     @property
     def gradient(self) -> Array:
@@ -57,10 +60,11 @@ class Optimality:
     `rows` (M, n + 1) are slopes to (κ, τ): first of the `active` bounds, each named in `kinds`,
     then of the ends of κ's box, (name, "lower" or "upper"), and of a least τ. `multipliers` (M,):
     change of the goal per ln of a bound; `residual` is over ‖goal‖∞; `violation`: by how much a
-    bound is passed (logarithm).
+    bound is passed (logarithm). `near`: what all but binds, which counts for none of this.
     """
 
     active: Constraints
+    near: Constraints
     kinds: tuple[str, ...]
     box_ends: tuple[tuple[str, str], ...]
     rows: Array
@@ -94,7 +98,8 @@ def optimality(
     """
     peaks = point.assessment.peaks
     assert peaks is not None
-    active = peaks.only(np.abs(peaks.value) <= ACTIVE)
+    binds = np.abs(peaks.value) <= ACTIVE
+    active, near = peaks.only(binds), peaks.only(~binds & (np.abs(peaks.value) <= NEAR))
     n = len(point.kappa)
     unit = np.eye(n + 1)
     rows, ends = [np.column_stack([active.to_kappa, active.to_tau])], []
@@ -107,7 +112,7 @@ def optimality(
         rows.append(-unit[n:])
     matrix, goal = np.concatenate(rows), unit[n] if goal is None else goal
     return Optimality(
-        active, tuple(kinds_of_rows(problem, active)), tuple(ends), matrix, goal,
+        active, near, tuple(kinds_of_rows(problem, active)), tuple(ends), matrix, goal,
         *non_negative(matrix, goal), point.assessment.violation,
     )  # fmt: skip
 
@@ -121,7 +126,14 @@ def envelope_of(
     """
     if found.residual > RESIDUAL or found.violation > ACTIVE:
         return None
-    slopes = to_theta(problem, kappa, found.active)
+    near, count = found.near, len(found.kinds)
+    slopes = np.concatenate([to_theta(problem, kappa, part) for part in (found.active, near)])
     if direct is None:
         direct, slopes = np.zeros(slopes.shape[1]), -slopes
-    return Envelope(found.kinds, direct, slopes, found.rows, found.goal, found.multipliers)
+    at = np.full(len(near.v), count)  # behind those that bind, before the ends of the box
+    rows = np.insert(found.rows, at, np.column_stack([near.to_kappa, near.to_tau]), axis=0)
+    return Envelope(
+        (*found.kinds, *kinds_of_rows(problem, near)), direct, slopes, rows, found.goal,
+        np.insert(found.multipliers, at, 0.0),
+        np.insert(np.zeros(len(found.rows)), at, np.abs(near.value)),
+    )  # fmt: skip
