@@ -24,7 +24,7 @@ from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import together, with_members
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
@@ -223,7 +223,7 @@ class SectionsOuter(ThetaOuter):
         raced = raced_at(asked, best) if end.raced is None else end.raced
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
+        kkt = theta_kkt(problem, best, asked, end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
         drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
@@ -285,11 +285,10 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
     near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
-    truth = TrueBandwidth(sampler, "polishing")
-    candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
+    candidates = sampler.bandwidths(np.unique([near, theta], axis=0), "polishing")
     best = min(candidates, key=lambda s: objective_of(problem, s))
     if theta_kkt(problem, best).stationarity > STATIONARY:
-        best = pieces_from(truth, best, LEVEL)
+        best = pieces_from(sampler, best, LEVEL)
     return sampler, best
 
 

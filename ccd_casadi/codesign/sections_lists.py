@@ -22,7 +22,7 @@ from ccd_casadi.codesign.outer_problem import (
     unmet_constraint,
 )
 from ccd_casadi.codesign.outer_sections import SectionsOuter
-from ccd_casadi.codesign.theta_direct import FAR, TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_direct import FAR, pieces_from
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.inner_problem.objective import objective_of
@@ -100,8 +100,8 @@ class ListedSections:
 
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by."""
-    truth = TrueBandwidth(sampler, "near by")
-    return _found(sampler.problem, pieces_from(truth, truth.at(theta), SETTLED, FAR))
+    best = sampler.bandwidths(theta, "near by")[0]
+    return _found(sampler.problem, pieces_from(sampler, best, SETTLED, FAR))
 
 
 def carried(
