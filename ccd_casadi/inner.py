@@ -41,6 +41,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     point = break_frequencies(options)
     answer = {MixedSensitivityProblem: mixed_answer, SectionsProblem: sections_answer}
     with Workers(options.workers) as workers:
+        if isinstance(problem.controller, SectionsProblem):
+            workers.begin(sections_answer.__module__)
         how = InnerOptions(options.seed, workers, _progress(options), point, options.begin_at)
         try:
             found = answer[type(problem.controller)](problem, theta, how)

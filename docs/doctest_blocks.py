@@ -1,4 +1,4 @@
-"""For mkdocstrings: examples with >>> in docstrings as code, not as quotations."""
+"""For mkdocstrings: examples with >>> in docstrings as code, and an entry for each parameter."""
 
 import re
 from typing import Any
@@ -7,6 +7,15 @@ import griffe
 
 EXAMPLE = re.compile(r"^>>> .*?(?=\n\s*\n|\Z)", re.DOTALL | re.MULTILINE)
 
+# `a, b : float` and its description: apart, each has its own default
+GROUP = re.compile(r"^(\w+(?:, \w+)+)( : [^\n]*)?\n((?:    [^\n]*\n?)+)", re.MULTILINE)
+
+
+def apart(found: re.Match[str]) -> str:
+    """The same for each name of a group."""
+    names, kind, words = found[1].split(", "), found[2] or "", found[3].rstrip()
+    return "".join(f"{name}{kind}\n{words}\n" for name in names)
+
 
 class DoctestBlocks(griffe.Extension):
     """Fences the examples of every docstring that is drawn."""
@@ -14,5 +23,6 @@ class DoctestBlocks(griffe.Extension):
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:
             obj.docstring.value = EXAMPLE.sub(
-                lambda found: f"```pycon\n{found[0].rstrip()}\n```", obj.docstring.value
+                lambda found: f"```pycon\n{found[0].rstrip()}\n```",
+                GROUP.sub(apart, obj.docstring.value),
             )

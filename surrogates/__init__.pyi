@@ -5,19 +5,15 @@ from surrogates.covariance import Kernel as Kernel
 from surrogates.estimator import SurrogateRegressor as SurrogateRegressor
 from surrogates.extrapolation import Extrapolation as Extrapolation
 from surrogates.extrapolation import extrapolation as extrapolation
-from surrogates.fitting import Kind as Kind
 from surrogates.fitting import fit as fit
 from surrogates.fitting import fit_outputs as fit_outputs
 from surrogates.gaussian_process import GaussianProcess as GaussianProcess
 from surrogates.gaussian_process import condition as condition
 from surrogates.gaussian_process import loo_errors as loo_errors
 from surrogates.interface import Errors as Errors
-from surrogates.interface import Surrogate as Surrogate
 from surrogates.interface import SurrogateFitError as SurrogateFitError
-from surrogates.polynomial import Polynomial as Polynomial
-from surrogates.polynomial import fit_polynomial as fit_polynomial
+from surrogates.interface import errors as errors
 from surrogates.quality import Quality as Quality
-from surrogates.quality import Roughness as Roughness
 from surrogates.quality import quality_of as quality_of
 from surrogates.samples import Samples as Samples
 from surrogates.samples import checked as checked
@@ -30,4 +26,3 @@ from surrogates.sampling_plan import sobol as sobol
 from surrogates.serialise import SurrogateFileError as SurrogateFileError
 from surrogates.serialise import load as load
 from surrogates.serialise import save as save
-from surrogates.validation import errors as errors

@@ -6,7 +6,6 @@ samples and 8 inputs, mean with gradient: 0.07 ms so, 0.25 ms unrolled in SX (an
 """
 
 from collections.abc import Sequence
-from functools import singledispatch
 from math import factorial
 
 import casadi as ca
@@ -15,8 +14,6 @@ from scipy.linalg import solve_triangular
 
 from surrogates.covariance import ROOT5, Kernel
 from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
-from surrogates.interface import Array, Surrogate
-from surrogates.polynomial import Polynomial
 
 # Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
 # polynomial of degree 9, whose remainder (√5 r)^10 · 10⁻⁵ is below 1e-20 there.
@@ -26,19 +23,32 @@ UNDER_ROOT = 1e-30
 
 
 def to_casadi(
-    surrogate: Surrogate | Sequence[Surrogate], name: str = "surrogate", std: bool = True
+    surrogate: GaussianProcess | Sequence[GaussianProcess],
+    name: str = "surrogate",
+    std: bool = True,
 ) -> ca.Function:
-    """Return the CasADi function x (d) -> mean (k), or -> (mean, std) with `std`.
+    """The CasADi function x (d) -> mean (k), or -> (mean, std) with `std`; equal to `predict`.
 
-    k is the number of surrogates given (1 for a single one), which must share their
-    inputs; x is in input units. Agrees with `predict` to rounding, and value,
-    gradient and Hessian are finite and exact everywhere, at the samples too. The
-    deviation costs O(n²) a look against O(n) for the mean: leave it out of an
-    optimisation that does not use it.
+    Value, gradient and Hessian are exact and finite everywhere, at the samples too.
 
-    Raises:
-        ValueError: no surrogates, or surrogates of different numbers of inputs.
-        TypeError: no expression is registered for the kind of surrogate.
+    Parameters
+    ----------
+    surrogate : GaussianProcess or sequence
+        One, or k of the same inputs.
+    name : str
+        Of the function.
+    std : bool
+        Whether to return deviations: O(n²) an evaluation, where the mean takes O(n).
+
+    Returns
+    -------
+    casadi.Function
+        In input and output units.
+
+    Raises
+    ------
+    ValueError
+        No surrogates, or surrogates of different numbers of inputs.
     """
     members = list(surrogate) if isinstance(surrogate, Sequence) else [surrogate]
     inputs = {member.lower.size for member in members}
@@ -50,21 +60,12 @@ def to_casadi(
     return ca.Function(name, [x], outputs, ["x"], ["mean", "std"][: len(outputs)])
 
 
-@singledispatch
-def expression(surrogate: Surrogate, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
-    """Return (mean,) or, with `std`, (mean, std) of a surrogate at the symbol x (d).
-
-    Register an implementation for every new kind of surrogate.
-    """
-    raise TypeError(f"no CasADi expression is known for {type(surrogate).__name__}")
-
-
-@expression.register
-def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
+def expression(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
+    """Return (mean,) or, with `std`, (mean, std) of a process at the symbol x (d)."""
     p = process.hyperparameters
     lengths = p.length_scales
     n, d = process.X.shape
-    unit = in_unit_box(process, x)
+    unit = (x - ca.DM(process.lower)) / ca.DM(process.upper - process.lower)
     # Columns are samples: CasADi stores by column, and this repeats x contiguously.
     z = ca.repmat(unit / lengths, 1, n) - ca.DM((process.X / lengths).T)
     s = ca.sum1(z * z).T
@@ -88,29 +89,6 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     variance = p.signal_variance - ca.sumsqr(ca.mtimes(ca.DM(half), k))
     floor = VARIANCE_FLOOR * p.signal_variance
     return mean, process.band * process.output_scale * ca.sqrt(ca.fmax(variance, floor))
-
-
-@expression.register
-def _(polynomial: Polynomial, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
-    phi = legendre_products(polynomial.exponents, 2.0 * in_unit_box(polynomial, x) - 1.0)
-    value = ca.dot(ca.DM(polynomial.coefficients), phi)
-    if not std:
-        return (value,)
-    leverage = ca.sumsqr(ca.mtimes(ca.DM(polynomial.root), phi))
-    return value, ca.sqrt(polynomial.residual_variance * (1.0 + leverage))
-
-
-def in_unit_box(surrogate: Surrogate, x: ca.MX) -> ca.MX:
-    """x̂ = (x - lower) / (upper - lower)."""
-    return (x - ca.DM(surrogate.lower)) / ca.DM(surrogate.upper - surrogate.lower)
-
-
-def legendre_products(exponents: Array, v: ca.MX) -> ca.MX:
-    """Π_j P_{e_ij}(v_j) as (m, 1) for exponents (m, d) and v (d): `polynomial.products`."""
-    powers = [ca.MX.ones(v.shape[0]), v]
-    for k in range(1, int(exponents.max(initial=1))):
-        powers.append(((2 * k + 1) * v * powers[k] - k * powers[k - 1]) / (k + 1))
-    return products_of(exponents, powers)
 
 
 def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:
@@ -156,24 +134,3 @@ def matern_series(terms: int) -> list[float]:
     differentiable.
     """
     return [(-ROOT5) ** m * ((m - 1) * (m - 3)) / (3.0 * factorial(m)) for m in range(terms)]
-
-
-def products_of(exponents: Array, powers: list[ca.MX]) -> ca.MX:
-    """Π_j powers_{e_ij}(j) as (m, 1), powers_k (d, 1): one gather to each factor.
-
-    A term of total degree p has at most p factors that are not 1, so that p gathers
-    make all terms at once; unrolled, 500 terms of 20 inputs would be 10⁴ nodes.
-    """
-    e = exponents.astype(int)
-    d = e.shape[1]
-    degree = int(e.sum(axis=1).max())
-    stack = ca.vertcat(*powers)
-    result = ca.MX.ones(len(e))
-    table = np.zeros((len(e), max(degree, 1)), dtype=int)  # entry 0 of the stack is 1
-    for i, row in enumerate(e):
-        factors = [power * d + j for j, power in enumerate(row) if power]
-        table[i, : len(factors)] = factors
-    for column in table.T:
-        if column.any():
-            result = result * stack[column.tolist()]
-    return result

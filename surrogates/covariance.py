@@ -26,16 +26,6 @@ class Kernel(StrEnum):
     RBF = "rbf"
 
 
-class Rough(StrEnum):
-    """Families too rough for surrogates, which samples are compared with; of values alone."""
-
-    MATERN12 = "matern12"
-    MATERN32 = "matern32"
-
-
-Family = Kernel | Rough
-
-
 @dataclass(frozen=True)
 class Hyperparameters:
     """What the likelihood determines, in the scaled units of the unit box.
@@ -51,22 +41,13 @@ class Hyperparameters:
     gradient_noise_variance: float = 0.0
 
 
-def radial(kernel: Family, s: Array, order: int) -> list[Array]:
+def radial(kernel: Kernel, s: Array, order: int) -> list[Array]:
     """Return [φ, φ', ..., φ^(order)](s), order <= 3, for squared distances s >= 0.
 
     Matérn 5/2: φ = (1 + √5 r + 5/3 r²) e^(-√5 r); RBF: φ = e^(-s/2). The third
     derivative of the Matérn kernel grows as 1/r; it only ever appears times terms
-    of order r⁴ and is returned as 0 at r = 0, the limit of those products. Of the rough ones
-    order <= 1; Matérn 1/2, φ = e^-r, has no slope at 0, where only s φ' counts.
+    of order r⁴ and is returned as 0 at r = 0, the limit of those products.
     """
-    if kernel is Rough.MATERN12:
-        r = np.sqrt(s)
-        e = np.exp(-r)
-        return [e, -0.5 * np.divide(e, r, out=np.zeros_like(r), where=r > 0.0)][: order + 1]
-    if kernel is Rough.MATERN32:
-        r = np.sqrt(3.0 * s)
-        e = np.exp(-r)
-        return [(1.0 + r) * e, -1.5 * e][: order + 1]
     if kernel is Kernel.RBF:
         e = np.exp(-0.5 * s)
         return [e, -0.5 * e, 0.25 * e, -0.125 * e][: order + 1]
@@ -93,7 +74,7 @@ def separations(A: Array, B: Array, length_scales: Array) -> Array:
 
 
 def covariance(
-    kernel: Family,
+    kernel: Kernel,
     A: Array,
     B: Array,
     length_scales: Array,
@@ -136,7 +117,7 @@ def blocks(
 
 
 def observed_covariance(
-    kernel: Family,
+    kernel: Kernel,
     X: Array,
     parameters: Hyperparameters,
     gradients: bool,

@@ -8,12 +8,12 @@ from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from surrogates.covariance import Kernel
-from surrogates.fitting import Kind, fit
+from surrogates.fitting import fit
 from surrogates.interface import Array
 
 
 class SurrogateRegressor(RegressorMixin, BaseEstimator):
-    """`fit` and `predict` of any kind of surrogate, thinly: everything is that of `surrogates.fit`.
+    """`fit` and `predict` of a surrogate, thinly: everything is that of `surrogates.fit`.
 
     X (n, d) and y (n,) in their own units; the box is the range of X. `noise` None estimates it,
     0 interpolates. After `fit`, `surrogate_` is the surrogate itself, ready for `to_casadi`.
@@ -27,21 +27,19 @@ class SurrogateRegressor(RegressorMixin, BaseEstimator):
 
     def __init__(
         self,
-        kind: Kind | str = "gaussian_process",
         *,
         kernel: Kernel | str = "matern52",
         noise: float | None = None,
         starts: int = 5,
         seed: int = 0,
     ) -> None:
-        self.kind = kind
         self.kernel = kernel
         self.noise = noise
         self.starts = starts
         self.seed = seed
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Fit to samples. Raises ValueError where this kind cannot take them, and says why."""
+        """Fit to samples. Raises ValueError where no process can take them, and says why."""
         data: tuple[Array, Array] = validate_data(
             self, X, y, y_numeric=True, ensure_min_samples=2, dtype=np.float64
         )

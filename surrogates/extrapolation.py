@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from surrogates.interface import Array, Surrogate, points_in
+from surrogates.gaussian_process import GaussianProcess
+from surrogates.interface import Array
 
 # Samples nearest to the point that enter the hull: those beyond seldom change it.
 NEAREST = 500
@@ -38,7 +39,7 @@ class Extrapolation:
         return bool(self.reasons)
 
 
-def extrapolation(surrogate: Surrogate, X: ArrayLike, x: ArrayLike) -> Extrapolation:
+def extrapolation(surrogate: GaussianProcess, X: ArrayLike, x: ArrayLike) -> Extrapolation:
     """Compare a point x (d,) with the samples X (n, d) a surrogate was fitted to.
 
     Flagged are points outside the box, further outside the convex hull of the samples
@@ -52,8 +53,7 @@ def extrapolation(surrogate: Surrogate, X: ArrayLike, x: ArrayLike) -> Extrapola
     from scipy.spatial import cKDTree
 
     low, span = surrogate.lower, surrogate.upper - surrogate.lower
-    samples = (points_in(surrogate, X) - low) / span
-    point = ((points_in(surrogate, x) - low) / span)[0]
+    samples, point = surrogate.in_unit_box(X), surrogate.in_unit_box(x)[0]
     near = cKDTree(samples).query(samples, k=2)[0][:, 1]  # to the nearest other sample
     spacing = float(np.median(near))
     distances = np.linalg.norm(samples - point, axis=1)

@@ -1,91 +1,68 @@
-"""One way to fit every surrogate of the package."""
+"""Surrogates of one output, or of several, from samples."""
 
 from collections.abc import Sequence
-from enum import StrEnum
-from typing import Literal, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from surrogates.covariance import Kernel
 from surrogates.gaussian_process import GaussianProcess
-from surrogates.interface import Surrogate, SurrogateFitError
+from surrogates.interface import SurrogateFitError
 from surrogates.maximum_likelihood import fit_process
-from surrogates.polynomial import Polynomial, fit_polynomial
 from surrogates.samples import checked
 
 Noise = ArrayLike | None
-E = TypeVar("E", bound=StrEnum)
 
 
-class Kind(StrEnum):
-    """The kinds of surrogate."""
-
-    GAUSSIAN_PROCESS = "gaussian_process"
-    POLYNOMIAL = "polynomial"
-
-
-@overload
 def fit(
     X: ArrayLike,
     Y: ArrayLike,
     dY: ArrayLike | None = None,
     *,
-    kind: Literal["gaussian_process", Kind.GAUSSIAN_PROCESS] = ...,
-    lower: ArrayLike | None = ...,
-    upper: ArrayLike | None = ...,
-    kernel: Kernel | str = ...,
-    noise: Noise = ...,
-    seed: int = ...,
-    starts: int = ...,
-) -> GaussianProcess: ...
-@overload
-def fit(
-    X: ArrayLike,
-    Y: ArrayLike,
-    dY: ArrayLike | None = None,
-    *,
-    kind: Kind | str,
-    lower: ArrayLike | None = ...,
-    upper: ArrayLike | None = ...,
-    noise: Noise = ...,
-) -> Surrogate: ...
-def fit(
-    X: ArrayLike,
-    Y: ArrayLike,
-    dY: ArrayLike | None = None,
-    *,
-    kind: Kind | str = Kind.GAUSSIAN_PROCESS,
     lower: ArrayLike | None = None,
     upper: ArrayLike | None = None,
     kernel: Kernel | str = Kernel.MATERN52,
     noise: Noise = None,
     seed: int = 0,
     starts: int = 5,
-) -> GaussianProcess | Polynomial:
-    """Fit a surrogate to samples of one output, with gradients if there are any.
+) -> GaussianProcess:
+    """Fit a process to samples of one output, with gradients if there are any.
 
-    X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X, which processes
-    and polynomials take. `lower`, `upper` (d,) scale the inputs; left out, they are the
-    range of X. `kernel`, `seed` and `starts` are those of the processes.
+    Parameters
+    ----------
+    X, Y : array (n, d), array (n,)
+        Places and values of the samples, in input and output units.
+    dY : array (n, d), optional
+        Gradients ∂Y/∂X.
+    lower, upper : array (d,), optional
+        Box that scales the inputs; left out, the range of X.
+    kernel : Kernel or str
+        Covariance.
+    noise : float or array (n,), optional
+        Standard deviation of Y, in output units; 0 interpolates, None estimates it.
+    seed, starts : int
+        Of the search for hyperparameters.
 
-    `noise` is the standard deviation of Y in output units, one for all or one to each
-    sample (n,); 0 interpolates, None estimates it where the kind can.
+    Returns
+    -------
+    GaussianProcess
+        The surrogate, with its leave-one-out errors.
 
-    Raises:
-        SurrogateFitError: wrong shapes, values that are not finite, negative noise,
-            an unknown kind, or samples that this kind cannot take; the sentence says
-            what to do.
+    Raises
+    ------
+    SurrogateFitError
+        Wrong shapes, values that are not finite, negative noise, or an unknown kernel; the sentence
+        says what to do.
     """
     samples = checked(X, Y, lower, upper, dY, noise)
     if starts < 1:
         raise SurrogateFitError("there must be a start")
-    match _named(Kind, kind, "kind"):
-        case Kind.GAUSSIAN_PROCESS:
-            family = _named(Kernel, kernel, "kernel")
-            return fit_process(samples, family, seed, starts)
-        case Kind.POLYNOMIAL:
-            return fit_polynomial(samples)
+    try:
+        family = Kernel(kernel)
+    except ValueError:
+        known = ", ".join(Kernel)
+        raise SurrogateFitError(f"unknown kernel {kernel!r}; it is one of: {known}") from None
+    return fit_process(samples, family, seed, starts)
 
 
 def fit_outputs(
@@ -129,12 +106,3 @@ def fit_outputs(
         )
         for i in range(k)
     )
-
-
-def _named(family: type[E], name: E | str, what: str) -> E:
-    """Return the member of a family of names, or raise SurrogateFitError with the names."""
-    try:
-        return family(name)
-    except ValueError:
-        known = ", ".join(member.value for member in family)
-        raise SurrogateFitError(f"unknown {what} {name!r}; it is one of: {known}") from None

@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
 from surrogates.covariance import Hyperparameters, Kernel, covariance
-from surrogates.interface import Array, Errors, box, freeze, points_in
+from surrogates.interface import Array, Errors, box, errors, freeze
 from surrogates.likelihood import factorise, symmetric_inverse
 from surrogates.samples import Samples, checked
-from surrogates.validation import errors
 
 # Rounding leaves the predictive variance at noise-free samples anywhere within a
 # few eps of zero, of either sign; below this share of σ² it is taken as the floor.
@@ -93,6 +92,17 @@ class GaussianProcess:
             self.sample_noise,
         )[0]
 
+    def in_unit_box(self, X: ArrayLike) -> Array:
+        """x̂ = (x - lower) / (upper - lower) of points (m, d); a single point (d,) is one row.
+
+        Raises:
+            ValueError: X does not have the inputs of the box.
+        """
+        points = np.atleast_2d(np.asarray(X, dtype=float))
+        if points.ndim != 2 or points.shape[1] != self.lower.size:
+            raise ValueError(f"expected points (m, {self.lower.size}), got {points.shape}")
+        return np.asarray((points - self.lower) / (self.upper - self.lower))
+
     @overload
     def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Array: ...
     @overload
@@ -106,7 +116,7 @@ class GaussianProcess:
         Raises:
             ValueError: X does not have the inputs of the box.
         """
-        unit = (points_in(self, X) - self.lower) / (self.upper - self.lower)
+        unit = self.in_unit_box(X)
         p = self.hyperparameters
         k = p.signal_variance * covariance(
             self.kernel, unit, self.X, p.length_scales, gradients_of_b=self.has_gradients

@@ -1,12 +1,6 @@
-"""What every surrogate of this package offers, and nothing more.
-
-A new kind is a frozen dataclass with the attributes below, one
-`casadi_export.expression` registration, one entry in `serialise.KINDS` and one in
-`fitting`; no other module has to know about it.
-"""
+"""What every module of this package shares: arrays, boxes, errors of prediction."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,29 +25,18 @@ class Errors:
     q2: float
 
 
-class Surrogate(Protocol):
-    """A smooth scalar function of d inputs that stands in for an expensive one."""
+def errors(residuals: ArrayLike, Y: ArrayLike) -> Errors:
+    """Summarise residuals y - ŷ (n,) at samples Y (n,).
 
-    @property
-    def lower(self) -> Array:
-        """Lower bounds (d,) of the sampled box, in input units."""
-
-    @property
-    def upper(self) -> Array:
-        """Upper bounds (d,) of the sampled box, in input units."""
-
-    @property
-    def left_out(self) -> Array:
-        """Residuals (n,) of the samples, each predicted without it, in output units."""
-
-    @property
-    def loo(self) -> Errors:
-        """The errors that `left_out` amounts to."""
-
-    @overload
-    def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Array: ...
-    @overload
-    def predict(self, X: ArrayLike, return_std: Literal[True]) -> tuple[Array, Array]: ...
+    >>> errors([0.0, 3.0, 4.0], [0.0, 5.0, 10.0])
+    Errors(rms=2.886751345948129, max=4.0, q2=0.5)
+    """
+    e = np.asarray(residuals, dtype=float)
+    y = np.asarray(Y, dtype=float)
+    wrong = float(e @ e)
+    spread = float(np.sum((y - y.mean()) ** 2))
+    q2 = 1.0 - wrong / spread if spread > 0.0 else float(wrong == 0.0)
+    return Errors(float(np.sqrt(wrong / e.size)), float(np.abs(e).max()), q2)
 
 
 def box(lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
@@ -69,18 +52,6 @@ def box(lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise ValueError("bounds must be finite with lower < upper in every input")
     return low, high
-
-
-def points_in(surrogate: Surrogate, X: ArrayLike) -> Array:
-    """Return X as points (m, d) of the surrogate's inputs; a single point (d,) is one row.
-
-    Raises:
-        ValueError: X does not have the inputs of the box.
-    """
-    points = np.atleast_2d(np.asarray(X, dtype=float))
-    if points.ndim != 2 or points.shape[1] != surrogate.lower.size:
-        raise ValueError(f"expected points (m, {surrogate.lower.size}), got {points.shape}")
-    return points
 
 
 def freeze(*arrays: Array) -> None:

@@ -12,8 +12,8 @@ from scipy.linalg.lapack import dpotri
 
 from surrogates.covariance import (
     NO_NOISE,
-    Family,
     Hyperparameters,
+    Kernel,
     blocks,
     observed_covariance,
     radial,
@@ -34,7 +34,7 @@ JITTERS = (0.0, *(10.0**k for k in range(-15, -5)))
 
 
 def factorise(
-    kernel: Family,
+    kernel: Kernel,
     X: Array,
     parameters: Hyperparameters,
     gradients: bool,
@@ -57,7 +57,7 @@ def factorise(
 
 
 def log_likelihood(
-    kernel: Family,
+    kernel: Kernel,
     X: Array,
     targets: Array,
     parameters: Hyperparameters,

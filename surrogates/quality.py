@@ -1,34 +1,22 @@
 """How far a Gaussian process can be trusted, judged by its own samples.
 
-Left out one by one and fold by fold, with the hyperparameters kept (estimated anew they would
-cost more than a whole solve, and differ by little); bands against residuals; kinks and jumps;
-and whether a point of interest lies where the samples are.
+Left out one by one, with the hyperparameters kept (estimated anew they would cost more than a whole
+solve, and differ by little); bands against residuals; and whether a point of interest lies where
+the samples are.
 """
 
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import lru_cache
 
 import numpy as np
 
-from surrogates.covariance import Family, Hyperparameters, Kernel, Rough
 from surrogates.extrapolation import extrapolation
-from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
-from surrogates.interface import Array, Errors
-from surrogates.likelihood import LENGTH_BOUNDS, SIGNAL_BOUNDS, log_likelihood, maximised
+from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, loo_errors
+from surrogates.interface import Array, Errors, errors
 from surrogates.samples import Samples
-from surrogates.validation import errors, held_out
 
-FOLDS = 10
-# Samples without which likelihoods of roughness say nothing, and those that enter the four
-# likelihood fits; they cost O(n³) each.
-LEAST_FOR_ROUGHNESS = 20
-ROUGHNESS_ORDER = 200
-NUGGET = 1e-9
-# Q² above which the samples are followed whatever their roughness; above which a kink is a slight
-# one; and below which the surrogate follows them poorly, smooth or not.
-EXCELLENT = 1.0 - 1e-6
-GOOD = 0.995
+# Q² of left-out samples above which the surrogate follows them, and below which it does poorly.
+FOLLOWED = 0.995
 POOR = 0.9
 # A sample this close to the point of interest (share of the box) is that point. Left out, it may be
 # off by so many of its deviations, or by so much of the samples' range, before the others miss it.
@@ -36,22 +24,6 @@ SAME = 1e-6
 SIGMAS = 3.0
 SHARE = 1e-3
 NEAR = 0.05  # share of the box: samples this close to the point of interest are around it
-
-
-MATERN: dict[str, Family] = {
-    "1/2": Rough.MATERN12,
-    "3/2": Rough.MATERN32,
-    "5/2": Kernel.MATERN52,
-    "inf": Kernel.RBF,
-}
-
-
-class Roughness(StrEnum):
-    """The kind of function the samples look like at their own resolution."""
-
-    SMOOTH = "smooth"
-    KINKED = "kinked"
-    JUMPS = "jumps"
 
 
 @dataclass(frozen=True)
@@ -74,22 +46,12 @@ class Quality:
 
     true, predicted (n,): each sample, and its prediction without it; standardised (n,): the
     difference over the deviation of the band; coverage: share inside nominal 95 % bands.
-    loo, kfold: errors left out one by one and in ten folds. extrapolates: what is amiss at the
-    point of interest, nothing where samples support it. at_point: where that point is itself a
-    sample, the error there without it in `unit` and in predicted deviations; None elsewhere.
-    around: the same of every sample around that point, itself included.
+    loo: errors left out one by one. extrapolates: what is amiss at the point of interest, nothing
+    where samples support it. at_point: where that point is itself a sample, the error there without
+    it in `unit` and in predicted deviations; None elsewhere. around: the same of every sample
+    around that point, itself included.
 
-    roughness: a kink across a surface has Sobolev regularity just below 3/2, a jump just below
-    1/2, and sample paths of a Matérn process regularity ν. Each ν is fitted by maximum
-    likelihood (at most 200 of the samples, values only) and the verdict is 'smooth' if ν = 5/2
-    or ∞ explains the values best; else 'jumps' if ν = 1/2 explains them better than 5/2, and
-    'kinked' if not. The measure sees what the samples resolve and no more: kinks and jumps that
-    are small beside the smooth variation read one class too smooth, the more so the fewer
-    samples and the more inputs; a steep smooth step reads as rough. So 'jumps' and 'kinked' are
-    grounds to act, 'smooth' is no proof.
-
-    Source: Stein, Interpolation of Spatial Data (1999), section 6.7, on estimating
-    ν by likelihood; Rasmussen & Williams (2006), section 5.4.2 on leave-one-out.
+    Source: Rasmussen & Williams (2006), section 5.4.2 on leave-one-out.
     """
 
     name: str
@@ -98,9 +60,7 @@ class Quality:
     predicted: Array
     standardised: Array
     loo: Errors
-    kfold: Errors
     coverage: float
-    roughness: Roughness
     extrapolates: tuple[str, ...]
     at_point: tuple[float, float] | None = None
     around: tuple[Missed, ...] = ()
@@ -128,16 +88,17 @@ class Quality:
     @property
     def poor(self) -> bool:
         """Whether left-out samples are predicted too badly to speak of support."""
-        return not self.kfold.q2 >= POOR
+        return not self.loo.q2 >= POOR
 
     @property
-    def samples_look(self) -> str:
-        """Smooth, kinked or torn, as far as the surrogate follows the samples at all."""
-        if self.poor:
-            return "poorly followed"
-        if self.roughness is Roughness.KINKED and self.kfold.q2 >= GOOD:
-            return "nearly smooth"
-        return self.roughness.value
+    def followed(self) -> bool:
+        """Whether one smooth surrogate suits the samples."""
+        return self.loo.q2 >= FOLLOWED
+
+    @property
+    def samples_are(self) -> str:
+        """How well the surrogate follows them; kinks and jumps are followed roughly at best."""
+        return "followed" if self.followed else f"{'poorly' if self.poor else 'roughly'} followed"
 
     @property
     def unsupported(self) -> str:
@@ -145,7 +106,7 @@ class Quality:
         if self.extrapolates:
             return "; ".join(self.extrapolates)
         if self.poor:
-            return f"followed to Q² {self.kfold.q2:.3g} only"
+            return f"followed to Q² {self.loo.q2:.3g} only"
         missed = self.missed
         if missed is None:
             return ""
@@ -154,12 +115,6 @@ class Quality:
             f"{missed.where} is {what} that the others miss by {abs(missed.error):.3g} "
             f"{self.unit}, {missed.sigmas:.1f} deviations"
         )
-
-    @property
-    def smooth_enough(self) -> bool:
-        """Whether one smooth surrogate suits the samples."""
-        smooth = self.roughness is Roughness.SMOOTH and not self.poor
-        return smooth or self.kfold.q2 >= EXCELLENT
 
 
 def quality_of(
@@ -170,7 +125,6 @@ def quality_of(
     unit: str = "",
     factor: float = 1.0,
     logarithm: bool = False,
-    seed: int = 0,
 ) -> Quality:
     """Judge a process by the samples it holds, and at a point of interest x (d,).
 
@@ -180,7 +134,7 @@ def quality_of(
     Raises:
         ValueError: the point does not have the process's inputs.
     """
-    samples, residuals, deviations, folded = _left_out(process, seed)
+    samples, residuals, deviations = _left_out(process)
     standardised = residuals / (process.band * deviations)
     predicted = samples.Y - residuals
     unit_x = (np.asarray(x, float) - process.lower) / (process.upper - process.lower)
@@ -197,9 +151,7 @@ def quality_of(
         predicted=np.exp(predicted) if logarithm else factor * predicted,
         standardised=standardised,
         loo=errors(factor * residuals, factor * samples.Y),
-        kfold=errors(factor * folded, factor * samples.Y),
         coverage=float(np.mean(np.abs(standardised) <= TWO_SIDED_95)),
-        roughness=_roughness_of(process, seed),
         extrapolates=extrapolation(process, samples.X, x).reasons,
         at_point=at_point,
         around=around,
@@ -207,57 +159,9 @@ def quality_of(
 
 
 @lru_cache(maxsize=8)  # a process is judged before it is relied on, and again in the report
-def _left_out(process: GaussianProcess, seed: int) -> tuple[Samples, Array, Array, Array]:
-    """The samples, residuals and deviations one by one, residuals fold by fold: nothing of x."""
-    samples = _samples(process)
-    folded = held_out(
-        lambda part: conditioned(process.hyperparameters, part, process.kernel, np.empty(0)),
-        samples,
-        min(FOLDS, len(process.X)),
-        seed,
-    )
-    return (samples, *loo_errors(process), folded)
-
-
-@lru_cache(maxsize=8)
-def _roughness_of(process: GaussianProcess, seed: int) -> Roughness:
-    n = len(process.X)
-    if n < LEAST_FOR_ROUGHNESS:
-        return Roughness.SMOOTH
-    return roughness(smoothness_likelihoods(process.X, process.targets[:n], seed))
-
-
-def roughness(likelihoods: dict[str, float]) -> Roughness:
-    """Return the verdict of the likelihoods of the four smoothnesses, as `Quality` says it.
-
-    >>> roughness({"1/2": -9.0, "3/2": 0.0, "5/2": -4.0, "inf": -20.0}).value
-    'kinked'
-    """
-    rough = max(likelihoods["1/2"], likelihoods["3/2"])
-    if max(likelihoods["5/2"], likelihoods["inf"]) >= rough:
-        return Roughness.SMOOTH
-    return Roughness.JUMPS if likelihoods["1/2"] > likelihoods["5/2"] else Roughness.KINKED
-
-
-def smoothness_likelihoods(X: Array, values: Array, seed: int) -> dict[str, float]:
-    """Return the log likelihoods of the values under Matérn kernels, keyed by ν; 0 is the best.
-
-    X (n, d) in the unit box; values (n,) in units of their own deviation.
-    """
-    n, d = X.shape
-    rows = np.random.default_rng(seed).permutation(n)[:ROUGHNESS_ORDER]
-    starts = [np.array([0.5] * d + [1.0]), np.array([5.0] * d + [100.0])]
-    found = {}
-    for name, family in MATERN.items():
-
-        def at(natural: Array, family: Family = family) -> tuple[float, Array]:
-            parameters = Hyperparameters(natural[:d], float(natural[d]), NUGGET)
-            value, slope = log_likelihood(family, X[rows], values[rows], parameters)
-            return value, slope[: d + 1]
-
-        found[name] = maximised(at, starts, [LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS])[0]
-    best = max(found.values())
-    return {name: value - best for name, value in found.items()}
+def _left_out(process: GaussianProcess) -> tuple[Samples, Array, Array]:
+    """The samples, residuals and deviations one by one: nothing of x."""
+    return (_samples(process), *loo_errors(process))
 
 
 def _samples(process: GaussianProcess) -> Samples:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from surrogates.interface import Array, SurrogateFitError, box
 
@@ -54,26 +54,6 @@ class Samples:
         if self.noise is None:
             return np.zeros(self.Y.size)
         return (self.noise / self.scaling[1]) ** 2
-
-    @property
-    def least_squares_weights(self) -> Array:
-        """Weights (n,) ~ 1 / noise, largest 1, for fits that weigh residuals."""
-        if self.noise is None or self.noise.max() == 0.0:
-            return np.ones(self.Y.size)
-        # A sample without noise would weigh infinitely much beside one with it.
-        known = np.maximum(self.noise, 1e-3 * self.noise.max())
-        return known.min() / known
-
-    def rows(self, rows: NDArray[np.intp]) -> "Samples":
-        """Return the samples of these row numbers, in the same box."""
-        return Samples(
-            self.lower,
-            self.upper,
-            self.X[rows],
-            self.Y[rows],
-            None if self.dY is None else self.dY[rows],
-            None if self.noise is None else self.noise[rows],
-        )
 
 
 def checked(

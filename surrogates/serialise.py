@@ -20,12 +20,10 @@ import numpy as np
 
 from surrogates.files import write_whole
 from surrogates.gaussian_process import GaussianProcess
-from surrogates.interface import Surrogate
-from surrogates.polynomial import Polynomial
 
 SCHEMA = "surrogates/2"
 READABLE = (SCHEMA, "surrogates/1")
-KINDS: dict[str, type[Any]] = {"gaussian_process": GaussianProcess, "polynomial": Polynomial}
+KIND = "gaussian_process"
 
 
 class SurrogateFileError(ValueError):
@@ -33,7 +31,7 @@ class SurrogateFileError(ValueError):
 
 
 def save(
-    surrogates: Surrogate | Sequence[Surrogate],
+    surrogates: GaussianProcess | Sequence[GaussianProcess],
     path: str | os.PathLike[str],
     extra: dict[str, Any] | None = None,
 ) -> None:
@@ -50,7 +48,7 @@ def save(
     text = json.dumps(
         {
             "schema": SCHEMA,
-            "surrogates": [_record(member) for member in members],
+            "surrogates": [{"kind": KIND, **_fields(member)} for member in members],
             "extra": extra or {},
         },
         allow_nan=False,
@@ -58,7 +56,7 @@ def save(
     write_whole(Path(path), text)
 
 
-def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str, Any]]:
+def load(path: str | os.PathLike[str]) -> tuple[tuple[GaussianProcess, ...], dict[str, Any]]:
     """Return the surrogates of a file written by `save`, and its `extra`.
 
     Raises:
@@ -83,13 +81,6 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str,
     return tuple(members), extra
 
 
-def _record(surrogate: Surrogate) -> dict[str, Any]:
-    for name, cls in KINDS.items():
-        if type(surrogate) is cls:
-            return {"kind": name, **_fields(surrogate)}
-    raise TypeError(f"cannot save a {type(surrogate).__name__}; known kinds: {sorted(KINDS)}")
-
-
 def _fields(value: Any) -> dict[str, Any]:
     return {f.name: _encode(getattr(value, f.name)) for f in fields(value)}
 
@@ -105,9 +96,9 @@ def _encode(value: Any) -> Any:
 def _member(record: Any) -> Any:
     body = dict(record)
     kind = body.pop("kind")
-    if kind not in KINDS:
-        raise ValueError(f"kind {kind!r:.60} is none of {', '.join(KINDS)}; fit it again")
-    return _decode(KINDS[kind], body)
+    if kind != KIND:
+        raise ValueError(f"kind {kind!r:.60} is not {KIND}; fit it again")
+    return _decode(GaussianProcess, body)
 
 
 def _decode(cls: Any, value: Any) -> Any:

@@ -47,8 +47,25 @@ _PER_CHANNEL = (
 
 
 def load_case(path: str | Path) -> Case:
-    """Read and check a case file. Raises CaseError on the first mistake.
+    """Read and check a case file.
 
+    Parameters
+    ----------
+    path : path
+        The TOML file.
+
+    Returns
+    -------
+    Case
+        Its tables, checked.
+
+    Raises
+    ------
+    CaseError
+        On the first mistake, with its key and what is wrong.
+
+    Examples
+    --------
     >>> load_case(TWO_MASS).theta[0].table
     {'lower': 55.0, 'upper': 70.0, 'start': 67.56, 'unit': 'kg'}
     """
@@ -89,10 +106,27 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
-    """The tables of a case file, as TOML reads them, checked; files in them are relative to `path`.
+    """Check the tables of a case file, as TOML reads them.
 
-    Raises CaseError on the first mistake.
+    Parameters
+    ----------
+    data : mapping
+        The tables by name.
+    path : path
+        What files in them are relative to.
 
+    Returns
+    -------
+    Case
+        The tables, checked.
+
+    Raises
+    ------
+    CaseError
+        On the first mistake.
+
+    Examples
+    --------
     >>> parse_case({"plant": {"model": "two_mas"}, "theta": {}})
     Traceback (most recent call last):
     ccd_casadi.cases.case.CaseError: case: objective: is missing; add a table [objective]

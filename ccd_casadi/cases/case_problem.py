@@ -24,11 +24,25 @@ from ccd_casadi.support.units import HZ
 
 
 def problem_of(case: Case) -> CoDesignProblem:
-    """The case in SI, as the lower layers take it.
+    """The case in SI, with its plant, which is made once here.
 
-    The plant is made once here, and one of the user's own is looked at over its box. Raises
-    CaseError where it is none.
+    Parameters
+    ----------
+    case : Case
+        As `load_case` gives it.
 
+    Returns
+    -------
+    CoDesignProblem
+        What `solve`, `true_inner` and the like take.
+
+    Raises
+    ------
+    CaseError
+        The plant is none; the user's own is evaluated over its box.
+
+    Examples
+    --------
     >>> from ccd_casadi.cases.case import TWO_MASS, load_case
     >>> problem = problem_of(load_case(TWO_MASS))
     >>> problem.names, problem.w2, round(problem.inner.omega_low, 3)

@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
-from ccd_casadi.inner_problem.sections_search import with_range
+from ccd_casadi.inner_problem.sections_search import joined, with_range
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -147,7 +147,7 @@ def _read_sections(
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
-    problem = with_function(folder / "result.json", problem, result)
+    problem = joined(with_function(folder / "result.json", problem, result), kappa, ())
     plant, weights = scaled_plant(problem, theta), problem.weights
     figures = measure(
         plant, controller, weights, gamma=UNBOUNDED, omega_low=problem.inner.omega_low

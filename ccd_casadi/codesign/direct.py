@@ -25,13 +25,16 @@ LEVEL = 1e-8  # of the terms of J, which may cancel: what ω_b is good to
 
 @dataclass(frozen=True)
 class Direct:
-    """Options of the direct formulation: local solves on the truth go from so many `starts`.
+    """Options of the direct formulation: local solves on the truth.
 
-    They are the case's own and a Sobol set over the box. `tolerance` is of the inner problem;
-    `box_points` true inner problems over the box are looked at in the end (`box_look`).
-
-    >>> Direct(starts=2).starts
-    2
+    Parameters
+    ----------
+    starts : int
+        The case's own and a Sobol set over the box.
+    tolerance : float
+        Of the inner problem.
+    box_points : int
+        True inner problems over the box in the global check at the end.
     """
 
     starts: int = 4

@@ -13,7 +13,6 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from surrogates import GaussianProcess, Kernel, Quality, SurrogateFitError, condition, quality_of
-from surrogates.quality import Roughness
 
 TAKEN = 1e-6  # relative: an error at a sample that is rounding
 # Name, unit of its errors, the number that turns the surrogate's unit into it, whether what is
@@ -23,7 +22,6 @@ BOUNDED = (
     ("sensitivity_low", "%", 100.0, True),
     ("compliance", "%", 100.0, True),
 )
-ROUGH = (Roughness.KINKED, Roughness.JUMPS)  # as `Quality.samples_look` has it
 SAME = 1e-6  # of the box: samples that are closer are of one place
 
 
@@ -79,7 +77,7 @@ def with_sample(process: GaussianProcess, x: Array, value: float, slope: Array) 
 
 
 def surrogate_quality(
-    processes: Sequence[GaussianProcess], at: Verified, seed: int = 0, *, quiet: bool = True
+    processes: Sequence[GaussianProcess], at: Verified, *, quiet: bool = True
 ) -> tuple[Quality, ...]:
     """Judge the processes of what J counts, and of ln of each bounded figure, at a design."""
     figure = at.problem.figure
@@ -94,7 +92,6 @@ def surrogate_quality(
                 unit=unit,
                 factor=factor,
                 logarithm=logarithm,
-                seed=seed,
             )
             found.append(quality)
             bar.advance()
@@ -108,17 +105,17 @@ def recommendation(qualities: Sequence[Quality]) -> str:
     said = []
     poor = [q for q in qualities if q.poor]
     if poor:
-        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.kfold.q2:.2g})" for q in poor)
+        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.loo.q2:.2g})" for q in poor)
         said.append(
             f"Left-out samples of {which} are predicted poorly: more samples are needed before the "
             "surrogate says anything away from the design."
         )
-    looks = {q.name.replace("_", " "): q.samples_look for q in qualities}
-    rough = [f"{name} ({look})" for name, look in looks.items() if look in ROUGH]
+    rough = [q for q in qualities if not q.followed and not q.poor]
     if rough:
-        what = ", ".join(rough)
+        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.loo.q2:.3g})" for q in rough)
         said.append(
-            f"The samples of {what} are rough: one smooth surrogate follows them only near the "
+            f"Left-out samples of {which} are predicted roughly, as those of a function with kinks "
+            "or jumps are: one smooth surrogate follows them only near the "
             "design. "
             + (
                 "Solve with --formulation lifted, whose outputs are smooth where the best "
@@ -150,9 +147,8 @@ def quality_dict(qualities: Sequence[Quality]) -> dict[str, Any]:
                 "unit": q.unit,
                 "samples": len(q.true),
                 "leave_one_out": asdict(q.loo),
-                "k_fold": asdict(q.kfold),
                 "coverage_95": q.coverage,
-                "roughness": q.roughness.value,
+                "samples_are": q.samples_are,
                 "extrapolates": list(q.extrapolates),
                 "left_out_at_design": None
                 if q.at_point is None

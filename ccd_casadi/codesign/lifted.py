@@ -42,12 +42,14 @@ FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polis
 class Lifted:
     """Options of the lifted formulation; the defaults are those of a case file.
 
-    `points` designs of (θ, ω_S, ω_T) are sampled; 0 takes 6 (n_θ + 2). A quadratic in n variables
-    has (n + 1)(n + 2)/2 coefficients and a sample with gradients gives n + 1 numbers: 6 n samples
-    are twelve times what it needs at n = 4, six times at n = 8. The rest as for `Nested`.
-
-    >>> Lifted(points=24, tolerance=1e-4).starts
-    16
+    Parameters
+    ----------
+    points : int
+        Designs of (θ, ω_S, ω_T); 0: 6 (n_θ + 2). A quadratic in n variables has (n + 1)(n + 2)/2
+        coefficients, a sample with gradients n + 1 numbers: 6 n samples are twelve times what it
+        needs at n = 4, six times at n = 8.
+    starts, tolerance, max_refinements, kernel, box_points
+        As for `Nested`.
     """
 
     points: int = 0
@@ -59,17 +61,11 @@ class Lifted:
 
 
 def solve_lifted(
-    sampler: Sampler,
-    options: Lifted,
-    *,
-    seed: int,
-    given: Surrogates | None = None,
-    incumbent: QuantitySample | None = None,
+    sampler: Sampler, options: Lifted, *, seed: int, given: Surrogates | None = None
 ) -> FormulationResult:
     """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
 
-    With `given` surrogates the rounds start from those and what they were fitted to, with an
-    `incumbent` from that design.
+    With `given` surrogates the rounds start from those and what they were fitted to.
     """
     problem = sampler.problem
     lower, upper = lifted_bounds(problem)
@@ -83,6 +79,7 @@ def solve_lifted(
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)
     iterates: list[Iterate] = []
+    incumbent: QuantitySample | None = None
     processes: tuple[GaussianProcess, ...] = () if given is None else given.processes
     solution: OuterSolution | None = None
     agreed, fitted = False, len(samples) if processes else 0

@@ -33,13 +33,20 @@ STEP = 1e-3  # share of the box below which a step counts as small
 class Nested:
     """Options of the nested formulation; the defaults are those of a case file.
 
-    `plan`: "grid" (`points` an axis), "sobol" or "lhs" (`points` in all) over θ. `starts` of IPOPT
-    a round; prediction and truth agree within `tolerance` (relative) or after `max_refinements`
-    rounds at the latest. `kernel`: "matern52", "rbf", or "auto", which predicts left-out samples
-    best. `box_points` true inner problems over the box are looked at in the end (`box_look`).
-
-    >>> Nested(plan="sobol", points=24).starts
-    16
+    Parameters
+    ----------
+    plan : str
+        "grid", "sobol" or "lhs" over θ.
+    points : int
+        Along each axis of a grid, else in all.
+    starts : int
+        Of IPOPT in a round.
+    tolerance, max_refinements : float, int
+        Prediction and truth agree within it (relative), or after this many rounds at the latest.
+    kernel : str
+        "matern52", "rbf", or "auto", which predicts left-out samples best.
+    box_points : int
+        True inner problems over the box in the global check at the end.
     """
 
     plan: str = "grid"
@@ -94,6 +101,7 @@ def solve_nested(
     surrogate: GaussianProcess | None = None
     solution: OuterSolution | None = None
     for round_number in range(options.max_refinements + 1):
+        samples, raised = sampler.latest(samples), sampler.raised
         best = _best(problem, samples)
         low, high = _region(problem, best, radius)
         local = _local(samples, low, high, upper - lower)
@@ -123,6 +131,8 @@ def solve_nested(
         settled = abs(iterate.objective - value_of(best)) <= options.tolerance * abs(
             iterate.objective
         )
+        if sampler.raised > raised:
+            continue  # fitted to worse controllers than are known now
         if agreed and (iterate.step <= STEP or settled):
             break
         if not agreed:
@@ -132,7 +142,7 @@ def solve_nested(
             radius *= 0.5
         elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone
             radius = min(1.0, 2.0 * radius)
-    best = _best(problem, samples)
+    best = _best(problem, sampler.latest(samples))
     message = "" if agreed else "prediction and truth did not agree within the budget"
     surrogates = () if surrogate is None else (surrogate,)
     return FormulationResult(best.joint, tuple(iterates), surrogates, solution, agreed, message)

@@ -143,20 +143,6 @@ class Outer(ABC):
         """With what stood against an end, to be searched again; None where nothing did."""
         return None
 
-    @abstractmethod
-    def resumed(
-        self,
-        formulation: Formulation,
-        outcome: FormulationResult,
-        x: Array,
-        sampled: Sequence[tuple[float, ...]],
-        seed: int,
-    ) -> FormulationResult:
-        """Go on from a design that the surrogates did not foresee: they learn it.
-
-        `sampled`: θ that the formulation had solved.
-        """
-
     def learnt(self, outcome: FormulationResult, end: End) -> FormulationResult:
         """With surrogates that have an end among their samples, which they did not foresee."""
         values, slopes = self.samples_of(end, outcome.surrogates[0].lower.size)

@@ -13,9 +13,8 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
-from ccd_casadi.codesign.direct import Direct, acceptable, polish, true_objective
+from ccd_casadi.codesign.direct import acceptable, polish, true_objective
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.kinked import SETTLED, descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -25,7 +24,7 @@ from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
-from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
+from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -46,7 +45,8 @@ from surrogates import GaussianProcess, design, quality_of
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
 BASIN = 1e-4  # residual of an end whose basin is not searched again
-COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
+# Of left-out samples, for surrogates to rule anything out: Q², and within their 95 % bands.
+EXPLAINED, COVERAGE = 0.99, 0.8
 NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
 
 
@@ -119,32 +119,6 @@ class MixedOuter(Outer):
         kkt = kkt_certificate(problem, x, made)
         return MixedEnd(x, made.figures.bandwidth, J, kkt, float(gap), made)
 
-    def resumed(
-        self,
-        formulation: Formulation,
-        outcome: FormulationResult,
-        x: Array,
-        sampled: Sequence[tuple[float, ...]],
-        seed: int,
-    ) -> FormulationResult:
-        sampler = self.sampler
-        if isinstance(formulation, Direct):
-            return replace(outcome, x=x, agreed=True)
-        if isinstance(formulation, Nested):
-            thetas = np.unique(np.array([*sampler.solved, tuple(self.theta_of(x))]), axis=0)
-            found = solve_nested(sampler, formulation, seed=seed, given=Surrogates((), thetas, ()))
-        else:
-            old = fitted_quantities(outcome.surrogates)
-            new = [sample for sample in sampler.quantities(x) if sample.certified]
-            samples = tuple({sample.x: sample for sample in (*old, *new)}.values())
-            thetas = np.array([sample.x[:-2] for sample in samples])
-            given = Surrogates(outcome.surrogates if old else (), thetas, samples)
-            first = new[0] if new else None
-            found = solve_lifted(sampler, formulation, seed=seed, given=given, incumbent=first)
-        if found.x is None:
-            return replace(outcome, x=x, surrogates=found.surrogates or outcome.surrogates)
-        return replace(found, iterates=(*outcome.iterates, *found.iterates))
-
     def samples_of(self, end: End, inputs: int) -> tuple[Array, Array]:
         if inputs < end.x.size:
             return super().samples_of(end, inputs)
@@ -175,8 +149,8 @@ class MixedOuter(Outer):
         if len(processes) < 2 or self._may_jump(x):
             return ()
         middle = 0.5 * (processes[0].lower + processes[0].upper)
-        found = [quality_of(process, middle, seed=seed) for process in processes]
-        sound = all(q.smooth_enough and q.coverage >= COVERAGE for q in found)
+        found = [quality_of(process, middle) for process in processes]
+        sound = all(q.loo.q2 >= EXPLAINED and q.coverage >= COVERAGE for q in found)
         return processes if sound else ()
 
     def _may_jump(self, x: Array) -> bool:

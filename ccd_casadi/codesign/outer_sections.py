@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,14 +18,14 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.cases.run_folder import read_json, with_function
+from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
-from ccd_casadi.codesign.theta_joint import together
+from ccd_casadi.codesign.theta_direct import pieces_from
+from ccd_casadi.codesign.theta_joint import together, with_members
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
@@ -38,6 +38,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_
 from ccd_casadi.inner_problem.sections_plant_set import (
     plants_of,
     sections_of_problem,
+    structure_of,
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
@@ -50,8 +51,8 @@ from ccd_casadi.inner_problem.sections_robustness import (
 )
 from ccd_casadi.inner_problem.sections_search import joined, least_from, prepared, race, with_range
 from ccd_casadi.limitations.of_problem import known_gap
-from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.neighbours import WORTH, alone
 from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -109,9 +110,10 @@ def seeded_and_prepared(
     return replace(problem, controller=sections), seeds.words
 
 
-def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
-    """A multi-start search at θ with all its optima, counted; from the store if it is there."""
-    problem = sampler.problem
+def raced_at(sampler: Sampler, best: BandwidthSample) -> SectionsValue:
+    """A multi-start search at the θ of a sample, from its controller too, with all its optima,
+    counted; from the store if it is there."""
+    problem, theta = joined(sampler.problem, np.array(best.kappa), ()), best.theta
 
     def raced() -> SectionsValue:
         made = race(problem, theta, teller("search at the end", sampler.quiet), sampler.workers)
@@ -122,10 +124,11 @@ def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
     return sampler.kept("race", theta, SectionsValue, raced)
 
 
-def value_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
-    """The value at θ with its design and envelope, from the store where it was made before."""
-    make = partial(sections_value, sampler.problem, theta)
-    return sampler.kept("value", theta, SectionsValue, make)
+def value_at(sampler: Sampler, best: BandwidthSample) -> SectionsValue:
+    """A sample with its design and envelope, from the store where it was made before."""
+    problem = alone(sampler.problem, best.kappa) if best.kappa else sampler.problem
+    make = partial(sections_value, problem, best.theta)
+    return sampler.of(problem).kept("value", best.theta, SectionsValue, make)
 
 
 def teller(label: str, quiet: bool) -> Callable[[str], None]:
@@ -139,11 +142,9 @@ def teller(label: str, quiet: bool) -> Callable[[str], None]:
     return tell
 
 
-BETTER = 1e-3  # relative: what the search at the end has to gain to be worth another round
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
-CARRIED = 12  # joint searches at most, each on the worst plants that the one before has left
-FOLLOWED = 3  # times at most that a controller is taken along past a jump of ω_b*
+TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
 @dataclass(frozen=True)
@@ -182,45 +183,53 @@ class SectionsOuter(ThetaOuter):
         return SectionsOuter(sampler.of(problem), words if lost else "")
 
     def continued(self, folder: Path, seed: int) -> "SectionsOuter":
-        """With the anchors and the plant set of a run, or those of a search where it has none."""
+        """With the anchors, plants and controller of a run; those of a search where it has none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
             return self.prepared(seed)
-        problem = with_function(path, sampler.problem, read_json(path))
-        return SectionsOuter(sampler.of(problem)).prepared(seed)
+        result = read_json(path)
+        problem = with_function(path, sampler.problem, result)
+        outer = SectionsOuter(sampler.of(problem)).prepared(seed)
+        if (folder / "controller.json").exists():
+            theta = [float(result["theta"][name]) for name in problem.names]
+            outer.sampler.climbed(theta, sections_kappa(folder, structure_of(problem)))
+        return outer
 
     def ended(self, x: Array) -> SectionsEnd:
-        with self.sampler.spent.on("polish"):
-            asked, best = polish_sections(self.sampler, self.theta_of(x))
-        problem, theta = asked.problem, best.theta
-        found = value_at(asked, theta)
-        tell = teller("at the end", asked.quiet)
-        worst, members = worst_members(problem, theta, found.design, 0, tell)
-        raced = None if members else raced_at(asked, theta)
-        gap = 0.0 if raced is None else _gap(problem, best, raced)
+        theta = self.theta_of(x)
+        for _ in range(TAKEN):
+            with self.sampler.spent.on("polish"):
+                asked, best = polish_sections(self.sampler, theta)
+            problem, found = asked.problem, value_at(asked, best)
+            tell = teller("at the end", asked.quiet)
+            worst, members = worst_members(problem, best.theta, found.design, 0, tell)
+            raced = None if members else raced_at(asked, best)
+            gap = 0.0 if raced is None else _gap(problem, best, raced)
+            if raced is None or gap <= WORTH:
+                break
+            asked.climbed(best.theta, raced.design.kappa.tolist())
+            theta = np.array(best.theta)
         return SectionsEnd(
-            np.array(theta), best.value, objective_of(problem, best),
+            np.array(best.theta), best.value, objective_of(problem, best),
             theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found, raced,
             worst, members,
         )  # fmt: skip
 
     def joined(self, end: End) -> "SectionsOuter | None":
         end = cast(SectionsEnd, end)
-        if end.members:
-            return SectionsOuter(with_members(end.asked, end.found.design.kappa, end.members))
-        if end.raced is None or end.gap <= BETTER:
+        if not end.members:
             return None
-        kappa = end.raced.design.kappa
-        return SectionsOuter(self.sampler.of(joined(end.asked.problem, kappa, ())))
+        anchored = joined(end.asked.problem, end.found.design.kappa, ())
+        return SectionsOuter(with_members(end.asked.of(anchored), end.members))
 
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)
         asked, best, made, worst = end.asked, end.best, end.found.design, end.worst
         problem = asked.problem
-        raced = raced_at(asked, best.theta) if end.raced is None else end.raced
+        raced = raced_at(asked, best) if end.raced is None else end.raced
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
+        kkt = theta_kkt(problem, best, asked, end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
         drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
@@ -259,45 +268,22 @@ class SectionsOuter(ThetaOuter):
 
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.bandwidths(x, "the run's own design")[0]
-        return sections_responses(self.problem, sample, value_at(self.sampler, sample.theta))
+        return sections_responses(self.problem, sample, value_at(self.sampler, sample))
 
 
 def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: SectionsValue) -> float:
     return problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
 
 
-def with_members(sampler: Sampler, kappa: Array, members: Sequence[Member]) -> Sampler:
-    """The sampler of the problem with more plants: on these what was found before is worth
-    nothing."""
-    trace = sampler.trace
-    trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
-    return sampler.of(joined(sampler.problem, kappa, members))
-
-
-def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
-    """`together` again with the worst plants of its end, until it settles and none is worse."""
-    for turn in range(CARRIED):
-        sampler, best, settled = together(sampler, theta)
-        if not best.feasible:
-            break
-        design, tell = value_at(sampler, best.theta).design, teller("on the way", sampler.quiet)
-        members = worst_members(sampler.problem, best.theta, design, turn, tell)[1]
-        if settled and not members:
-            break
-        theta = np.array(best.theta)
-        sampler = with_members(sampler, design.kappa, members) if members else sampler
-    return sampler, best
-
-
 def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
-    the sampler of the problem that has it: with more anchors, where the given ones lose it.
+    the sampler of the problem that has it: with more plants, where worse ones were found.
 
     By the joint search where J counts the bandwidth; from there, where J is not stationary, by
     pieces (`pieces`), which know kinks.
     """
     if sampler.problem.figure is BANDWIDTH:
-        sampler, best = carried(sampler, theta)
+        sampler, best, _ = together(sampler, theta, teller("on the way", sampler.quiet))
         if best.feasible and _stationary(sampler, best):
             return sampler, best
         theta = np.array(best.theta)
@@ -305,44 +291,15 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
     near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
-    truth = TrueBandwidth(sampler, "polishing")
-    candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
+    candidates = sampler.bandwidths(np.unique([near, theta], axis=0), "polishing")
     best = min(candidates, key=lambda s: objective_of(problem, s))
     if theta_kkt(problem, best).stationarity > STATIONARY:
-        truth, best = by_pieces(truth, best)
-    return truth.sampler, best
+        best = pieces_from(sampler, best, LEVEL)
+    return sampler, best
 
 
 def _stationary(sampler: Sampler, best: BandwidthSample) -> bool:
     """Whether a sample is optimal to first order, by the gradients of several sides of it."""
-    envelope = value_at(sampler, best.theta).envelope
+    envelope = value_at(sampler, best).envelope
     kkt = theta_kkt(sampler.problem, best, envelope=envelope)
     return kkt.stationarity <= VerifiedSections.kkt_level
-
-
-def by_pieces(
-    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL, first: float = FIRST
-) -> tuple[TrueBandwidth, BandwidthSample]:
-    """From a sample, and what was asked for near it, to where the pieces of J promise no more.
-
-    Where ω_b* jumps beside the best θ the climbs from the anchors have lost its controller: that
-    one becomes an anchor, and the search goes on. So does one that a search at its θ has found:
-    another search at each θ near by would be dear, and ω_b* none of one controller.
-    """
-    for _ in range(FOLLOWED):
-        if best.anew and truth.sampler.problem.figure is BANDWIDTH:
-            truth, best = _with_anchor(truth, best)
-        best, jumped = pieces_from(truth, best, settled, first)
-        if not jumped:
-            break
-        truth, best = _with_anchor(truth, best)
-    return truth, best
-
-
-def _with_anchor(
-    truth: TrueBandwidth, best: BandwidthSample
-) -> tuple[TrueBandwidth, BandwidthSample]:
-    """With the controller of a sample as one more anchor, and the sample of that problem."""
-    problem = joined(truth.sampler.problem, np.array(best.kappa), ())
-    truth = TrueBandwidth(truth.sampler.of(problem), truth.label)
-    return truth, truth.at(np.array(best.theta))

@@ -44,14 +44,33 @@ def solve(
 
         min w1 f(θ) + w2 ω_b*(θ),  θ_min <= θ <= θ_max,  λ(θ) <= 0      (paper, equation (9))
 
-    `formulation` is `Nested(...)`, `Lifted(...)` or `Direct(...)`: by default lifted, direct with
-    more than 12 parameters. Samples are kept in the file `store`, which a later call resumes from,
-    or nowhere. More than one of `workers` needs the caller's script behind
-    `if __name__ == "__main__":`, as any use of processes does.
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        As `problem_of` gives it.
+    formulation : Nested, Lifted or Direct
+        By default lifted, and direct with more than 12 parameters.
+    seed : int
+        Of every random choice.
+    workers : int
+        Processes; with more than one, call it behind `if __name__ == "__main__":`.
+    store : path
+        File of the samples, which a later call resumes from.
+    quiet : bool
+        Whether to show no progress on stderr.
 
-    Raises UserError where the plant or the store cannot be used; an infeasible problem is a
-    Solution with `verified` None.
+    Returns
+    -------
+    Solution
+        The design; of an infeasible problem with `verified` None.
 
+    Raises
+    ------
+    UserError
+        The plant or the store cannot be used.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd
     >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
     >>> solution = ccd.solve(problem, ccd.Lifted(points=24, box_points=4))

@@ -22,7 +22,6 @@ from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.arrays import Array
 
 AGAIN = 3  # times at most that a search begins with what the inner problem has found better
-MOVED_ROUNDS = 1  # more after a look: local solves on the truth have found what they would look for
 
 
 @dataclass(frozen=True)
@@ -59,46 +58,29 @@ def searched(
             outcome = outer.rescued(outcome, seed)
         if outcome.x is None:
             return Searched(outer, outcome, None, rounds)
-        sampled = tuple(outer.sampler.solved)
         end = outer.ended(outcome.x)
         more = None if rounds == AGAIN else outer.joined(end)
         if more is None:
-            return _looked(Searched(outer, outcome, end, rounds), formulation, sampled, seed)
+            return _looked(Searched(outer, outcome, end, rounds), formulation, seed)
         goes_on = known is not None or isinstance(formulation, Direct)
         outer, known = more, end.x if goes_on else None
 
 
-def _looked(
-    found: Searched, formulation: Formulation, sampled: Sequence[tuple[float, ...]], seed: int
-) -> Searched:
+def _looked(found: Searched, formulation: Formulation, seed: int) -> Searched:
     """After the global check over the box, and a last try where the end is not stationary."""
     outer, outcome, end = found.outer, found.outcome, found.end
     assert end is not None
     with outer.sampler.spent.on("box_look"):
-        points = formulation.box_points
-        look = look_over_box(outer, end, points, seed, outcome.surrogates)
-    rounds = 0 if isinstance(formulation, Direct) else formulation.max_refinements
-    missed = _missed(outcome, end) > formulation.tolerance
-    if look.x is not None or (missed and len(outcome.iterates) <= rounds):
-        x, again = end.x, formulation
-        if look.x is not None:
-            x = look.x
-            if not isinstance(formulation, Direct):
-                again = replace(formulation, max_refinements=min(rounds, MOVED_ROUNDS))
-        outcome = outer.resumed(again, outcome, x, sampled, seed)
-        places = [] if np.array_equal(x, end.x) else [x]
-        if outcome.x is not None and not np.array_equal(x, outcome.x):
-            places.append(outcome.x)
-        end = best_end([end, *map(outer.ended, places)], outer.kkt_level, formulation.tolerance)
+        look = look_over_box(outer, end, formulation.box_points, seed, outcome.surrogates)
+    if look.x is not None:
+        end = best_end([end, outer.ended(look.x)], outer.kkt_level, formulation.tolerance)
     if np.isfinite(end.kkt.stationarity) and end.kkt.stationarity > outer.kkt_level:
         with outer.sampler.spent.on("polish"):
             starts = perturbed(outer, end.x, seed)
         ends = [end, *map(outer.ended, starts)]
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
-        if isinstance(formulation, Direct):  # has no surrogate that could have promised another
-            outcome = replace(outcome, x=end.x)
-    may_learn = rounds > 0 and end.feasible and bool(outcome.surrogates)
-    if may_learn and _missed(outcome, end) > formulation.tolerance:
+    learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
+    if learns and end.feasible and _missed(outcome, end) > formulation.tolerance:
         outcome = outer.learnt(outcome, end)  # left out, it tells how they support the design
     return replace(found, outcome=outcome, end=end, look=look)
 
@@ -134,7 +116,7 @@ def concluded(
         return Solution(result, outcome, None)
     with sampler.spent.on("checks"):
         verified = outer.verified(found.end, found.rounds)
-    quality = surrogate_quality(outcome.surrogates, verified, seed, quiet=sampler.quiet)
+    quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
     result = result_dict(
         formulation, outcome, verified, tolerance=tolerance, spent=sampler.spent.by_purpose,
         seconds=perf_counter() - began, seed=seed, quality=quality, look=found.look,

@@ -18,7 +18,7 @@ import numpy as np
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.sampling.rows import Sample, problem_hash
+from ccd_casadi.sampling.rows import Sample, hashes_of
 from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -67,22 +67,13 @@ def named_surrogate(
     return Surrogates(processes, X[:, :-2], _quantities(processes, X))
 
 
-def fitted_quantities(processes: tuple[GaussianProcess, ...]) -> tuple[QuantitySample, ...]:
-    """The samples that the lifted formulation's processes were fitted to; none without them."""
-    if not processes:
-        return ()
-    X = processes[0].lower + processes[0].X * (processes[0].upper - processes[0].lower)
-    return _quantities(processes, X)
-
-
 def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Array, Sample]]:
     """Designs with derivatives inside the box as (x, row), x = (θ, ln ω_S, ln ω_T), oldest first.
 
     Designs that were not certified are among them.
     """
     lower, upper = lifted_bounds(problem)
-    key = problem_hash(problem.identity())
-    keys = store.keys_with_gradients(key)
+    keys = store.keys_with_gradients(hashes_of(problem)[0])
     known = store.get(keys)
     slack = SAME * (upper - lower)
     found = []
@@ -104,9 +95,7 @@ def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[A
 def stored_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
     """Every θ (n, n_θ) inside the box whose inner problem was solved, oldest first."""
     lower, upper = box(problem)
-    designs = problem_hash(problem.identity())
-    key = problem_hash({"problem": designs, "inner": problem.inner_identity()})
-    thetas = store.thetas(key)
+    thetas = store.thetas(hashes_of(problem)[1])
     if any(len(theta) != len(lower) for theta in thetas):
         raise store.damaged()
     X = np.array(thetas, dtype=float).reshape(-1, len(lower))
@@ -197,10 +186,9 @@ def load_version(run: Path, name: str) -> tuple[GaussianProcess, ...]:
     if name not in known:
         words = f"known are {known[0]} to {known[-1]}" if known else "there are none yet"
         raise SurrogateFileError(f"{path}: there is no such version; {words}")
-    members = load(path)[0]
-    processes = tuple(m for m in members if isinstance(m, GaussianProcess))
-    if len(processes) != len(members) or not processes:
-        raise SurrogateFileError(f"{path}: holds other surrogates than Gaussian processes")
+    processes = load(path)[0]
+    if not processes:
+        raise SurrogateFileError(f"{path}: holds no surrogate")
     return processes
 
 

@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
 from ccd_casadi.inner_problem.sections_search import prepared, with_range
-from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
+from ccd_casadi.sampling.rows import Sample, hashes_of, sample_key
 from ccd_casadi.sampling.units import sections_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome
@@ -62,8 +62,7 @@ def designed(task: tuple[CoDesignProblem, Knobs], tell: Progress) -> Designed:
     if not sections_of_problem(problem).anchors:
         problem = prepared(replace(problem, start=knobs.theta), progress=tell)[0]
     problem = with_range(problem)
-    designs = problem_hash(problem.identity())
-    inner = problem_hash({"problem": designs, "inner": problem.inner_identity()})
+    designs, inner = hashes_of(problem)
     own = sample_key(inner, knobs.theta, 0.0, 0.0)
     rows, (_, theta, payload) = sections_unit(problem, designs, own, knobs.theta)
     kappa = np.array(payload["kappa"]) if payload["kappa"] else None

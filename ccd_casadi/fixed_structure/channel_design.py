@@ -129,7 +129,7 @@ def synthesise(
         return _joined(problem, plants, sampling, made, seed, begun)
     pool = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
     field = _stable(problem, pool)
-    evaluations = len(pool)
+    evaluations, known = len(pool), len(field)
     shared = len(structure.decoupling.outputs) < len(structure.structures)
     if shared and not only_initial:
         rng = np.random.default_rng(seed)
@@ -148,7 +148,7 @@ def synthesise(
     if not field:
         return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
     runners = run_race(
-        problem, np.array(field), lambda words: tell(f"whole loop: {words}"), workers
+        problem, np.array(field), lambda words: tell(f"whole loop: {words}"), workers, known=known
     )
     return concluded(problem, plants, sampling, runners, len(field), evaluations, seed, begun, tell)
 

@@ -33,7 +33,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
-CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
+CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 REDRAWS = 2  # searches at most from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
 POOL = 12  # random starts tried for stability for each one that is kept
@@ -94,12 +94,13 @@ def synthesise_sections(
     rng = np.random.default_rng(seed)
     begun_at = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
     pool = kept(problem, np.reshape(begun_at, (-1, len(structure.names))))
+    known = len(pool)
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     tell = progress or (lambda words: None)
     if not len(pool):
         return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
-    runners = run_race(problem, pool, tell, workers)
+    runners = run_race(problem, pool, tell, workers, known=known, last=only_initial)
     for _ in range(0 if only_initial else REDRAWS):
         best = runners[0].merit
         fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)

@@ -17,15 +17,15 @@ from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 
-ROUNDS = (15, 30, 60, 60, 60, 60, 60, 60)  # steps of each
-HALVINGS = 3  # rounds after which the better half goes on
+ROUNDS, STEPS = 27, 15  # at most, steps of each
+HALVINGS = (0, 2, 6)  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
 MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
-LOWERED = 6  # steps at most to the bandwidth of a controller
+NEWTON = 8  # steps at most to the bandwidth of a controller
 WITHIN = 1e-4  # ln: a violation that the end of a search may have
 
 
@@ -65,20 +65,26 @@ def run_race(
     tell: Callable[[str], None],
     workers: Pool | None = None,
     before: Sequence[Runner] = (),
+    known: int = 0,
+    last: bool = True,
 ) -> list[Runner]:
     """All searches from the starts `pool` (N, n), the best first.
 
-    Those of searches `before` are in the field too: they climb no more, but have to be overtaken.
+    The first `known` of these are controllers that searches have ended with. Those of searches
+    `before` are in the field too and have to be overtaken. Where this race is not the `last` one,
+    a search that goes on alone and gains little does so in the next.
     """
-    field = [replace(runner, running=False) for runner in before]
-    field += [Runner(started(problem, kappa)) for kappa in pool]
+    field = list(before)
+    field += [Runner(at_its_bandwidth(problem, kappa)) for kappa in pool[:known]]
+    field += [Runner(started(problem, kappa)) for kappa in pool[known:]]
     scale = problem.plants.omega_0 / (2.0 * np.pi)
-    for turn, steps in enumerate(ROUNDS):
+    for turn in range(ROUNDS):
         running = [runner for runner in field if runner.running]
-        if not running:
+        alone = len(running) == 1 and turn > 0 and running[0].gained < SAME
+        if not running or (alone and not last):
             break
         others = [runner for runner in field if not runner.running]
-        field = others + _climbed(problem, running, steps, workers or Workers(1))
+        field = others + _climbed(problem, running, workers or Workers(1))
         field = _merged(problem, sorted(field, key=lambda runner: -runner.merit))
         field = _going_on(field, turn)
         lead = field[0].point
@@ -95,18 +101,33 @@ def started(problem: LoopProblem, kappa: Array) -> Point:
     ω_low is none.
     """
     tau = problem.begin(kappa)
-    first = point = Point(kappa, tau, assess(problem, kappa, tau))
-    for _ in range(LOWERED):
-        peaks = point.assessment.peaks
-        if peaks is None or not (over := peaks.value > WITHIN).any():
-            return point
-        if not (peaks.to_tau[over] > 0.0).all():
-            break
-        tau -= float((peaks.value[over] / peaks.to_tau[over]).max())
-        if tau < np.log(problem.low):
-            break
+    first = Point(kappa, tau, assess(problem, kappa, tau))
+    peaks = first.assessment.peaks
+    if peaks is None or not (over := peaks.value > WITHIN).any() or (peaks.to_tau[over] <= 0).any():
+        return first
+    own = at_its_bandwidth(problem, kappa)
+    inside = own.assessment.violation <= WITHIN and np.log(problem.low) <= own.tau < tau
+    return own if inside else first
+
+
+def at_its_bandwidth(problem: LoopProblem, kappa: Array) -> Point:
+    """A controller at the largest ω_b that the shape and -3 dB leave it.
+
+    There a known one begins: from below a climb would first make another controller of it, and end
+    in another optimum.
+    """
+    tau = problem.begin(kappa)
+    for _ in range(NEWTON):
         point = Point(kappa, tau, assess(problem, kappa, tau))
-    return first
+        peaks = point.assessment.peaks
+        if peaks is None:
+            break
+        rising = peaks.to_tau > 0.0
+        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=1.0))
+        if abs(room) < WITHIN:
+            break
+        tau += float(np.clip(room, -1.0, 1.0))
+    return point
 
 
 def finished(runners: Sequence[Runner]) -> list[Runner]:
@@ -140,11 +161,9 @@ def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOpt
     return tuple(found)
 
 
-def _climbed(
-    problem: LoopProblem, running: Sequence[Runner], steps: int, workers: Pool
-) -> list[Runner]:
+def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool) -> list[Runner]:
     """All of them some steps further, in their order."""
-    tasks = [(i, problem, r.point, r.radius, steps) for i, r in enumerate(running)]
+    tasks = [(i, problem, r.point, r.radius) for i, r in enumerate(running)]
     ends = dict(workers.map_unordered(_climb, tasks))
     found = []
     for i, runner in enumerate(running):
@@ -156,9 +175,9 @@ def _climbed(
     return found
 
 
-def _climb(task: tuple[int, LoopProblem, Point, float, int]) -> tuple[int, Ascent]:
-    index, problem, point, radius, steps = task
-    return index, ascend(problem, point, iterations=steps, radius=radius)
+def _climb(task: tuple[int, LoopProblem, Point, float]) -> tuple[int, Ascent]:
+    index, problem, point, radius = task
+    return index, ascend(problem, point, iterations=STEPS, radius=radius)
 
 
 def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
@@ -179,15 +198,15 @@ def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
 def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
     """The field, best first, with those stopped that lost, or will not meet the bounds."""
     running = [i for i, runner in enumerate(field) if runner.running]
-    most = max(LAST, len(running) // 2) if turn < HALVINGS else len(running)
+    most = max(LAST, len(running) // 2) if turn in HALVINGS else len(running)
     lead, found = field[0].merit, list(field)
     for place, i in enumerate(running):
         runner = field[i]
         behind = lead - runner.merit
         lost = place >= most or behind + WORTH > OVERTAKING * runner.gained
-        lost = lost or (turn >= HALVINGS - 1 and behind > BEHIND)
+        lost = lost or (turn >= HALVINGS[-1] and behind > BEHIND)
         missing = PENALTY * runner.point.assessment.violation
-        hopeless = turn >= HALVINGS - 1 and missing > OVERTAKING * runner.gained
+        hopeless = turn >= HALVINGS[-1] and missing > OVERTAKING * runner.gained
         if hopeless or (lost and i):
             found[i] = replace(runner, running=False)
     return found

@@ -61,10 +61,10 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
         return found
     if n == 1:
         unit = np.linspace(0.0, 1.0, count)[:, None]
-    else:
-        from scipy.stats import qmc  # slow to import
-
-        unit = qmc.Halton(n, seed=seed).random(count)
+    else:  # a Latin hypercube
+        rng = np.random.default_rng(seed)
+        cells = rng.permuted(np.tile(np.arange(count), (n, 1)), axis=1).T
+        unit = (cells + rng.random((count, n))) / count
     points = box[0] + unit * (box[1] - box[0])
     share = max(1, len(uncertain.options))
     return found + [(i % share, point) for i, point in enumerate(points)]

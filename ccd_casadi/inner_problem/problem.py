@@ -168,9 +168,19 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
         max ω_b over (ω_S, ω_T)  s.t.  ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low    (paper),
                                        ‖GS‖∞ <= compliance_max where that is given
 
-    The best over the design plants of a robust problem that leaves its own open. An infeasible θ
-    is a result without `optimum` that says what falls short.
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence
+        θ in SI, in the order of `problem.names`. The best design plant is taken where a robust
+        problem leaves its own open.
 
+    Returns
+    -------
+    InnerResult
+        Bandwidth in rad/s; an infeasible θ has no `optimum` and says what falls short.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd
     >>> best = ccd.true_inner(ccd.problem_of(ccd.load_case(ccd.TWO_MASS)), (60.0, 60.0))
     >>> round(best.bandwidth / ccd.HZ, 2), best.active
@@ -200,10 +210,27 @@ def best_choice(
 def true_design(
     problem: CoDesignProblem, theta: Sequence[float], omega_S: float, omega_T: float
 ) -> Sensitivities:
-    """One certified synthesis with its total derivatives at (θ, ω_S, ω_T); rad/s.
+    """One certified synthesis with its total derivatives.
 
-    Raises ValueError where the problem leaves open what plant the controller is made on.
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence
+        θ in SI, in the order of `problem.names`.
+    omega_S, omega_T : float
+        Frequencies of the weights, rad/s.
 
+    Returns
+    -------
+    Sensitivities
+        Figures and their derivatives to θ, ln ω_S and ln ω_T.
+
+    Raises
+    ------
+    ValueError
+        The problem leaves open what plant the controller is made on.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd
     >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
     >>> made = ccd.true_design(problem, (60.0, 60.0), 800.0 * ccd.HZ, 40.0 * ccd.HZ)

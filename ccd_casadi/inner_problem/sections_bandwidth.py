@@ -49,7 +49,7 @@ class SectionsValue:
     Of a problem that minimises something else, `error` is that in SI (RMS error in m, time of a
     move in s) and what the gradient is of, `bandwidth` that of the design. `syntheses`: climbs and
     multi-start searches that it took. At a kink of the value the gradient is that of one side, and
-    `envelope` has the others. `anew`: no anchor led to the design, but a search at θ.
+    `envelope` has the others.
     """
 
     theta: tuple[float, ...]
@@ -59,7 +59,6 @@ class SectionsValue:
     syntheses: int
     error: float = float("nan")
     envelope: Envelope | None = None
-    anew: bool = False
 
     @property
     def value(self) -> float:
@@ -95,20 +94,20 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
     initial = warm_starts(problem, structure_of(problem), plants, bounds)
     made: SectionsDesign | None = None
-    spent, anew = 0, False
+    spent = 0
     if initial:
         made = searched(problem, plants, initial)
         spent += 1
     if made is None or (sections.starts and not made.certified):
         made = searched(problem, plants, initial, min(FEW, sections.starts))
-        spent, anew = spent + 1, True
+        spent += 1
     while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
         again = searched(problem, plants, [made.kappa])
         spent += 1
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
             break
         made = again
-    return replace(valued(problem, theta, plants, made, spent), anew=anew)
+    return valued(problem, theta, plants, made, spent)
 
 
 def valued(

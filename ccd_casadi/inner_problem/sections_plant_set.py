@@ -17,13 +17,13 @@ from ccd_casadi.fixed_structure.decoupling import (
     given_decoupling,
 )
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.race import started
+from ccd_casadi.fixed_structure.race import at_its_bandwidth
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
-from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, near
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -101,17 +101,34 @@ def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
     return with_sections(problem, channels=tuple(channels))
 
 
-def uncertain_plant(problem: CoDesignProblem, theta: Sequence[float]) -> UncertainPlant:
-    """The model at θ with every option set, and the box of what may differ from it."""
+def nearby(
+    problem: CoDesignProblem, known: Sequence[Sequence[float]], here: Sequence[float]
+) -> tuple[Evaluate, ...]:
+    """The model with every option set, from what is known at some θ; see `plants.plant.near`."""
+    return tuple(near(plant_of(option), known, here) for option in _options(problem))
+
+
+def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
+    given = sections_of_problem(problem).uncertainty.options
+    return [with_options(problem, options) for options in ((), *given)]
+
+
+def uncertain_plant(
+    problem: CoDesignProblem, theta: Sequence[float], known: Sequence[Mechanics] = ()
+) -> UncertainPlant:
+    """The model at θ with every option set, and the box of what may differ from it.
+
+    `known`: their matrices, in the place of the plants' own.
+    """
     u, held = sections_of_problem(problem).uncertainty, problem.source.held
-    options = [with_options(problem, options) for options in ((), *u.options)]
+    options = _options(problem)
     wider = [plant_of(_with_ranges(option)) for option in options]
 
     def along(option: int, values: Array) -> Mechanics:
         return mechanics(wider[option], (*theta, *values.tolist()))
 
     return UncertainPlant(
-        tuple(mechanics(plant_of(option), theta) for option in options),
+        tuple(known) or tuple(mechanics(plant_of(option), theta) for option in options),
         problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
         tuple((name, low, held[name], high) for name, low, high in u.ranges), along,
     )  # fmt: skip
@@ -177,7 +194,7 @@ def warm_starts(
         found = problem_for(set_of, own, bounds, sections.sampling, sections.frequencies)
         both = [kappa, moved(own, before, set_of[0], kappa)]
         merits = [
-            started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
+            at_its_bandwidth(found, np.clip(in_problem_units(found, one), *found.box)).merit()
             for one in both
         ]
         return both[int(np.argmax(merits))]

@@ -15,6 +15,7 @@ from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import Progress
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
@@ -29,6 +30,7 @@ from ccd_casadi.inner_problem.sections_plant_set import (
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
 AT_ONCE = 3  # plants added in a round
@@ -52,10 +54,33 @@ def worst_members(
 
     Where a move's time counts the plant that settles latest besides, if it is later than v.
     """
-    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
+    uncertain = uncertain_plant(problem, theta)
+    worst, found = worse_members(problem, uncertain, made.kappa, made.bandwidth, turn, progress)
+    if problem.figure is MOVE_TIME and made.controller is not None:
+        value = float(np.exp(goal_of(problem, theta, ()).at(made.kappa)[0]))
+        seed = sections_of_problem(problem).seed + turn
+        time, option, point = latest_plant(problem, theta, made.controller, seed)
+        if progress is not None:
+            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms told")
+        if time > value:
+            found = (*found, (option, tuple(map(float, point))))
+    return worst, found
+
+
+def worse_members(
+    problem: CoDesignProblem,
+    uncertain: UncertainPlant,
+    kappa: Array,
+    bandwidth: float,
+    turn: int,
+    progress: Progress | None = None,
+    within: float = WITHIN,
+) -> tuple[Excess, tuple[Member, ...]]:
+    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
+    sections = sections_of_problem(problem)
     heads, count = worst_plants(
-        uncertain, structure_of(problem), made.kappa, made.bandwidth, bounds_of(problem),
-        sections.sampling, seed=sections.seed + turn,
+        uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem), sections.sampling,
+        seed=sections.seed + turn,
     )  # fmt: skip
     if progress is not None:
         progress(f"{np.exp(heads[0].value):.6g} of a bound at most on {count} plants")
@@ -68,15 +93,8 @@ def worst_members(
             for option, point in (*known, *found)
             if option == head.option
         ]
-        if head.value > WITHIN and (not near or min(near) > APART) and len(found) < AT_ONCE:
+        if head.value > within and (not near or min(near) > APART) and len(found) < AT_ONCE:
             found.append((head.option, tuple(map(float, head.point))))
-    if problem.figure is MOVE_TIME and made.controller is not None:
-        value = float(np.exp(goal_of(problem, theta, ()).at(made.kappa)[0]))
-        time, option, point = latest_plant(problem, theta, made.controller, sections.seed + turn)
-        if progress is not None:
-            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms told")
-        if time > value:
-            found.append((option, tuple(map(float, point))))
     return heads[0], tuple(found)
 
 

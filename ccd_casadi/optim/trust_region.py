@@ -8,8 +8,10 @@ solves
     min ∇f·p + ½ pᵀ H p + ρ σ   s.t.  c + ∇c p (+ ½ pᵀ ∇²c p) <= σ,  |p| <= Δ,  0 <= σ,
 
 with ½ pᵀ ∇²c p by programmes around the step before, whose Hessian is that of the Lagrangian, made
-convex (Fletcher and Sainz de la Maza 1989). A trial counts where the merit falls. What is minimised
-and how its curvature is learnt is the `Model`'s; `Radius` is how far a step is trusted.
+convex (Fletcher and Sainz de la Maza 1989), each within a region of its own and corrected to second
+order, so that what the model promises grows from one to the next. A trial counts where the merit
+falls. What is minimised and how its curvature is learnt is the `Model`'s; `Radius` is how far a
+step is trusted.
 """
 
 from abc import ABC, abstractmethod
@@ -22,9 +24,10 @@ import numpy as np
 from ccd_casadi.optim.quadratic import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
-PROGRAMMES = 6  # around each other, for one step
+PROGRAMMES = 12  # around each other, for one step
 SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to the answer of a programme
-SETTLED = 1e-2  # of the radius: a step that moves less from one programme to the next
+SETTLED = 1e-2  # of the radius: a programme that moves less has no more to give
+LITTLE = 1e-2  # of the gain: what one more programme has to add
 HOLDS = 1e-7  # of the penalty: the multiplier of a row that holds the step
 BENDS = 0.2  # of the sizes of its parts: how far curvature may move a row more than it is known to
 FLAT = 1e-4  # of the slopes: least curvature, which leaves a linear programme one
@@ -36,6 +39,7 @@ STEADY = 3  # steps at one radius, each of a middling gain, after which a larger
 WIDER = 10.0
 ZOOM = 4.0  # steps of the radius to which it comes down where they are too small for it
 FADING = 0.1  # of a penalty that a larger sum of multipliers left, at each step
+TIMES = 2.0  # the sum of multipliers and slope: the penalty that a step along curved rows counts
 ELASTIC = 10.0  # times the merit's penalty, where that grows: of the programme
 
 Data = TypeVar("Data")
@@ -125,6 +129,9 @@ class Model(ABC, Generic[Data]):
     carried = False  # whether σ >= 0 falls away: f is the largest row
     corrected = False  # whether a trial that gains too little is corrected to second order
     growing = False  # whether the penalty grows with the multipliers
+    # Whether a row that ends below its bound by little of what it moves counts with its curvature,
+    # as it may bend over it. Searches over K alone end in better optima without.
+    bending = False
 
     @abstractmethod
     def at(self, x: Array) -> Iterate[Data] | None:
@@ -188,16 +195,16 @@ def minimise(
             else:
                 return End(here, radius, evaluations, True)
             continue
-        penalty = step.penalty
+        penalty = step.penalty if model.growing else penalty
         there = model.at(here.x + step.change)
         evaluations += 1
-        gained = _gain(here, there, penalty)
+        gained = _gain(here, there, step.penalty)
         if gained < ENOUGH * step.predicted and there is not None and model.corrected:
             change = _corrected(model, here, there, step, H, radius.value)
             other = None if change is None else model.at(here.x + change)
             evaluations += change is not None
-            if _gain(here, other, penalty) > gained:
-                there, gained = other, _gain(here, other, penalty)
+            if _gain(here, other, step.penalty) > gained:
+                there, gained = other, _gain(here, other, step.penalty)
         radius = radius.after(gained, step)
         if there is not None:
             if model.ended(here, there):
@@ -232,44 +239,67 @@ def best_step(
         most = float(level[elastic > 0.0].max(initial=-np.inf if model.carried else 0.0))
         return penalty * (here.violation - most) - float(here.gradient @ p + 0.5 * p @ H @ p)
 
-    at, offset, M, p = slopes, value + margin[chosen], convex(H, FLAT * unit), np.zeros(n)
-    best: Step | None = None
-    straight = 0.0
-    for turn in range(PROGRAMMES):
-        cost = here.gradient + (H - M) @ p  # M acts on what is left of p
-        ends = _ends(model, here, radius)
-        found = solve_elastic(
+    def answer(offset: Array) -> tuple[Array, Array] | None:
+        """That of the programme around p with these rows: M acts on what is left of p."""
+        cost = here.gradient + (H - M) @ p
+        ends = np.maximum(low, p - near), np.minimum(high, p + near)
+        return solve_elastic(
             M, cost, at, offset, elastic, *ends, weight, radius, unit, free=model.carried
         )
+
+    at, offset, M, p = slopes, value + margin[chosen], convex(H, FLAT * unit), np.zeros(n)
+    (low, high), near, straight = _ends(model, here, radius), radius, 0.0
+    best: Step | None = None
+    for turn in range(PROGRAMMES):
+        found = answer(offset)
         if found is None:
             break
         way, mu = found[0] - p, found[1]
         if model.growing:
             penalty = max(FADING * penalty, 2.0 * float(mu.sum()))
+        elif rows.curved:
+            penalty = min(weight, TIMES * float(mu.sum() + unit))
         if turn == 0:
             straight = gain(way)
         holds = mu > HOLDS * weight
-        # A row that ends below its bound by little of what it moves may bend over it.
-        counts = holds | (offset + at @ found[0] > -BENDS * (np.abs(slopes) @ np.abs(found[0])))
-        fresh = np.setdiff1d(np.flatnonzero(counts & (chosen < rows.curved)), bent)
+        counts = holds.copy()
+        if model.bending:
+            counts |= offset + at @ found[0] > -BENDS * (np.abs(slopes) @ np.abs(found[0]))
+        counts[bent] = False
+        fresh = np.flatnonzero(counts & (chosen < rows.curved))
         if len(fresh) and rows.hessians is not None:
             curved = np.concatenate([curved, rows.hessians(chosen[fresh])])
             bent = np.concatenate([bent, fresh])
+        known, size = gain(p), float(np.abs(way).max())
         # The rows bend less on part of the way: a whole one may lead further and further out.
-        p = max((p + share * way for share in (SHARES if rows.curved else SHARES[:1])), key=gain)
-        bend, predicted = curved @ p, gain(p)
-        at, offset = slopes.copy(), value.copy()
-        at[bent] += bend
-        offset[bent] -= 0.5 * bend @ p
+        tried = [p + share * way for share in (SHARES if rows.curved else SHARES[:1])]
+        gains = [gain(end) for end in tried]
+        if turn and gains[0] < max(gains):  # the whole of it, with what the rows bend on it
+            bends = offset.copy()
+            bends[bent] += 0.5 * (curved @ way) @ way
+            if (other := answer(bends)) is not None:
+                tried.append(other[0])
+                gains.append(gain(other[0]))
+        predicted = max(gains)
+        better = predicted - known
+        if better > 0.0 or not rows.curved:
+            end = tried[gains.index(predicted)]
+            near, p = 2.0 * float(np.abs(end - p).max()), end
+        else:
+            near, predicted = 0.5 * SHARES[-1] * size, known
+        multipliers = np.zeros(len(rows.value))
+        multipliers[chosen] = mu
         if rows.curved:
+            bend = curved @ p
+            at, offset = slopes.copy(), value.copy()
+            at[bent] += bend
+            offset[bent] -= 0.5 * bend @ p
             lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0)[bent], curved)
             active = at[holds]
             M = convex(lagrangian + CONVEXIFYING * active.T @ active, FLAT * unit)
-        if best is None or predicted > best.predicted:
-            multipliers = np.zeros(len(rows.value))
-            multipliers[chosen] = mu
-            best = Step(p, predicted, straight, M, multipliers, rows, penalty)
-        if not rows.curved or (not len(fresh) and np.abs(way).max() < SETTLED * radius):
+        best = Step(p, predicted, straight, M, multipliers, rows, penalty)
+        little = better < LITTLE * predicted if better > 0.0 else size < SETTLED * radius
+        if not rows.curved or (turn and little and not len(fresh)):
             break
     return best
 

@@ -89,7 +89,11 @@ def through(
 
     `others`: fields that are given as they are, of the new θ.
     """
-    shapes, drawing = plant.shapes, plant.drawing
+    shapes, drawing, nearby = plant.shapes, plant.drawing, plant.nearby
+
+    def near(known: Sequence[Sequence[float]]) -> Evaluate:
+        assert nearby is not None
+        return of(nearby([own(theta) for theta in known]))
 
     def shown(theta: Sequence[float], count: int) -> ModeShapes:
         assert shapes is not None
@@ -103,6 +107,7 @@ def through(
         "evaluate": of(plant.evaluate),
         "references": {name: of(closer) for name, closer in plant.references.items()},
         "values": None if plant.values is None else of(plant.values),
+        "nearby": None if nearby is None else near,
         "notes": lambda theta: plant.notes(own(theta)),
         "doubt": lambda theta: plant.doubt(own(theta)),
         "shapes": None if shapes is None else shown,

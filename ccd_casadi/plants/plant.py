@@ -65,8 +65,9 @@ class Plant:
     plant modelled more closely, by name, without derivatives: a design is certified on them again,
     not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
     reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
-    known. `doubt` says what is wrong with the derivatives at θ, empty where
-    nothing is. Without `exact_hessian` second derivatives of `hardware` cost too much to be asked
+    known. `nearby` makes, of θ that are known, a cheaper `evaluate` that is true there and nearly
+    so beside them. `doubt` says what is wrong with the derivatives at θ, empty where nothing is.
+    Without `exact_hessian` second derivatives of `hardware` cost too much to be asked
     for. `shapes` are so many of the lowest flexible modes at θ as pictures need them, `drawing` is
     of several θ by name; None where the plant has no such picture.
     """
@@ -82,6 +83,7 @@ class Plant:
     values: Callable[[Sequence[float]], Mechanics] | None = None
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
     domain: tuple[Array, Array] | None = None
+    nearby: Callable[[Sequence[Sequence[float]]], Evaluate] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
     drawing: Callable[[Mapping[str, Sequence[float]]], Figure] | None = None
@@ -206,6 +208,14 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
         remedy = "give every coordinate a mass, or narrow the bounds of theta"
         raise PlantError(f"{words}: its least eigenvalue is {least:.3g}; {remedy}") from None
     return system
+
+
+def near(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[float]) -> Evaluate:
+    """θ -> Mechanics from what is known: the plant's own way, or to first order around `here`."""
+    if plant.nearby is not None and known:
+        return plant.nearby(known)
+    system = mechanics(plant, here)
+    return lambda theta: to_first_order(system, np.array(theta) - np.array(here))
 
 
 def _require_finite(plant: Plant, system: Mechanics, place: str) -> None:

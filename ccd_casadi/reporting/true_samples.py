@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
+from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, sample_key
 from ccd_casadi.sampling.store import SampleStore
 
 
@@ -21,14 +21,14 @@ class Truths:
 
 def read_truths(path: Path, problem: CoDesignProblem) -> Truths:
     """Everything in the store that belongs to this problem (a folder may have seen others)."""
-    designs_hash = problem_hash(problem.identity())
-    inner_hash = problem_hash({"problem": designs_hash, "inner": problem.inner_identity()})
+    designs_hash, inner_hash = hashes_of(problem)
     count = len(problem.names)
     thetas, values = [], []
     with SampleStore(path) as store:
         rows = [s for s in store.select() if len(s.theta) == count]
         for theta in dict.fromkeys(sample.theta for sample in rows):
-            known = store.get_result(sample_key(inner_hash, theta, 0.0, 0.0))
+            known = store.get_result(best_key(inner_hash, theta))
+            known = known or store.get_result(sample_key(inner_hash, theta, 0.0, 0.0))
             if known is not None:
                 thetas.append(theta)
                 value = known["bandwidth"]

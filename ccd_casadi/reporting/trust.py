@@ -68,15 +68,15 @@ def _caption(qualities: Sequence[Quality]) -> str:
 
 
 def table_trust(qualities: Sequence[Quality]) -> Table:
-    """Errors left out, calibration, kinks and support at the design, output by output."""
+    """Errors left out, calibration and support at the design, output by output."""
     head = (
-        "output", "samples", "leave one out, rms", "largest", "k-fold, rms", "Q²",
-        "in 95 % bands", "samples look", "at the design",
+        "output", "samples", "leave one out, rms", "largest", "Q²",
+        "in 95 % bands", "samples are", "at the design",
     )  # fmt: skip
     rows = tuple(
         (WORDS[q.name], len(q.true),
-         *(f"{number(e, 3)} {q.unit}" for e in (q.loo.rms, q.loo.max, q.kfold.rms)),
-         number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_look, q.at_design)
+         *(f"{number(e, 3)} {q.unit}" for e in (q.loo.rms, q.loo.max)),
+         number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_are, q.at_design)
         for q in qualities
     )  # fmt: skip
     return Table(head, rows)

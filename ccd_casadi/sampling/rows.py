@@ -12,6 +12,8 @@ from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any
 
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+
 DAMAGED = "a row is damaged"
 
 
@@ -113,9 +115,20 @@ def problem_hash(problem: Mapping[str, object]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def hashes_of(problem: CoDesignProblem) -> tuple[str, str]:
+    """Those of a problem's single designs, and of its inner problems."""
+    designs = problem_hash(problem.identity())
+    return designs, problem_hash({"problem": designs, "inner": problem.inner_identity()})
+
+
 def sample_key(problem: str, theta: Sequence[float], omega_S: float, omega_T: float) -> str:
     """The key of one synthesis of a problem, exact in every float."""
     return problem_hash({"problem": problem, "theta": list(theta), "omega": [omega_S, omega_T]})
+
+
+def best_key(inner: str, theta: Sequence[float]) -> str:
+    """That of the best found at a θ from other controllers than the inner problem's own."""
+    return sample_key(problem_hash({"best": inner}), theta, 0.0, 0.0)
 
 
 def _canonical(value: object) -> object:

@@ -6,7 +6,7 @@ end is stored whole (`kept`), with the controller, as it is made.
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +18,8 @@ from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
+from ccd_casadi.sampling.neighbours import alone, begun, promised
+from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import (
     BandwidthSample,
     QuantitySample,
@@ -65,13 +66,14 @@ class Sampler:
         self.store = store
         self.workers = workers
         self.quiet = quiet
-        self.hash = problem_hash(problem.identity())
-        self.inner_hash = problem_hash({"problem": self.hash, "inner": problem.inner_identity()})
+        self.hash, self.inner_hash = hashes_of(problem)
         store.put_problem(self.hash, problem.identity())
         self.spent = Spent()
         self.trace: list[TraceEntry] = []
         self.nearest: BandwidthSample | None = None  # of the infeasible ones
-        self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # inner problems asked for
+        self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # the best at each θ asked for
+        self.raised = 0  # times that a better controller was found where one had been known
+        self._tried: dict[tuple[float, ...], list[tuple[float, ...]]] = {}  # κ, in vain
 
     def of(
         self, problem: CoDesignProblem, *, traced: bool = True, quiet: bool = False
@@ -97,35 +99,76 @@ class Sampler:
             self.spent.once(f"race {key}", 1)
 
     def bandwidths(self, thetas: Array, label: str = "sampling") -> list[BandwidthSample]:
-        """ω_b* at every row of `thetas`, in their order."""
+        """ω_b* at every row of `thetas`, in their order: the best that is known there.
+
+        Of fixed structures a new θ begins from what is known near by too, and what falls short of
+        its neighbours is climbed anew (`neighbours`).
+        """
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]
-        keys = [sample_key(self.inner_hash, theta, 0.0, 0.0) for theta in points]
-        payloads = {key: self.store.get_result(key) for key in keys}
-        missing = {key: theta for key, theta in zip(keys, points, strict=True) if not payloads[key]}
+        known, before = list(self.solved.values()), len(self.trace)
+        new = [theta for theta in points if theta not in self.solved]
+        self._solve({theta: begun(self.problem, known, theta) for theta in new}, label)
+        self._raise()
+        self.report(before)
+        return [self.solved[theta] for theta in points]
+
+    def climbed(self, theta: Sequence[float], kappa: Sequence[float]) -> BandwidthSample:
+        """The sample at θ, where a controller (κ in SI) was found for it: also from that one."""
+        point, before = tuple(float(v) for v in theta), len(self.trace)
+        self._solve({point: alone(self.problem, kappa)}, "from a controller")
+        self._raise()
+        self.report(before)
+        return self.solved[point]
+
+    def latest(self, samples: Sequence[BandwidthSample]) -> list[BandwidthSample]:
+        """What is known by now at the θ of samples."""
+        return [self.solved.get(sample.theta, sample) for sample in samples]
+
+    def _raise(self) -> None:
+        """Climb anew from their neighbours where samples fall short of them, until none does."""
+        while tasks := promised(self.problem, self.solved.values(), self._tried):
+            before = {theta: self.solved[theta] for theta in tasks}
+            problems = {theta: alone(self.problem, kappa) for theta, kappa in tasks.items()}
+            self._solve(problems, "from neighbours")
+            for theta, kappa in tasks.items():
+                if self.solved[theta] is before[theta]:
+                    self._tried.setdefault(theta, []).append(kappa)
+
+    def _solve(self, problems: Mapping[tuple[float, ...], CoDesignProblem], label: str) -> None:
+        """The inner problem at every θ, and the better one kept of it and what is known."""
+        owners = {theta: hashes_of(problem)[1] for theta, problem in problems.items()}
+        keys = {theta: sample_key(owners[theta], theta, 0.0, 0.0) for theta in problems}
+        payloads = {key: self.store.get_result(key) for key in keys.values()}
+        missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
-            tasks = [(self.problem, self.hash, key, theta) for key, theta in missing.items()]
-            for samples, (key, theta, payload) in self.workers.map_unordered(inner_unit, tasks):
-                unit = (key, self.inner_hash, theta, payload)
-                self.store.put_unit(samples, unit, self.hash)
+            tasks = [(problems[theta], self.hash, key, theta) for key, theta in missing.items()]
+            for rows, (key, theta, payload) in self.workers.map_unordered(inner_unit, tasks):
+                self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
+                if theta not in self.solved:  # who goes on from the store asks for it by this key
+                    own = sample_key(self.inner_hash, theta, 0.0, 0.0)
+                    self.store.put_unit([], (own, self.inner_hash, theta, payload))
                 payloads[key] = payload
                 progress.advance()
-        found, before = [], len(self.trace)
-        for key, theta in zip(keys, points, strict=True):
+        for theta, key in keys.items():
             known = payloads[key]
             assert known is not None
             try:
                 sample = bandwidth_sample(theta, known)
             except (KeyError, TypeError, ValueError) as error:
                 raise self.store.damaged() from error
-            found.append(sample)
-            self.solved[theta] = sample
+            before = self.solved.get(theta, sample)
+            gain = self.problem.figure.gain(sample.value, before.value)  # NaN: one is infeasible
+            if theta not in self.solved or gain > 0.0 or sample.feasible > before.feasible:
+                if theta in self.solved:
+                    self.raised += 1
+                    best = (best_key(self.inner_hash, theta), owners[theta], theta, known)
+                    self.store.put_unit([], best, anew=True)
+                self.solved[theta] = sample
             if not sample.feasible and (
                 self.nearest is None or sample.violation < self.nearest.violation
             ):
                 self.nearest = sample
             self._spend(key, sample.syntheses, theta, sample.bandwidth, sample.value)
-        self.report(before)
-        return found
 
     def quantities(self, X: Array, label: str = "sampling") -> list[QuantitySample]:
         """Values and derivatives at every row of X = (θ, ln ω_S, ln ω_T), in their order."""

@@ -32,7 +32,6 @@ class BandwidthSample:
     syntheses: int
     kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
     error: float | None = None
-    anew: bool = False  # whether no anchor leads to κ, but a search at this θ did
 
     @property
     def x(self) -> tuple[float, ...]:

@@ -133,13 +133,19 @@ class SampleStore:
         samples: Iterable[Sample],
         result: tuple[str, str, Sequence[float], Mapping[str, object]],
         problem: str | None = None,
+        *,
+        anew: bool = False,
     ) -> None:
-        """Write a unit's samples and its result (key, problem, θ, payload): all or nothing."""
+        """Write a unit's samples and its result (key, problem, θ, payload): all or nothing.
+
+        A key that is known stays as it is, unless the result is `anew`.
+        """
         key, owner, theta, payload = result
         row = (key, owner, json.dumps(list(theta)), json.dumps(payload))
         with self.worded(), self._transaction():
             self._insert(samples, problem)
-            self._db.execute("insert or ignore into results values (?, ?, ?, ?)", row)
+            way = "replace" if anew else "ignore"
+            self._db.execute(f"insert or {way} into results values (?, ?, ?, ?)", row)
 
     def get(self, keys: Sequence[str]) -> dict[str, Sample]:
         """The samples known among `keys`."""

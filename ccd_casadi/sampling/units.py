@@ -100,7 +100,6 @@ def sections_unit(
         "shortfall": "" if value.feasible else design.words,
         "violation": _number(np.log(max(design.short.values()))) if design.short else None,
         "syntheses": value.syntheses,
-        "anew": value.anew,
     }
     return [row], (key, theta, payload)
 

@@ -42,8 +42,9 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     Raises UserError where too few designs are certified to learn from, or none is feasible.
     """
     began, rule = perf_counter(), HZ * case.baseline.first_resonance_hz
-    spent = process_time()
-    first_resonance(sampler.problem, np.array(sampler.problem.start))  # needed below anyhow
+    spent, (lower, upper) = process_time(), box(sampler.problem)
+    beside = np.array(sampler.problem.start) + 1e-3 * (upper - lower)  # the start itself is known
+    first_resonance(sampler.problem, np.clip(beside, lower, upper))
     slow = process_time() - spent > SLOW
     hardware = design_hardware(
         sampler.problem, rule, starts=STARTS_SLOW if slow else STARTS, seed=seed,

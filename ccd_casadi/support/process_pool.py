@@ -69,6 +69,12 @@ class Workers:
     def __exit__(self, *_: object) -> None:
         self._end(self._workers)
 
+    def begin(self, module: str) -> None:
+        """Start the processes, which import a module while this one goes on."""
+        missing = self.count - len(self._workers) if self.count > 1 else 0
+        with interrupts_held():
+            self._workers += [WorkerProcess(module) for _ in range(missing)]
+
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
     ) -> Generator[R, None, None]:

@@ -5,6 +5,7 @@ it held. What goes through the pipe is pickled, which is how Python's processes 
 processes that this one started, and is never stored.
 """
 
+import importlib
 import math
 import multiprocessing
 import os
@@ -37,14 +38,14 @@ class Overrun(RuntimeError):
 
 
 class WorkerProcess:
-    """One spawned process and the parent's end of its pipe."""
+    """One spawned process and the parent's end of its pipe; it imports `module` at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, module: str = "ccd_casadi") -> None:
         track_resources()
         with interrupts_held(), _one_thread_each():
             self.pipe, theirs = _SPAWN.Pipe()
             # A daemon: it is ended at exit even where the pool was not left properly.
-            self.process = _SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
+            self.process = _SPAWN.Process(target=_serve, args=(theirs, module), daemon=True)
             self.process.start()
         theirs.close()  # the process holds it alone: its death is an end of file here
 
@@ -170,9 +171,10 @@ def interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(pipe: connection.Connection) -> None:
+def _serve(pipe: connection.Connection, module: str) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends."""
     become_worker()
+    importlib.import_module(module)
     with suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(answered(pipe.recv_bytes()))

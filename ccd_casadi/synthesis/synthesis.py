@@ -107,11 +107,30 @@ def synthesise(
     guess: float = 0.0,
     compliance: bool = False,
 ) -> Design:
-    """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none).
+    """One certified design by mixed sensitivity.
 
-    With a family it is made on the family's design plant, see `over_family`. A failure is an
-    outcome of its `figures`, no exception. `compliance` asks for ‖GS‖∞ among them.
+    Parameters
+    ----------
+    plant : ScaledPlant
+        With a family the design is made on the family's design plant, see `over_family`.
+    weights : Weights
+        W1, W2, W3.
+    omega_low : float
+        Where |S| is reported, rad/s.
+    gamma_backoff : float
+        The controller is made at this multiple of γ_opt.
+    guess : float
+        A nearby γ_opt; 0: none.
+    compliance : bool
+        Whether ‖GS‖∞ is among the figures.
 
+    Returns
+    -------
+    Design
+        A failure is an outcome of its `figures`, no exception.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd
     >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
     >>> weights = problem.weights.at(800.0 * ccd.HZ, 40.0 * ccd.HZ)

@@ -8,19 +8,28 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Weights:
-    """Parameters of W1, W2, W3 (paper, equations (4) to (6)); frequencies in rad/s.
+    """Parameters of W1, W2, W3 (paper, equations (4) to (6)).
 
         W1 = (s/M_S + ω_S)/(s + ω_S A_S)
         W2 = c_K (s + ω_K)/(M_K (s + c_K ω_K))
         W3 = (s + ω_T/A_l)/(A_u s + ω_T)
 
-    M_K has the unit of force over displacement (N/m); the others but the frequencies none.
-    `disturbance` W_d (N/m) > 0 makes the problem the one with input disturbance d,
+    With `disturbance` W_d > 0 the problem is the one with input disturbance d, in which W_d newtons
+    weigh as much as one metre of reference:
 
-        ‖[W1 I; W2 K; (W3/M_K) K] S [I  W_d G]‖∞,
+        ‖[W1 I; W2 K; (W3/M_K) K] S [I  W_d G]‖∞
 
-    in which W_d newtons weigh as much as one metre of reference.
+    Parameters
+    ----------
+    omega_S, omega_K, omega_T : float
+        rad/s.
+    M_K, disturbance : float
+        N/m.
+    M_S, A_S, c_K, A_l, A_u : float
+        Without unit.
 
+    Examples
+    --------
     >>> w = Weights(M_S=2.0, A_S=1e-4, omega_S=100.0, c_K=1e4, omega_K=600.0, M_K=2e7,
     ...             A_l=1.0, A_u=1e-2, omega_T=250.0)
     >>> tuple(round(float(v), 4) for v in abs(w.responses(np.array([100.0]))[:, 0]))

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -11,8 +10,6 @@ from helpers import few, problem
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.outer_sections import by_pieces
-from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.verdict import State, optimal
 from ccd_casadi.codesign.verified_sections import VerifiedSections
@@ -22,6 +19,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.optim.pieces import Local, descend
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 
 J0 = -700.0
@@ -158,7 +156,7 @@ def test_elsewhere_on_a_kink_it_is_the_distance_of_the_hull_from_zero(
 
 @dataclass
 class Told:
-    """J = the largest of pieces over θ, through ω_b* = -J, as `TrueBandwidth` tells it."""
+    """J = the largest of pieces over θ, through ω_b* = -J, as a sampler tells it."""
 
     case: CoDesignProblem
     of: Pieces
@@ -174,8 +172,8 @@ class Told:
             tuple(map(float, theta)), -value, gradient, np.nan, np.nan, (), "", 0.0, 1
         )
 
-    def all_at(self, thetas: np.ndarray) -> list[BandwidthSample]:
-        return [self.at(theta) for theta in thetas]
+    def bandwidths(self, thetas: np.ndarray, label: str) -> list[BandwidthSample]:
+        return [self.at(theta) for theta in np.atleast_2d(thetas)]
 
 
 def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate:
@@ -183,7 +181,7 @@ def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate
     lower, width = np.array(told.case.lower), np.subtract(told.case.upper, told.case.lower)
     envelope = replace(envelope_of(slopes), to_theta=-slopes / width)
     sample = replace(told.at(lower + width * z), gradient=tuple(-slopes[0] / width))
-    return theta_kkt(told.case, sample, cast(TrueBandwidth, told), envelope)
+    return theta_kkt(told.case, sample, cast(Sampler, told), envelope)
 
 
 def case() -> CoDesignProblem:
@@ -264,30 +262,3 @@ def test_where_one_gradient_is_enough_there_is_no_kink() -> None:
     smooth = certificate(told, of.minimiser, np.zeros((2, 2)))
     assert smooth.kink is None
     assert smooth.stationarity <= VerifiedSections.kkt_level
-
-
-class TwoControllers(SimpleNamespace):
-    """A sampler whose climbs lose the better controller at a cliff, but from that one's own κ."""
-
-    def of(self, other: CoDesignProblem) -> "TwoControllers":
-        return TwoControllers(problem=other, slope=self.slope, cliff=self.cliff)
-
-    def bandwidths(self, theta: np.ndarray, label: str) -> list[BandwidthSample]:
-        theta = np.ravel(theta)
-        z = (float(theta[0]) - 55.0) / 15.0
-        better = z < self.cliff or (1.0,) in self.problem.controller.anchors
-        value = 300.0 + self.slope * z - 40.0 * z**2 if better else 250.0 + 10.0 * z
-        bent = self.slope - 80.0 * z if better else 10.0
-        at, kappa, nan = tuple(map(float, theta)), (1.0 if better else 2.0,), float("nan")
-        return [BandwidthSample(at, value, (bent / 15.0, 0.0), nan, nan, (), "", 0.0, 1, kappa)]
-
-
-@few(max_examples=20)
-@given(st.floats(0.1, 0.3), st.floats(30.0, 60.0))
-def test_a_jump_of_the_bandwidth_is_passed_by_its_controller(cliff: float, slope: float) -> None:
-    case = problem(controller=SectionsProblem(anchors=((2.0,),)), w1=0.0, w2=-1.0)
-    truth = TrueBandwidth(cast(Any, TwoControllers(problem=case, slope=slope, cliff=cliff)), "")
-    after, best = by_pieces(truth, truth.at(np.array([55.0, 60.0])))
-    assert best.theta[0] == pytest.approx(55.0 + 15.0 * slope / 80.0, abs=0.02)
-    assert best.kappa == (1.0,)
-    assert len(truth.known) + len(after.known) < 60

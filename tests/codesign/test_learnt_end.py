@@ -44,7 +44,7 @@ def test_a_better_value_takes_the_place_of_one_at_the_same_theta(sloped: bool) -
 
 @pytest.mark.parametrize("rounds", [1, 0])
 def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
-    """Where the budget of rounds is spent and no global check has moved the design; not where the
+    """Whatever the rounds had left, and where no global check has moved the design; not where the
     case allows none."""
     X = np.linspace(0.0, 1.0, 6)[:, None]
     process = fit(X, 1.0 + X[:, 0], lower=[0.0], upper=[1.0])
@@ -58,6 +58,6 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     )  # fmt: skip
     monkeypatch.setattr(search, "look_over_box", lambda *_: SimpleNamespace(x=None))
     options = SimpleNamespace(box_points=0, max_refinements=rounds, tolerance=1e-3)
-    found = search._looked(search.Searched(outer, outcome, end, 1), options, (), 0)
+    found = search._looked(search.Searched(outer, outcome, end, 1), options, 0)
     assert search._missed(outcome, end) > 0.1
     assert (search._missed(found.outcome, end) < 1e-3) is (rounds > 0)

@@ -15,7 +15,7 @@ from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant, with_sections
+from ccd_casadi.inner_problem.sections_plant_set import nearby, uncertain_plant, with_sections
 from ccd_casadi.inner_problem.sections_search import with_range
 from ccd_casadi.plants.plant import mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
@@ -55,7 +55,8 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
 ) -> None:
     """Of peaks that move, along random directions, the frequency of each found anew."""
     omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
-    model = JointModel(built(), Place((60.0, 60.0), stored, omega), 0.1)
+    problem, theta = built(), (60.0, 60.0)
+    model = JointModel(problem, nearby(problem, [theta], theta), Place(theta, stored, omega), 0.1)
     family, start = model.loops, model.start
     z, kappa, tau = model.parts(start)
     loops = family(z)
@@ -94,18 +95,19 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         sampler = Sampler(problem, store, Workers(1))
         first = sampler.bandwidths(np.array(problem.start))[0]
         at = Place(first.theta, first.kappa, first.bandwidth)
-        promised = proposed(problem, at, 0.05)
+        promised = proposed(problem, nearby(problem, [at.theta], at.theta), at, 0.05)
         assert promised.gain > 0.0
-        last, best, settled = together(sampler, np.array(problem.start))
+        _, best, settled = together(sampler, np.array(problem.start))
         assert settled
         assert best.feasible
         assert objective_of(problem, best) < objective_of(problem, first) - 0.5 * promised.gain
         assert best.theta == pytest.approx((55.0, 55.0), abs=1e-6)
         assert best.bandwidth >= 0.99 * 2.0 * np.pi * STORED["bandwidth_hz"]
-        spent = last.spent.total
-        again = together(Sampler(problem, store, Workers(1)), np.array(problem.start))[1]
+        spent = sampler.spent.total
+        other = Sampler(problem, store, Workers(1))
+        again = together(other, np.array(problem.start))[1]
         assert (again.theta, again.kappa) == (best.theta, best.kappa)  # all from the store
-        assert last.spent.total == spent
+        assert other.spent.total == spent
 
 
 def test_where_each_theta_is_dear_none_is_sampled() -> None:

@@ -1,14 +1,19 @@
 """The public face: every name is there, typed, documented with an example, and costs nothing."""
 
 import ast
+import inspect
 import json
 import subprocess
 import sys
+from enum import Enum
 from pathlib import Path
+from types import ModuleType
 
+import griffe
 import pytest
 
 import ccd_casadi
+import surrogates
 
 NAMES = sorted(set(ccd_casadi.__all__) - {"__version__"})
 HEAVY = ("numpy", "numba", "casadi", "matplotlib", "scipy")
@@ -29,6 +34,39 @@ def test_importing_it_loads_nothing_that_can_wait(module: str, heavy: tuple[str,
         [sys.executable, "-c", words], capture_output=True, text=True, check=True
     )
     assert json.loads(found.stdout) == []
+# whose docstrings are prose still
+PROSE = {
+    "Bounds", "CoDesignProblem", "Errors", "Extrapolation", "GaussianProcess", "Hyperparameters",
+    "Plant", "Quality", "Samples", "Sampling", "SectionsDesign", "Solution", "StateSpace",
+    "Structure", "SurrogateRegressor", "TrueQuantities", "Tuned", "build_plant", "certify",
+    "checked", "compare", "condition", "corners", "deploy", "design", "errors", "extrapolation",
+    "fit_outputs", "grid", "latin_hypercube", "load", "loo_errors", "plant_from_control",
+    "quality_of", "read_frequency_response", "read_run", "robustness", "samples_frame", "save",
+    "scaled_plant", "sobol", "synthesise_sections", "tune", "verify",
+}  # fmt: skip
+
+
+def documented(module: ModuleType) -> list[tuple[str, object]]:
+    """What of a package takes parameters: no enumerations and errors."""
+    found = ((name, getattr(module, name)) for name in module.__all__)
+    return [(name, each) for name, each in found if callable(each)
+            and not (isinstance(each, type) and issubclass(each, Exception | Enum))]  # fmt: skip
+
+
+@pytest.mark.parametrize("module", [ccd_casadi, surrogates])
+def test_sections_of_a_docstring_name_what_the_signature_does(module: ModuleType) -> None:
+    wrong = {}
+    for name, each in documented(module):
+        parsed = griffe.Docstring(inspect.getdoc(each) or "").parse("numpy", warnings=False)
+        sections = {section.kind.value: section.value for section in parsed}
+        signature = inspect.signature(each)
+        named = sorted(item.name for item in sections.get("parameters", []))
+        if named != sorted(signature.parameters):
+            wrong[name] = f"{named} instead of {sorted(signature.parameters)}"
+        elif inspect.isfunction(each) and signature.return_annotation is not None:
+            wrong |= {} if "returns" in sections else {name: "no returns"}
+    assert {name: wrong[name] for name in wrong if name not in PROSE} == {}
+    assert all(name in wrong for name in PROSE & set(module.__all__))
 
 
 @pytest.mark.parametrize("name", NAMES)

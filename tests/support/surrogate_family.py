@@ -1,10 +1,10 @@
-"""One smooth function of three inputs of different units, and a surrogate of each kind."""
+"""One smooth function of three inputs of different units, and a process of each kernel."""
 
 import casadi as ca
 import numpy as np
 import pytest
 
-from surrogates import Hyperparameters, Surrogate, condition, design, fit
+from surrogates import GaussianProcess, Hyperparameters, condition, design
 
 LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])
 SPAN = HIGH - LOW
@@ -25,7 +25,7 @@ T = design("lhs", LOW, HIGH, 60, seed=2)
 BOX = {"lower": LOW, "upper": HIGH}
 
 
-def process(kernel: str, gradients: bool) -> Surrogate:
+def process(kernel: str, gradients: bool) -> GaussianProcess:
     p = Hyperparameters(np.array([0.7, 0.5, 0.6]), 2.0, 1e-5, 1e-4)
     return condition(p, X, Y, **BOX, kernel=kernel, dY=DY if gradients else None)
 
@@ -35,14 +35,12 @@ MAKERS = {
     "rbf": lambda: process("rbf", False),
     "matern52+gradients": lambda: process("matern52", True),
     "rbf+gradients": lambda: process("rbf", True),
-    "polynomial": lambda: fit(X, Y, **BOX, kind="polynomial"),
-    "polynomial+gradients": lambda: fit(X, Y, DY, **BOX, kind="polynomial"),
 }
-MADE: dict[str, Surrogate] = {}
+MADE: dict[str, GaussianProcess] = {}
 MEMBERS = pytest.mark.parametrize("name", list(MAKERS))
 
 
-def member(name: str) -> Surrogate:
+def member(name: str) -> GaussianProcess:
     if name not in MADE:  # the same surrogate serves several tests; it is immutable
         MADE[name] = MAKERS[name]()
     return MADE[name]

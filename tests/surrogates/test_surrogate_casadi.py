@@ -191,15 +191,6 @@ def test_outputs_are_stacked_and_named() -> None:
     flat = fit([[0.0], [1.0]], [0.0, 1.0], lower=[0.0], upper=[1.0], starts=1)
     with pytest.raises(ValueError, match="share their inputs"):
         to_casadi([one, flat])
-    with pytest.raises(TypeError, match="no CasADi expression"):
-        to_casadi(Foreign())
-
-
-class Foreign:
-    """Has the attributes, but nobody registered an expression."""
-
-    lower = np.zeros(1)
-    upper = np.ones(1)
 
 
 def test_a_thousand_samples_of_eight_inputs_take_two_milliseconds() -> None:

@@ -106,8 +106,7 @@ def damage(document: dict, where: str, value: object) -> dict:
         ("surrogates", {"kind": "x"}, "damaged"),
         ("surrogates", 3, "damaged"),
         ("extra", [], "damaged"),
-        ("kind", "polynomial", "damaged"),
-        ("kind", "radial_basis", "is none of gaussian_process, polynomial; fit it again"),
+        ("kind", "polynomial", "is not gaussian_process; fit it again"),
         ("kind", ["x"], "damaged"),
         ("weights", None, "weights"),
         ("weights", [1.0, 2.0], "one weight"),
@@ -146,7 +145,7 @@ def test_failed_save_leaves_the_old_file_alone(
         save(process(seed=1), path, {"function": print})
     with pytest.raises(ValueError, match="not JSON compliant"):
         save(process(seed=1), path, {"value": float("nan")})
-    with pytest.raises(TypeError, match="cannot save a str"):
+    with pytest.raises(TypeError, match="dataclass"):
         save(["text"], path)  # type: ignore[list-item]
 
     def full(*_: object) -> None:

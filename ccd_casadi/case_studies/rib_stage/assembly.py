@@ -102,6 +102,24 @@ class Assembler:
             out[box, 6] += copies * (a.T @ wide)
         return out
 
+    def moved(self, sector: Sector, theta: Array, values: Array, vectors: Array) -> Array:
+        """(∂K - λ ∂M) φ of modes (n, k) with λ (k,): (n, θ k), reduced vectors."""
+        _, dc = self.coefficients(theta)
+        k, n = len(values), sector.fold.size
+        out = np.zeros((n + 1, len(theta) * k))
+        padded = np.vstack([vectors, np.zeros((1, k))])
+        for box, places, weight, copies in sector.maps:
+            block = self.blocks[box]
+            index = sector.fold.index[places]
+            b = weight[:, None] * padded[index]
+            K = cube_stiffness(block.orders, self.material) @ b
+            wide = (cube_mass(block.orders) @ b.reshape(len(block.nodes), -1)).reshape(b.shape)
+            d = dc[:, box]
+            found = np.tensordot(d[:, :6], K, 1) - d[:, 6, None, None] * (wide * values)
+            rows = copies * weight[:, None] * found.transpose(1, 0, 2).reshape(len(b), -1)
+            np.add.at(out, index, rows)
+        return out[:n]
+
     def slopes(self, sector: Sector, theta: Array, left: Array, right: Array) -> tuple[Array, ...]:
         """leftᵀ ∂K right and leftᵀ ∂M right, each (θ, a, b)."""
         _, dc = self.coefficients(theta)

@@ -158,6 +158,11 @@ def points_of(stage: RibStage) -> tuple[Point, ...]:
     return tuple(dict.fromkeys((*stage.actuator_points, *stage.sensor_points)))
 
 
+def rigid_part(stage: RibStage, theta: Array) -> tuple[Array, Array]:
+    """u_z of z, tip and tilt at the points (3, p), and (θ, 3, p)."""
+    return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)
+
+
 def assembled(
     stage: RibStage, lam: Array, u: Array, du: Array | None = None, dK: Array | None = None
 ) -> Mechanics:
@@ -210,7 +215,7 @@ def _displacements(
     count = len(theta) if derivatives else 0
     u, du = np.zeros((n, len(points))), np.zeros((count, n, len(points)))
     dK = np.zeros((count, n, n))
-    u[:3], slope = rigid_values(_rigid_function(stage.geometry, points), theta)
+    u[:3], slope = rigid_part(stage, theta)
     du[:, :3] = slope[:count]
 
     def fill(index: int) -> None:

@@ -1,7 +1,7 @@
 """The flexible modes of the stage at one θ, with exact derivatives of λ and of displacements.
 
 Each symmetry is an eigenproblem of its own, so the double frequencies of a square stage are
-simple here. With point masses that break the square, all symmetries form one direct sum.
+simple here. Point masses that break the square couple symmetries: these form a direct sum.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,13 @@ from ccd_casadi.case_studies.rib_stage.assembly import (
     build_assembler,
     build_sector,
 )
-from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Material, Point, PointMass
+from ccd_casadi.case_studies.rib_stage.geometry import (
+    Geometry,
+    Material,
+    Point,
+    PointMass,
+    has_square_symmetry,
+)
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder, build_mesh
 from ccd_casadi.case_studies.rib_stage.symmetry import (
     ALL,
@@ -67,7 +73,18 @@ class Group:
 
 
 SQUARE_GROUPS = tuple(Group((s,), ((s,), (AS,)) if s is SA else ((s,),)) for s in SOLVED)
-WHOLE = Group(ALL, (ALL,))
+
+
+def groups_of(geometry: Geometry) -> tuple[Group, ...]:
+    """The symmetries that point masses leave apart: each, those even and odd about an axis on which
+    all masses lie, or none. Modes of two groups cross where θ moves; those of one do not."""
+    if has_square_symmetry(geometry):
+        return SQUARE_GROUPS
+    for axis in ("y", "x"):
+        if not any(getattr(mass, axis) for mass in geometry.point_masses):
+            sides = (tuple(s for s in ALL if getattr(s, axis) == sign) for sign in (1, -1))
+            return tuple(Group(side, (side,)) for side in sides)
+    return (Group(ALL, (ALL,)),)
 
 
 @dataclass(frozen=True)

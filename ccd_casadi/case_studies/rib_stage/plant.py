@@ -6,6 +6,7 @@ from functools import partial
 
 import casadi as ca
 
+from ccd_casadi.case_studies.rib_stage import reduced
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE, FINE, MeshOrder
 from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, ROWS, RibStage
@@ -92,9 +93,17 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         inputs=count or len(stage.actuator_points),
         references={name: evaluator(variant) for name, variant in references.items()},
         values=evaluator(stage),
+        nearby=partial(_nearby, stage, evaluate, names) if reduced.applies(stage) else None,
         shapes=lambda theta, count: mode_shapes(stage, evaluate.own(theta), count),
         drawing=partial(_drawing, stage, evaluate),
     )
+
+
+def _nearby(
+    stage: RibStage, order: Ordered, names: Sequence[str], known: Sequence[Sequence[float]]
+) -> Ordered:
+    made = reduced.bases(stage, tuple(map(order.own, known)))
+    return Ordered(lambda theta, _: reduced.mechanics(stage, made, theta), NAMES, names)
 
 
 def _drawing(stage: RibStage, order: Ordered, thetas: Mapping[str, Sequence[float]]) -> Figure:

@@ -8,13 +8,13 @@ from ccd_casadi.case_studies.rib_stage.geometry import Geometry, has_square_symm
 from ccd_casadi.case_studies.rib_stage.modes import (
     EXTRA,
     SHIFT,
-    SQUARE_GROUPS,
-    WHOLE,
     Discretisation,
     Group,
     Spectrum,
+    groups_of,
     spectrum,
 )
+from ccd_casadi.case_studies.rib_stage.symmetry import AS, SA
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.threads import side_by_side
 
@@ -42,10 +42,7 @@ class ModeCount:
 
     def of(self, group: Group) -> int:
         """Modes solved of a group of symmetries."""
-        if group is WHOLE:
-            return self.total
-        name = group.solved[0].name
-        return int(getattr(self, "tilt" if name == "SA" else name))
+        return sum(getattr(self, "tilt" if s in (SA, AS) else s.name) for s in group.solved)
 
 
 TWENTY = ModeCount(A1=4, B1=2, B2=4, A2=2, tilt=4)  # to see spill-over
@@ -78,17 +75,18 @@ class ModeSet:
 def solve_modes(
     disc: Discretisation, geometry: Geometry, theta: Array, count: ModeCount, by_frequency: bool
 ) -> ModeSet:
-    """Solve every symmetry (or their direct sum) at θ and choose the modes of the model.
+    """Solve every symmetry (or direct sums of them) at θ and choose the modes of the model.
 
-    By symmetry the order is A1, B1, B2, A2, then SA and AS in turns, lowest first in each: it
-    does not change where frequencies of different symmetries cross.
+    By symmetry the order is A1, B1, B2, A2, then SA and AS in turns, or the even and the odd ones
+    about an axis, lowest first in each: it does not change where frequencies of different
+    symmetries cross.
     """
     square = has_square_symmetry(geometry)
     wanted = {}
-    for group in SQUARE_GROUPS if square else (WHOLE,):
+    for group in groups_of(geometry):
         number = count.of(group)
-        if square and by_frequency:
-            number = max(count.total // 2, 1)  # no symmetry has more than half of the lowest
+        if by_frequency:  # no symmetry of the square has more than half of the lowest
+            number = max(count.total // 2, 1) if square else count.total
         if number:
             wanted[group] = number
     boxes = disc.assembler.box_matrices(theta, SHIFT)

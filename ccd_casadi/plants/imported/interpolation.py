@@ -1,27 +1,25 @@
 """A modal table as a smooth function of θ, with exact derivatives and the error of rows left out.
 
-In the frame of `frames` the entries of ln K, ln D, B and C are interpolated one by one (by
-polynomials, or Gaussian processes where these predict left-out rows better). The matrix
-logarithm makes K = exp(ln K) positive definite at every θ, and frequencies, which follow powers
-of lengths and masses, nearly linear. Source: Arsigny et al., SIAM J. Matrix Anal. Appl. 29 (2007),
-for log-Euclidean interpolation; the derivative of exp is that of Daleckii and Krein.
+In the frame of `frames` the entries of ln K, ln D, B and C are interpolated one by one
+(`entries`). The matrix logarithm makes K = exp(ln K) positive definite at every θ, and frequencies,
+which follow powers of lengths and masses, nearly linear. Source: Arsigny et al., SIAM J. Matrix
+Anal. Appl. 29 (2007), for log-Euclidean interpolation; the derivative of exp is that of Daleckii
+and Krein.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import comb
 
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.plants.imported.entries import Entries, fit_entries
 from ccd_casadi.plants.imported.frames import Frame, frames
 from ccd_casadi.plants.imported.modal_table import ModalTable
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-from surrogates import Kind, Surrogate, SurrogateFitError, fit, to_casadi
 
-GOOD = 1e-3  # of an entry's range: below it a polynomial is not compared with a process
 DAMPED = 0.1  # responses are compared at s = (0.1 + j) ω: resonances that move do not drown it
 FREQUENCIES = 120
 
@@ -39,7 +37,7 @@ class InterpolatedModes:
     """θ -> Mechanics (M = I) between the samples of a modal table; `left_out` is its error.
 
     Frequencies below `rigid_below` (rad/s) are rigid-body modes. Raises PlantError where samples
-    differ in their number of these, or are too few for a polynomial of degree 1.
+    differ in their number of these, or are too few.
     """
 
     def __init__(self, table: ModalTable, rigid_below: float) -> None:
@@ -57,9 +55,9 @@ class InterpolatedModes:
         self.ratio = _common_ratio(table, self.rigid)
         tried = [self._fitted(frame) for frame in frames(table, self.rigid)]
         best = min(range(len(tried)), key=lambda i: tried[i][2].response)
-        self.frame, members, self.left_out = tried[best]
+        self.frame, entries, self.left_out = tried[best]
         theta = ca.MX.sym("theta", len(table.names))
-        y = to_casadi(members, std=False)(theta)
+        y = entries.at(theta)
         self._entries = ca.Function("entries", [theta], [y, ca.jacobian(y, theta)])
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
@@ -95,12 +93,11 @@ class InterpolatedModes:
         distance = np.abs((self.table.theta - np.asarray(theta)) / width).max(axis=1)
         return int(distance.argmin()), float(distance.min())
 
-    def _fitted(self, frame: Frame) -> tuple[Frame, list[Surrogate], LeftOut]:
+    def _fitted(self, frame: Frame) -> tuple[Frame, Entries, LeftOut]:
         table = self.table
         Y = np.array([self._vector(s, frame) for s in range(len(table.theta))])
-        members = [fit_entry(table.theta, column) for column in Y.T]
-        predicted = Y - np.array([member.left_out for member in members]).T
-        return frame, members, self._left_out(Y, predicted, frame)
+        entries = fit_entries(table.theta, Y)
+        return frame, entries, self._left_out(Y, Y - entries.left_out, frame)
 
     def _pairs(self, frame: Frame) -> list[tuple[int, int]]:
         """Entries of ln K that are not zero in the frame, upper triangle."""
@@ -189,20 +186,3 @@ def _common_ratio(table: ModalTable, rigid: int) -> float | None:
     if damping.size and damping.min() <= 0.0:
         raise PlantError("a flexible mode has no damping; give a damping ratio above 0")
     return float(damping.flat[0]) if damping.size and np.ptp(damping) == 0.0 else None
-
-
-def fit_entry(theta: Array, values: Array) -> Surrogate:
-    """One entry over θ, by a polynomial, or by a process where that predicts better.
-
-    A process chooses its length scales: on few samples the best left-out error is luck.
-    """
-    bounds = {"lower": theta.min(axis=0), "upper": theta.max(axis=0)}
-    try:
-        best: Surrogate = fit(theta, values, kind=Kind.POLYNOMIAL, **bounds)
-        enough = len(theta) >= 2 * comb(theta.shape[1] + 3, 3)
-        if enough and best.loo.rms > GOOD * np.ptp(values) > 0.0:
-            other = fit(theta, values, noise=0.0, starts=2, **bounds)
-            best = min(best, other, key=lambda member: member.loo.rms)
-    except (SurrogateFitError, ValueError) as error:
-        raise PlantError(f"the samples cannot be interpolated: {error}; add samples") from error
-    return best

@@ -8,12 +8,12 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.imported.interpolation import InterpolatedModes, fit_entry, row_of
+from ccd_casadi.plants.imported.entries import fit_entries
+from ccd_casadi.plants.imported.interpolation import InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.errors import PlantError
-from surrogates import to_casadi
 
 NEAREST = "the nearest sample as it stands"
 
@@ -63,10 +63,10 @@ def plant_of_table(
         modes = InterpolatedModes(table, 2.0 * np.pi * rigid_below_hz)
     except PlantError as error:
         raise PlantError(f"{source}: {error}") from error
-    scalars = [fit_entry(table.theta, row) for row in (table.cost, *table.constraints.T)]
+    scalars = fit_entries(table.theta, np.column_stack([table.cost, table.constraints]))
     theta = ca.MX.sym("theta", len(names))
-    both = to_casadi(scalars, std=False)(theta)
-    lam = both[1:] if len(scalars) > 1 else ca.MX(0, 1)
+    both = scalars.at(theta)
+    lam = both[1:] if both.numel() > 1 else ca.MX(0, 1)
     return Plant(
         names=tuple(names),
         constraint_names=table.constraint_names,

@@ -1,0 +1,104 @@
+"""What samples of a fixed structure tell those near by: where to begin, and what to expect there.
+
+A climb ends in one of several local optima, and which one may change from θ to θ. Where θ_i and θ_j
+have controllers of one branch of v(θ), to third order of what lies between them,
+
+    v_j = v_i + ½ (∇v_i + ∇v_j)·(θ_j - θ_i).
+
+So a sample that falls short of this is worth a climb from κ_i, and a new θ begins from what
+promises most there too.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ccd_casadi.inner_problem.objective import objective, objective_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_search import joined
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+
+WORTH = 1e-3  # relative: what another branch has to promise, and what a verdict counts as better
+MORE = 2  # neighbours, beside one for each parameter
+NEAR = 0.1  # of the box: so near the best θ a surrogate has to be of one branch
+TRIES = 2  # climbs from neighbours, of a sample, that may be in vain
+
+Theta = tuple[float, ...]
+
+
+def begun(
+    problem: CoDesignProblem, known: Iterable[BandwidthSample], theta: Theta
+) -> CoDesignProblem:
+    """The problem with the neighbour's controller that promises most at a new θ as an anchor."""
+    near = _nearest(problem, _usable(known), theta)
+    if not near:
+        return problem
+
+    def promise(one: BandwidthSample) -> float:
+        return problem.figure.gain(_branch(one, theta, one.gradient), near[0].value)
+
+    return joined(problem, np.array(max(near, key=promise).kappa), ())
+
+
+def alone(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
+    """The problem whose value is that of the climb from one controller, κ in SI."""
+    sections = sections_of_problem(problem).with_anchor(tuple(map(float, kappa)), 1)
+    return replace(problem, controller=replace(sections, starts=0))
+
+
+def promised(
+    problem: CoDesignProblem,
+    known: Iterable[BandwidthSample],
+    tried: Mapping[Theta, Sequence[Theta]],
+) -> dict[Theta, Theta]:
+    """κ to climb from at each θ whose sample falls short of what a neighbour promises.
+
+    Only where that counts: near the best θ, or where it would be a better one. `tried`: the κ that
+    a θ was climbed from in vain.
+    """
+    samples = _usable(known)
+    found: dict[Theta, tuple[float, Theta]] = {}
+    best = min(samples, key=lambda one: objective_of(problem, one), default=None)
+    for there in samples:
+        assert best is not None
+        theta, before = there.theta, tried.get(there.theta, ())
+        for one in _nearest(problem, samples, theta) if len(before) < TRIES else []:
+            value = _branch(one, theta, there.gradient)
+            counts = float(_away(problem, best.theta, theta)) <= NEAR
+            counts = counts or objective(problem, theta, value) < objective_of(problem, best)
+            gain = problem.figure.gain(value, there.value) if value > 0.0 else 0.0
+            if counts and one.kappa not in before and gain > found.get(theta, (WORTH, ()))[0]:
+                found[theta] = (gain, one.kappa)
+    return {theta: kappa for theta, (_, kappa) in found.items()}
+
+
+def _usable(known: Iterable[BandwidthSample]) -> list[BandwidthSample]:
+    """Those with a controller of fixed structure, and slopes."""
+    return [one for one in known if one.kappa and np.isfinite(one.gradient).all()]
+
+
+def _branch(one: BandwidthSample, theta: Theta, gradient: Theta) -> float:
+    """The value that a sample's branch has at another θ, where its gradient is this one."""
+    slope = 0.5 * np.add(one.gradient, gradient)
+    return one.value + float(np.subtract(theta, one.theta) @ slope)
+
+
+def _nearest(
+    problem: CoDesignProblem, samples: Sequence[BandwidthSample], theta: Theta
+) -> list[BandwidthSample]:
+    """The nearest samples at other θ."""
+    others = [one for one in samples if one.theta != theta]
+    if not others:
+        return []
+    away = _away(problem, [one.theta for one in others], theta)
+    return [others[i] for i in np.argsort(away, kind="stable")[: len(theta) + MORE]]
+
+
+def _away(problem: CoDesignProblem, thetas: Theta | Sequence[Theta], theta: Theta) -> Array:
+    """How far θ lie from one, in shares of the box."""
+    return np.asarray(
+        np.abs(np.subtract(thetas, theta) / np.subtract(problem.upper, problem.lower)).max(-1)
+    )

@@ -1,0 +1,108 @@
+"""The rib stage by a reduced basis, against its finite elements."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ccd_casadi.case_studies.rib_stage import reduced
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, PointMass
+from ccd_casadi.case_studies.rib_stage.mesh import COARSE
+from ccd_casadi.case_studies.rib_stage.model import RibStage
+from ccd_casadi.case_studies.rib_stage.plant import plant_of_stage
+from ccd_casadi.plants.plant import Mechanics, near
+from ccd_casadi.support.arrays import Array
+
+HERE = np.array([1.2e-3, 3.3e-3, 5e-3, 5e-3, 14e-3, 74e-3])
+STEP = np.array([1e-4, 1e-4, 3e-4, -3e-4, 8e-4, 8e-4])
+BARE = RibStage(order=COARSE)
+LOADED = replace(BARE, geometry=Geometry(point_masses=(PointMass(0.03, 0.0, 0.05),)))
+
+
+def reduced_at(stage: RibStage, known: Sequence[Array], theta: Array) -> Mechanics:
+    """By what is known."""
+    made = reduced.bases(stage, tuple(tuple(place.tolist()) for place in known))
+    return reduced.mechanics(stage, made, tuple(theta.tolist()))
+
+
+def frequencies(system: Mechanics) -> Array:
+    """Of the flexible modes, in rad/s."""
+    return np.asarray(np.sqrt(np.diag(system.K)[3:]))
+
+
+def strengths(system: Mechanics) -> Array:
+    """c bᵀ of every mode (n, outputs, inputs), which no sign of a mode moves."""
+    return np.asarray(system.C.T[:, :, None] * system.B[:, None, :])
+
+
+@pytest.mark.parametrize(("stage", "within"), [(BARE, 1e-7), (LOADED, 1e-3)])
+def test_at_a_known_theta_it_has_the_modes_of_the_elements(stage: RibStage, within: float) -> None:
+    known = [HERE, HERE + STEP]
+    for theta in known:
+        told, true = (reduced_at(stage, known, theta), stage.mechanics(theta))
+        np.testing.assert_allclose(frequencies(told), frequencies(true), rtol=within)
+        size = np.abs(strengths(true)).max()
+        np.testing.assert_allclose(strengths(told), strengths(true), atol=10.0 * within * size)
+
+
+def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
+    known = [HERE]
+
+    def missed(share: float) -> float:
+        theta = HERE + share * STEP
+        told, true = (reduced_at(BARE, known, theta), BARE.mechanics(theta))
+        return float(np.abs(frequencies(told) / frequencies(true) - 1.0).max())
+
+    assert missed(1.0) < 1e-2
+    assert missed(0.5) < 0.3 * missed(1.0)
+    more = reduced_at(BARE, [*known, HERE + STEP], HERE + 0.5 * STEP)
+    true = frequencies(BARE.mechanics(tuple(HERE + 0.5 * STEP)))
+    assert np.abs(frequencies(more) / true - 1.0).max() < 0.1 * missed(0.5)
+
+
+@pytest.mark.parametrize("stage", [BARE, LOADED])
+def test_its_derivatives_are_those_of_the_small_problem(stage: RibStage) -> None:
+    known = [HERE, HERE + STEP, HERE - STEP]
+    here, e = HERE + 0.3 * STEP, 1e-4
+    told = reduced_at(stage, known, here)
+    up, down = (reduced_at(stage, known, here + s * e * STEP) for s in (1.0, -1.0))
+    slope = np.einsum("t,tii->i", STEP, told.derivatives[2])
+    moved = (np.diag(up.K) - np.diag(down.K)) / (2.0 * e)
+    np.testing.assert_allclose(slope, moved, atol=1e-3 * np.abs(moved).max())
+    dB, dC = (np.tensordot(STEP, told.derivatives[k], 1) for k in (3, 4))
+    slope = dC.T[:, :, None] * told.B[:, None, :] + told.C.T[:, :, None] * dB[:, None, :]
+    moved = (strengths(up) - strengths(down)) / (2.0 * e)
+    # What masses bend of higher modes turns with θ; its slope is that of modes that stay.
+    within = 0.1 if stage is LOADED else 1e-4
+    np.testing.assert_allclose(slope, moved, atol=within * np.abs(moved).max())
+
+
+def test_a_plant_evaluates_it_in_its_own_order_of_parameters() -> None:
+    names = ("H", "h", "t_o", "t_i", "t_c", "x_i")
+    plant, place = plant_of_stage(BARE, names), [4, 0, 1, 2, 3, 5]
+    there = HERE[place] + 0.1 * STEP[place]
+    told, true = near(plant, [HERE[place]], HERE[place])(there), plant.evaluate(there)
+    np.testing.assert_allclose(frequencies(told), frequencies(true), rtol=1e-3)
+    np.testing.assert_allclose(
+        told.derivatives[2], true.derivatives[2], atol=0.1 * np.abs(true.derivatives[2]).max()
+    )
+
+
+def test_modes_that_may_cross_have_places_of_their_own() -> None:
+    """A payload on the axis y = 0 leaves even modes and odd ones: as many of each, lowest first."""
+    for found in (LOADED.mechanics(tuple(HERE)), reduced_at(LOADED, [HERE], HERE)):
+        mirrored = found.B[3:, [3, 2, 1, 0]]  # the corners (a, a), (-a, a), (-a, -a), (a, -a)
+        size = 1e-6 * np.abs(found.B).max()
+        np.testing.assert_allclose(mirrored[:5], found.B[3:8], atol=size)
+        np.testing.assert_allclose(mirrored[5:], -found.B[8:], atol=size)
+        for part in np.split(frequencies(found), 2):
+            np.testing.assert_array_equal(part, np.sort(part))
+
+
+def test_where_the_order_of_modes_is_not_kept_it_does_not_apply() -> None:
+    middle = Geometry(point_masses=(PointMass(0.0, 0.0, 0.05),))
+    assert reduced.applies(BARE)
+    assert reduced.applies(LOADED)
+    assert not reduced.applies(replace(BARE, geometry=middle))
+    assert not reduced.applies(replace(BARE, truncation="frequency"))

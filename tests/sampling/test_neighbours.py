@@ -1,0 +1,101 @@
+"""A better controller that is found at one θ is one for its neighbours too."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import few, problem
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ccd_casadi.codesign.theta_direct import pieces_from
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.sampling import sampler as module
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
+
+GOOD, POOR = (1.0,), (2.0,)
+SLOPE = 40.0
+
+
+def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
+    """A unit of work whose climbs lose the better controller at a cliff, but from its own κ."""
+
+    def unit(task: tuple[CoDesignProblem, str, str, tuple[float, ...]]) -> tuple[list, tuple]:
+        case, _, key, theta = task
+        sections, z = case.controller, (theta[0] - 55.0) / 15.0
+        assert isinstance(sections, SectionsProblem)
+        known = {*sections.anchors, *sections.error_anchors}
+        kappa = GOOD if GOOD in known or z < cliff else POOR
+        value, slope = 250.0 + 10.0 * z, 10.0
+        if kappa == GOOD:
+            value, slope = 300.0 + SLOPE * z - 40.0 * z**2, SLOPE - 80.0 * z
+        payload: dict[str, Any] = {
+            "bandwidth": value, "gradient": [slope / 15.0, 0.0], "kappa": list(kappa),
+            "active": [], "shortfall": "", "syntheses": 1,
+        }  # fmt: skip
+        if case.controller.figure.key == "move_time":  # less is better, and the slope is of that
+            payload |= {"error": 1.0 / value, "gradient": [-slope / 15.0 / value**2, 0.0]}
+        asked.append((theta, kappa))
+        return [], (key, theta, payload)
+
+    return unit
+
+
+def two_branches(**changes: object) -> CoDesignProblem:
+    sections = replace(SectionsProblem(anchors=(POOR,)), **changes)  # type: ignore[arg-type]
+    return problem(controller=sections, w1=0.0, w2=-1.0 if "minimise" not in changes else 1e6)
+
+
+@few(max_examples=10)
+@given(st.floats(0.1, 0.3))
+def test_a_cliff_is_passed_by_its_controller(cliff: float) -> None:
+    asked: list[tuple] = []
+    with pytest.MonkeyPatch.context() as patch, SampleStore(":memory:") as store:
+        patch.setattr(module, "inner_unit", branches(cliff, asked))
+        sampler = Sampler(two_branches(), store, Workers(1))
+        best = pieces_from(sampler, sampler.bandwidths(np.array([55.0, 60.0]))[0], 1e-9)
+    assert best.theta[0] == pytest.approx(55.0 + 15.0 * SLOPE / 80.0, abs=0.02)
+    assert best.kappa == GOOD
+    assert len(asked) < 60
+
+
+@pytest.mark.parametrize("changes", [{}, {"minimise": "move_time"}])
+def test_what_falls_short_of_its_neighbours_is_climbed_from_them(
+    changes: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those near the best end are of its branch, and a run from the store repeats itself."""
+    asked: list[tuple] = []
+    monkeypatch.setattr(module, "inner_unit", branches(0.3, asked))
+    thetas = np.array([[55.0 + 15.0 * z, 60.0 + z] for z in np.linspace(0.0, 1.0, 11)])
+    runs = []
+    for _ in range(2):
+        with SampleStore(tmp_path / "s.sqlite") as store:
+            sampler = Sampler(two_branches(**changes), store, Workers(1))
+            sampler.bandwidths(thetas)
+            sampler.bandwidths(thetas[3] + 0.1)
+            runs.append((list(sampler.solved.values()), sampler.syntheses))
+    at = {round((one.theta[0] - 55.0) / 15.0, 3): one.kappa for one in runs[0][0]}
+    assert {kappa for z, kappa in at.items() if 0.35 < z < 0.65} == {GOOD}
+    assert (thetas[5][0], POOR) in [(theta[0], kappa) for theta, kappa in asked[: len(thetas)]]
+    assert len(asked) < 2 * len(thetas)
+    assert runs[1] == runs[0]
+
+
+def test_a_controller_given_for_a_theta_counts_where_it_is_better(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "inner_unit", branches(-1.0, []))
+    with SampleStore(":memory:") as store:
+        sampler = Sampler(two_branches(), store, Workers(1))
+        theta = (60.0, 60.0)
+        poor = sampler.bandwidths(np.array(theta))[0]
+        assert sampler.climbed(theta, POOR) == poor
+        good = sampler.climbed(theta, GOOD)
+    assert (poor.kappa, good.kappa) == (POOR, GOOD)
+    assert sampler.latest([poor]) == [good]
