@@ -1,8 +1,9 @@
 """A multi-start search: local searches, by successive halving, to distinct local optima.
 
 All climb some steps, the better half goes on, and so forth. A search stops early where its steps no
-longer help, and where it gains so little that it cannot overtake. Each climb is a function of its
-start alone, so that any number of processes finds the same.
+longer help, where it has come to a controller that a better one has already been at, and where it
+gains so little that it cannot overtake. Each climb is a function of its start alone, so that any
+number of processes finds the same.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
+MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
 LOWERED = 6  # steps at most to the bandwidth of a controller
 NEWTON = 8  # and to that of one that is known
@@ -41,7 +43,7 @@ class LocalOptimum:
 class Runner:
     """One search: where it is, the radius, what its last round gained, loops looked at in all.
 
-    `done`: its steps no longer help. `running`: it goes on.
+    `done`: its steps no longer help. `running`: it goes on. `count`: searches that it stands for.
     """
 
     point: Point
@@ -50,6 +52,7 @@ class Runner:
     evaluations: int = 1
     done: bool = False
     running: bool = True
+    count: int = 1
 
     @property
     def merit(self) -> float:
@@ -83,7 +86,8 @@ def run_race(
             break
         others = [runner for runner in field if not runner.running]
         field = others + _climbed(problem, running, workers or Workers(1))
-        field = _going_on(sorted(field, key=lambda runner: -runner.merit), turn)
+        field = _merged(problem, sorted(field, key=lambda runner: -runner.merit))
+        field = _going_on(field, turn)
         lead = field[0].point
         going = sum(runner.running for runner in field)
         tell(f"{np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
@@ -155,10 +159,10 @@ def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOpt
     for end in sorted(good, key=lambda end: -end.point.tau):
         value = float(np.exp(end.point.tau)) * P.omega_0
         if found and value >= found[-1].bandwidth * (1.0 - SAME):
-            found[-1] = replace(found[-1], count=found[-1].count + 1)
+            found[-1] = replace(found[-1], count=found[-1].count + end.count)
         else:
             kappa = problem.structure.in_units(end.point.kappa, P.omega_0, P.force)
-            found.append(LocalOptimum(value, 1, tuple(map(float, kappa))))
+            found.append(LocalOptimum(value, end.count, tuple(map(float, kappa))))
     return tuple(found)
 
 
@@ -171,13 +175,29 @@ def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool) -> 
         end = ends[i]
         spent = runner.evaluations + end.evaluations
         gained = end.point.merit() - runner.merit
-        found.append(Runner(end.point, end.radius, gained, spent, end.done, not end.done))
+        found.append(Runner(end.point, end.radius, gained, spent, end.done, not end.done,
+                            runner.count))  # fmt: skip
     return found
 
 
 def _climb(task: tuple[int, LoopProblem, Point, float]) -> tuple[int, Ascent]:
     index, problem, point, radius = task
     return index, ascend(problem, point, iterations=STEPS, radius=radius)
+
+
+def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
+    """The field, best first, without searches that are where a better one is."""
+    kept: list[Runner] = []
+    for runner in field:
+        for i, other in enumerate(kept):
+            near = abs(runner.point.tau - other.point.tau) <= MERGED
+            if near and np.abs(runner.point.kappa - other.point.kappa).max() <= MERGED:
+                spent = other.evaluations + runner.evaluations
+                kept[i] = replace(other, count=other.count + runner.count, evaluations=spent)
+                break
+        else:
+            kept.append(runner)
+    return kept
 
 
 def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
