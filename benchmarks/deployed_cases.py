@@ -26,7 +26,7 @@ import numpy as np
 
 SHIFTS = 61  # plants over the range, and as many at random
 SLACK = 2e-4  # relative: grids of frequencies here and between plants there
-WAY = ["--method", "foh", "--lead", "on", "--quiet"]  # one way to discretise, of eight
+WAY = ["--quiet"]
 MODEL = '''
 import casadi as ca
 

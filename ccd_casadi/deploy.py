@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ccd_casadi.deployment.timing import Discretisation, Timing
+from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
@@ -16,8 +16,6 @@ from ccd_casadi.support.terminal import say
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
     from ccd_casadi.deployment.outcome import Deployment
-
-LEADS = {"auto": None, "on": True, "off": False}
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -49,16 +47,12 @@ def command(options: argparse.Namespace) -> ExitCode:
     if folder.resolve() == options.run.resolve():
         words = "would overwrite the run's own controller and report"
         raise UserError(f"--out {folder}: {words}; choose another folder")
-    method = None if options.method == "auto" else Discretisation(options.method)
-    timing = Timing(
-        options.rate_hz, options.delay, options.delay_samples, method, LEADS[options.lead]
-    )
-    count = (1 if method else len(Discretisation)) * (2 if timing.lead is None else 1)
+    timing = Timing(options.rate_hz, options.delay, options.delay_samples, options.lead == "on")
     channels = len(finished.plant.C) if finished.plant.channels else 1
     moved = None
-    if kind_of(finished.problem).as_designed:  # one way where a rate was given
-        channels, count = 0, 1 if finished.problem.sampling else count
-    steps = channels + count + 1 + (options.saturation is not None)
+    if kind_of(finished.problem).as_designed:
+        channels = 0
+    steps = channels + 2 + (options.saturation is not None)
     with Progress(steps, "deploying", options.quiet) as bar:
         found = deploy(
             finished, timing, saturation=options.saturation,
@@ -118,7 +112,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
         *([("decision", advice(run.result))] if advice(run.result) else []),
         ("order", order_words(run, found)),
         ("rate", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
-                 f"{found.conversion.label}; needed {needed}"),
+                 f"{found.conversion.value}; needed {needed}"),
         *((name.lower(), f"{value}, {words}") for name, value, words in figure_rows(run, found)),
     ]  # fmt: skip
     if not found.stable:
@@ -137,14 +131,11 @@ def _shortfall(run: "FinishedRun", found: "Deployment") -> str:
     """What is not kept, and at which rate it would be."""
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"
-    rate = f"{found.rate_hz:.6g} Hz with {found.conversion.label}"
-    ways = "" if len(found.trials) == 1 else f", the best of {len(found.trials)} ways,"
-    words = f"{rate}{ways} is not enough: {found.shortfalls[0]}"
-    possible = [t for t in found.trials if t.needed_hz is not None]
-    if not possible:
+    rate = f"{found.rate_hz:.6g} Hz with {found.conversion.value}"
+    words = f"{rate} is not enough: {found.shortfalls[0]}"
+    if found.needed_hz is None:
         return f"{words}; with this delay no rate is; shorten the delay"
-    least = min(possible, key=lambda t: t.needed_hz or 0.0)
-    return f"{words}; {least.needed_hz:.6g} Hz is needed ({least.conversion.label})"
+    return f"{words}; {found.needed_hz:.6g} Hz is needed"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -166,12 +157,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="the same time in sampling periods (default: 1)",
     )  # fmt: skip
     arguments.add_argument(
-        "--method", choices=["auto", *Discretisation], default="auto",
-        help="discretisation (default: the one that needs the lowest rate)",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--lead", choices=list(LEADS), default="auto",
-        help="a lead that compensates hold and delay (default: if it lowers the rate)",
+        "--lead", choices=["on", "off"], default="on",
+        help="a lead that compensates hold and delay (default: on, which lowers the rate)",
     )  # fmt: skip
     arguments.add_argument(
         "--unverified", action="store_true",

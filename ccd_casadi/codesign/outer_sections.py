@@ -18,13 +18,13 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.cases.run_folder import read_json, with_function
+from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import together, with_members
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
@@ -38,6 +38,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_
 from ccd_casadi.inner_problem.sections_plant_set import (
     plants_of,
     sections_of_problem,
+    structure_of,
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
@@ -182,12 +183,17 @@ class SectionsOuter(ThetaOuter):
         return SectionsOuter(sampler.of(problem), words if lost else "")
 
     def continued(self, folder: Path, seed: int) -> "SectionsOuter":
-        """With the anchors and the plant set of a run, or those of a search where it has none."""
+        """With the anchors, plants and controller of a run; those of a search where it has none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
             return self.prepared(seed)
-        problem = with_function(path, sampler.problem, read_json(path))
-        return SectionsOuter(sampler.of(problem)).prepared(seed)
+        result = read_json(path)
+        problem = with_function(path, sampler.problem, result)
+        outer = SectionsOuter(sampler.of(problem)).prepared(seed)
+        if (folder / "controller.json").exists():
+            theta = [float(result["theta"][name]) for name in problem.names]
+            outer.sampler.climbed(theta, sections_kappa(folder, structure_of(problem)))
+        return outer
 
     def ended(self, x: Array) -> SectionsEnd:
         theta = self.theta_of(x)
@@ -223,7 +229,7 @@ class SectionsOuter(ThetaOuter):
         raced = raced_at(asked, best) if end.raced is None else end.raced
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
+        kkt = theta_kkt(problem, best, asked, end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
         drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
@@ -285,11 +291,10 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
     near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
-    truth = TrueBandwidth(sampler, "polishing")
-    candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
+    candidates = sampler.bandwidths(np.unique([near, theta], axis=0), "polishing")
     best = min(candidates, key=lambda s: objective_of(problem, s))
     if theta_kkt(problem, best).stationarity > STATIONARY:
-        best = pieces_from(truth, best, LEVEL)
+        best = pieces_from(sampler, best, LEVEL)
     return sampler, best
 
 

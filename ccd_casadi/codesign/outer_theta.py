@@ -16,7 +16,7 @@ from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.theta_direct import FAR, SETTLED, TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_direct import FAR, SETTLED, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.optim.pieces import FIRST
@@ -52,19 +52,19 @@ class ThetaOuter(Outer, ABC):
 
     def ended(self, x: Array) -> End:
         """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
-        problem, truth = self.problem, TrueBandwidth(self.sampler, "polishing")
-        with self.sampler.spent.on("polish"):
-            best = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
-        kkt = theta_kkt(problem, best, truth)
+        problem, sampler = self.problem, self.sampler
+        with sampler.spent.on("polish"):
+            best = sampler.bandwidths(self.theta_of(x), "polishing")[0]
+            best = pieces_from(sampler, best, SETTLED)
+        kkt = theta_kkt(problem, best, sampler)
         return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
 
     def solved_from(
         self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem = self.problem
-        truth = TrueBandwidth(self.sampler, "local solve")
         first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)
-        best = pieces_from(truth, sample, least, first)
+        best = pieces_from(self.sampler, sample, least, first)
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None

@@ -22,7 +22,7 @@ from ccd_casadi.codesign.outer_problem import (
     unmet_constraint,
 )
 from ccd_casadi.codesign.outer_sections import SectionsOuter
-from ccd_casadi.codesign.theta_direct import FAR, TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_direct import FAR, pieces_from
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.inner_problem.objective import objective_of
@@ -86,11 +86,7 @@ class ListedSections:
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
             return _nothing("no theta within the constraints was found")
-        carried_on = carried(known, problem, self.members)
-        found = _climbed(sampler.of(with_sections(carried_on, starts=0)), theta)
-        if np.isfinite(found.result.get("objective", np.inf)):
-            return found
-        return _climbed(sampler.of(with_sections(carried_on, anchors=())), theta)
+        return _climbed(sampler.of(carried(known, problem, self.members)), theta)
 
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
@@ -104,8 +100,8 @@ class ListedSections:
 
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by."""
-    truth = TrueBandwidth(sampler, "near by")
-    return _found(sampler.problem, pieces_from(truth, truth.at(theta), SETTLED, FAR))
+    best = sampler.bandwidths(theta, "near by")[0]
+    return _found(sampler.problem, pieces_from(sampler, best, SETTLED, FAR))
 
 
 def carried(

@@ -15,42 +15,21 @@ FOLLOWED = 3  # descents at most, each with the better controllers that the one 
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 
-class TrueBandwidth:
-    """θ -> ω_b*(θ) in rad/s with its envelope gradient, from a sampler."""
-
-    def __init__(self, sampler: Sampler, label: str) -> None:
-        self.sampler, self.label = sampler, label
-        self.asked: dict[tuple[float, ...], BandwidthSample] = {}  # as they were when asked for
-
-    def at(self, theta: Array) -> BandwidthSample:
-        """The sample at θ; repeated points cost nothing."""
-        return self.all_at(np.atleast_2d(theta))[0]
-
-    def all_at(self, thetas: Array) -> list[BandwidthSample]:
-        """Those at several θ (k, n), over the workers."""
-        samples = self.sampler.bandwidths(thetas, self.label)
-        self.asked |= {sample.theta: sample for sample in samples}
-        return samples
-
-    @property
-    def known(self) -> list[BandwidthSample]:
-        """What is known by now of all that were asked for."""
-        return self.sampler.latest(list(self.asked.values()))
-
-
 def pieces_from(
-    truth: TrueBandwidth, best: BandwidthSample, settled: float, first: float = FIRST
+    sampler: Sampler, best: BandwidthSample, settled: float, first: float = FIRST
 ) -> BandwidthSample:
-    """From a sample, and what was asked for near it, to where the pieces of J promise no more.
+    """From a sample to where the pieces of J promise no more, with what is known near by.
 
     Again from the best where a better controller was found on the way for what had been known.
     """
-    problem = truth.sampler.problem
+    problem, asked = sampler.problem, [best]
     lower, upper = box(problem)
     width = upper - lower
 
     def at(z: Array) -> Local | None:
-        return local(truth.at(np.clip(lower + width * z, lower, upper)))
+        theta = np.clip(lower + width * z, lower, upper)
+        asked.extend(sampler.bandwidths(theta, "local solve"))
+        return local(asked[-1])
 
     def local(sample: BandwidthSample) -> Local | None:
         J, gradient = objective_of(problem, sample), objective_gradient(problem, sample)
@@ -64,14 +43,12 @@ def pieces_from(
 
     steps = STEPS * len(lower)
     for _ in range(FOLLOWED):
-        start, raised = local(best), truth.sampler.raised
+        start, raised = local(best), sampler.raised
         if start is None:
             break
-        others = [found for found in map(local, truth.known) if found is not None]
+        others = [found for found in map(local, sampler.solved.values()) if found is not None]
         descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
-        # where nothing is promised nothing was asked for
-        found = (*truth.sampler.latest([best]), *truth.known)
-        best = min(found, key=lambda sample: objective_of(problem, sample))
-        if truth.sampler.raised == raised:
+        best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
+        if sampler.raised == raised:
             break
     return best

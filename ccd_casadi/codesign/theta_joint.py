@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_thet
 from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
 from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -37,7 +38,7 @@ from ccd_casadi.inner_problem.sections_plant_set import (
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import worse_members
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
-from ccd_casadi.plants.plant import Evaluate, hardware_cost
+from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -49,10 +50,12 @@ LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 PENALTY = (
     6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
 )
-STEPS, ADAPTING = 30, 15  # of a search, and of the controller alone at its end
+STEPS, ADAPTING = 60, 15  # of a search, and of the controller alone at its end
 FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
-LEAST_GAIN = 1e-5  # of w2 ω_b
+LEAST_GAIN = 1e-7  # of w2 ω_b
 SETTLED = 3e-4  # of J: less is not worth another set of plants
+ENDINGS, CLOSE, MET = 4, 0.02, 1e-6  # searches on the plants to first order; of the box
+LAST_GAIN = 1e-10  # of w2 ω_b
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
 
@@ -87,7 +90,7 @@ def together(
     reach, settled, asked = REACH, False, sampler
     for turn in range(TURNS):
         models, within = nearby(problem, known, best.theta), LOOSE if turn else WITHIN
-        uncertain = uncertain_plant(problem, best.theta, models)
+        uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
         members = worse_members(
             problem, uncertain, np.array(best.kappa), best.bandwidth, turn, tell, within
         )[1]
@@ -117,12 +120,30 @@ def together(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
+    best = asked.kept("finished", (*best.theta, best.bandwidth), Place,
+                      partial(finished, problem, best))  # fmt: skip
+    if tell is not None:
+        tell("finished on the plants themselves")
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.climbed(best.theta, best.kappa)
     if asked is not sampler or objective_of(problem, last) < objective_of(problem, first):
         return asked, last, settled
     return sampler, first, True
+
+
+def finished(problem: CoDesignProblem, best: Place) -> Place:
+    """The joint optimum near by, on the plants themselves to first order around each end before: so
+    near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
+    for _ in range(ENDINGS):
+        models = nearby(problem, (), best.theta)
+        end = proposed(problem, models, best, CLOSE, LAST_GAIN).end
+        lower, upper = box(problem)
+        away = float(np.abs((np.array(end.theta) - best.theta) / (upper - lower)).max())
+        best = end
+        if away < MET:
+            break
+    return best
 
 
 def with_members(sampler: Sampler, members: Sequence[Member]) -> Sampler:
@@ -135,7 +156,11 @@ def with_members(sampler: Sampler, members: Sequence[Member]) -> Sampler:
 
 
 def proposed(
-    problem: CoDesignProblem, models: Sequence[Evaluate], at: Place, reach: float
+    problem: CoDesignProblem,
+    models: Sequence[Evaluate],
+    at: Place,
+    reach: float,
+    least_gain: float = LEAST_GAIN,
 ) -> Proposal:
     """The end of one search around a place, on the plants of these models."""
     model = JointModel(problem, models, at, reach)
@@ -144,7 +169,7 @@ def proposed(
         return Proposal(at, 0.0)
     n, radius = len(start.x), Radius(min(FIRST, reach), NARROWEST, WIDEST)
     end = minimise(
-        model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=LEAST_GAIN
+        model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=least_gain
     ).best
     gain = start.value - end.value - PENALTY * end.violation
     return Proposal(model.place(end.x), model.unit * float(gain))
@@ -154,19 +179,19 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     """J over its `unit`, w2 ω_b in the middle, on the plants to first order around a place; over
     x = (z, κ, τ), with the loops at x."""
 
-    corrected = True
+    corrected = bending = True
 
     def __init__(
         self, problem: CoDesignProblem, models: Sequence[Evaluate], place: Place, reach: float
     ) -> None:
         self.problem, self.models, self.middle = problem, models, np.array(place.theta)
         sections = sections_of_problem(problem)
-        uncertain = uncertain_plant(problem, place.theta, models)
         known = [(option, np.array(point)) for option, point in sections.members]
-        self.members = known or uncertain.corners()
-        self.first = uncertain.plants(self.members[:1])[0]
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
+        uncertain = self.uncertain((self.middle - lower) / self.width)
+        self.members = known or uncertain.corners()
+        self.first = uncertain.plants(self.members[:1])[0]
         self.unit = -problem.w2 * place.bandwidth
         middle = (self.middle - lower) / self.width
         loops = self.first_loops = self.loops(middle)
@@ -211,13 +236,21 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         count = len(self.middle)
         return x[:count], x[count:-1], float(x[-1])
 
-    def loops(self, z: Array) -> LoopProblem:
-        """Those of the set at z, in the units of its first plant in the middle."""
-        uncertain = uncertain_plant(self.problem, tuple(self.theta(z).tolist()), self.models)
+    def uncertain(self, z: Array, beside: Array | None = None) -> UncertainPlant:
+        """The plant at z, or beside z to first order."""
+        theta = tuple(self.theta(z).tolist())
+        known = [model(theta) for model in self.models]
+        if beside is not None:
+            known = [to_first_order(one, self.width * beside) for one in known]
+            theta = tuple(self.theta(z + beside).tolist())
+        return uncertain_plant(self.problem, theta, known)
+
+    def loops(self, z: Array, beside: Array | None = None) -> LoopProblem:
+        """Those of the set there, in the units of its first plant in the middle."""
         share = self.width[:, None, None]
         plants = [
             replace(plant, dA=share * plant.dA, dB=share * plant.dB, dC=share * plant.dC)
-            for plant in uncertain.plants(self.members)
+            for plant in self.uncertain(z, beside).plants(self.members)
         ]
         sections = sections_of_problem(self.problem)
         return problem_for(
@@ -254,7 +287,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
 
         @cache
         def beside() -> list[LoopProblem]:
-            return [self.loops(z + BESIDE * unit) for unit in np.eye(count)]
+            return [self.loops(z, BESIDE * unit) for unit in np.eye(count)]
 
         def second(index: np.ndarray) -> Array:
             return hessians(problem, kappa, tau, found.only(index), beside())

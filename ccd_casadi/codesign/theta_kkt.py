@@ -20,7 +20,6 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.optimize import nnls
 
-from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.objective import hardware_at, objective, objective_gradient
@@ -33,6 +32,7 @@ from ccd_casadi.optim.kkt import (
     hessian_products,
     reduced_curvature,
 )
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 
@@ -46,7 +46,7 @@ BESIDE = 10.0 * STEP  # of the box: differences of true values and gradients
 def theta_kkt(
     problem: CoDesignProblem,
     sample: BandwidthSample,
-    truth: TrueBandwidth | None = None,
+    truth: Sampler | None = None,
     envelope: Envelope | None = None,
 ) -> KktCertificate:
     """Residuals of optimality at a sample.
@@ -120,7 +120,7 @@ def _steepest_first(Z: Array, gradient: Array) -> Array:
 
 
 def _slopes(
-    problem: CoDesignProblem, truth: TrueBandwidth, sample: BandwidthSample, Z: Array, size: float
+    problem: CoDesignProblem, truth: Sampler, sample: BandwidthSample, Z: Array, size: float
 ) -> tuple[tuple[float, float], ...]:
     """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
     and over `size`; all are asked for at once."""
@@ -132,19 +132,20 @@ def _slopes(
     J = objective(problem, sample.theta, sample.value)
     far = np.flatnonzero(steps > 0.5 * BESIDE)
     found = np.full(len(ends), np.nan)
-    for i, there in zip(far, truth.all_at(ends[far]), strict=True):
+    for i, there in zip(far, truth.bandwidths(ends[far], "certificate"), strict=True):
         found[i] = (objective(problem, there.theta, there.value) - J) / (steps[i] * size)
     return tuple((float(low), float(high)) for low, high in found.reshape(-1, 2))
 
 
 def _hessian(
-    problem: CoDesignProblem, truth: TrueBandwidth, sample: BandwidthSample, Z: Array
+    problem: CoDesignProblem, truth: Sampler, sample: BandwidthSample, Z: Array
 ) -> Array | None:
     """∇²J Z (n, k) by differences of true gradients; λ's own curvature is left out."""
     lower, upper = box(problem)
 
     def slope(z: Array) -> Array:
-        return objective_gradient(problem, truth.at(lower + (upper - lower) * z))
+        there = truth.bandwidths(lower + (upper - lower) * z, "certificate")[0]
+        return objective_gradient(problem, there)
 
     z = (np.array(sample.theta) - lower) / (upper - lower)
     return hessian_products(slope, z, Z, BESIDE)

@@ -5,11 +5,11 @@ from dataclasses import replace
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.channels import Channel, split
 from ccd_casadi.deployment.discretise import Conversion, Target, loop_at
-from ccd_casadi.deployment.outcome import SAMPLED_BANDWIDTH, ChannelOrders, Trial
+from ccd_casadi.deployment.outcome import SAMPLED_BANDWIDTH, ChannelOrders
 from ccd_casadi.deployment.rate_choice import ChannelLoops
 from ccd_casadi.deployment.reduction import Reduced, Reduction
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
-from ccd_casadi.deployment.timing import Discretisation, Timing
+from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, structure_of
@@ -21,12 +21,12 @@ DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
 def at_its_rate(
     run: FinishedRun, channels: tuple[Channel, ...], family: tuple[Member, ...],
     designed: Sampling, timing: Timing,
-) -> tuple[Target, Trial, float, float]:  # fmt: skip
-    """Target, Tustin's rule at the case's rate, and the rate and delay to run at.
+) -> tuple[Target, float, float, float]:  # fmt: skip
+    """Target, the rate that is needed by Tustin's rule, and the rate and delay to run at.
 
     What was designed is the sampled loop: that is what a given rate or delay is held against.
     """
-    tustin, rate = Conversion(Discretisation.TUSTIN, False), timing.rate_hz or designed.rate_hz
+    tustin, rate = Conversion.TUSTIN, timing.rate_hz or designed.rate_hz
     plant = run.plant.plant_si()
     own = loop_at(plant, run.controller, tustin, designed.period, designed.delay)
     target = Target(run.problem.inner.S_max, DESIGNED_EXCESS, own.bandwidth, SAMPLED_BANDWIDTH)
@@ -35,7 +35,7 @@ def at_its_rate(
     loops = ChannelLoops(channels, [run.controller], target)
     met = loops.met(tustin, rate, timing, WorstFirst(family))
     needed = rate if met else designed.rate_hz
-    return target, Trial(tustin, needed), rate, timing.delay_at(rate)
+    return target, needed, rate, timing.delay_at(rate)
 
 
 def require_own_bounds(run: FinishedRun, designed: Sampling | None, timing: Timing) -> None:

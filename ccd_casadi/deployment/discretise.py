@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from itertools import pairwise
 
 import numpy as np
 
-from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
@@ -17,25 +17,17 @@ CLOSE = 1e-3  # relative: how closely the rate that is needed is bracketed
 NICE = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.4, 8.0, 10.0)
 
 
-@dataclass(frozen=True)
-class Conversion:
-    """A method, with or without the lead that makes up for hold and delay.
+class Conversion(StrEnum):
+    """How K(s) becomes K(z): Tustin's rule, or ramp-invariant, with or without a lead.
 
-    The lead is (1 + α) - α z⁻¹, whose phase is that of a time advance of αT at low frequency;
-    α = τ/T + 1/2. Its price is the gain 1 + 2α at half the sampling rate.
+    Ramp-invariant is exact for an error that is straight between samples; it needs the lower rate
+    on every case measured. The lead is (1 + α) - α z⁻¹, whose phase is that of a time advance of αT
+    at low frequency; α = τ/T + 1/2. Its price is the gain 1 + 2α at half the sampling rate.
     """
 
-    method: Discretisation
-    lead: bool
-
-    @property
-    def label(self) -> str:
-        """`foh with lead`."""
-        return f"{self.method.value}{' with lead' if self.lead else ''}"
-
-    def advance(self, period: float, delay: float) -> float:
-        """α, in periods; 0 without lead."""
-        return delay / period + 0.5 if self.lead else 0.0
+    TUSTIN = "tustin"  # of loops that were designed as they run
+    RAMP = "foh"
+    LEAD = "foh with lead"
 
 
 def discretise(
@@ -44,15 +36,15 @@ def discretise(
     """K(z) for a period and a delay in s, the lead on its input."""
     from scipy.signal import cont2discrete  # slow to import
 
-    if conversion.method is Discretisation.TUSTIN:
+    if conversion is Conversion.TUSTIN:
         found = tustin(controller, period)
         A, B, C, D = found.A, found.B, found.C, found.D
     else:
         parts = (controller.A, controller.B, controller.C, controller.D)
-        A, B, C, D, _ = cont2discrete(parts, period, conversion.method.value)
-    alpha = conversion.advance(period, delay)
-    if not alpha:
+        A, B, C, D, _ = cont2discrete(parts, period, Conversion.RAMP.value)
+    if conversion is not Conversion.LEAD:
         return StateSpace(A, B, C, D, period=period)
+    alpha = delay / period + 0.5
     n, m = B.shape
     return StateSpace(
         np.block([[A, -alpha * B], [np.zeros((m, n + m))]]),

@@ -36,24 +36,13 @@ class ChannelOrders:
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A way to discretise, the rate in Hz that it needs (None: no rate will do).
-
-    `there` is the worst loop of the set at a rate that was given, None where none was.
-    """
-
-    conversion: Conversion
-    needed_hz: float | None
-    there: SampledFigures | None = None
-
-
-@dataclass(frozen=True)
 class Deployment:
     """Everything that was found out on the way from a run's controller to the deployed one.
 
     `sampled` are the exact figures of the sampled loop on the nominal plant, `members` those on
     every other plant of the run's [robust] set. `unverified`: why the run itself is not verified,
-    empty where it is. `compliance`: the largest |GS| in m/N and on which plant, where the case
+    empty where it is. `needed_hz`: the least rate that will do, None where none does.
+    `compliance`: the largest |GS| in m/N and on which plant, where the case
     bounds it.
     """
 
@@ -61,7 +50,7 @@ class Deployment:
     limits: Limits
     reduced: StateSpace
     reduced_figures: DesignFigures
-    trials: tuple[Trial, ...]
+    needed_hz: float | None
     target: Target
     rate_hz: float
     delay: float
@@ -79,11 +68,6 @@ class Deployment:
     def order(self) -> int:
         """States of the reduced controller."""
         return len(self.reduced.A)
-
-    @property
-    def needed_hz(self) -> float | None:
-        """The rate that the chosen method needs."""
-        return next(t.needed_hz for t in self.trials if t.conversion == self.conversion)
 
     @property
     def stable(self) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.as_designed import at_its_rate, designed_channels, require_own_bounds
 from ccd_casadi.deployment.channels import Channel, assemble, split, whole
-from ccd_casadi.deployment.discretise import Target
+from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.judgement import judged
 from ccd_casadi.deployment.outcome import (
     SAMPLED_BANDWIDTH,
@@ -17,7 +17,7 @@ from ccd_casadi.deployment.outcome import (
     ChannelOrders,
     Deployment,
 )
-from ccd_casadi.deployment.rate_choice import ChannelLoops, choose, conversions_of
+from ccd_casadi.deployment.rate_choice import ChannelLoops, choose
 from ccd_casadi.deployment.reduction import Limits, Reduced, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing
@@ -75,18 +75,14 @@ def deploy(
     way: dict[str, Any] = {"limits": limits, "reduced": reduced, "reduced_figures": figures}
     if designed is not None:
         progress("the rate of the case")
-        target, best, rate, delay = at_its_rate(run, channels, family, designed, timing)
-        way |= {"trials": (best,), "target": target}
-        return judged(run, dense, orders, best.conversion, rate, delay, saturation, way)
-    loops, conversions = ChannelLoops(channels, small, target), conversions_of(timing)
+        target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing)
+        way |= {"needed_hz": own_hz, "target": target}
+        return judged(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
+    loops = ChannelLoops(channels, small, target)
     for attempt in range(1 + ADDED):
-        trials, best, rate = choose(
-            run, timing, loops, family, conversions, progress, attempt, remedy
-        )
-        way |= {"trials": trials, "target": target}
-        found = judged(
-            run, dense, orders, best.conversion, rate, timing.delay_at(rate), saturation, way
-        )
+        conversion, needed, rate = choose(run, timing, loops, family, progress, attempt, remedy)
+        way |= {"needed_hz": needed, "target": target}
+        found = judged(run, dense, orders, conversion, rate, timing.delay_at(rate), saturation, way)
         outside = max((m for m in found.members if not target.held(m.figures)),
                       default=None, key=lambda m: m.badness)  # fmt: skip
         if timing.rate_hz is not None or outside is None:

@@ -5,6 +5,7 @@ from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import Line, State
+from ccd_casadi.deployment.discretise import Conversion
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.robust_set import place_words
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -56,7 +57,9 @@ def order_words(run: FinishedRun, found: Deployment) -> str:
     words = " + ".join(
         f"{order} of {item.rows[0].order}" for order, item in zip(orders, found.orders, strict=True)
     )
-    more = len(found.realisation.system.A) - found.order if found.conversion.lead else 0
+    more = (
+        len(found.realisation.system.A) - found.order if found.conversion is Conversion.LEAD else 0
+    )
     lead = f", and {more} of the lead filter" if more else ""
     return f"{words} states ({len(run.controller.A)} synthesised){lead}"
 

@@ -91,7 +91,6 @@ class Panel:
     log_y: bool = False
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
-    whole_x: bool = False
     y_step: float | None = None
     legend: Literal["best"] | None = "best"
     title: str = ""

@@ -48,21 +48,14 @@ class Labels:
         self._taken: list[Box] = []
         self._curves = np.empty((0, 2))
 
-    def corner(self, names: Sequence[str]) -> tuple[str, float]:
-        """The place of a legend of these names that covers least, and how many points it covers."""
+    def corner(self, names: Sequence[str]) -> str:
+        """The place of a legend of these names that covers least; nothing lies over it then."""
+        boxes = self._corners(names)
         costs = {where: self._covered(box) + sum(_meet(box, one) for one in self._taken)
-                 for where, box in self._corners(names).items()}  # fmt: skip
+                 for where, box in boxes.items()}  # fmt: skip
         where = min(costs, key=lambda each: costs[each])
-        return where, costs[where]
-
-    def take_corner(self, names: Sequence[str], where: str) -> None:
-        """Nothing is to lie over a legend there."""
-        self._taken.append(self._corners(names)[where])
-
-    def share(self, names: Sequence[str]) -> float:
-        """The height of a legend of these names over that of the axes above it."""
-        tall = LINE * (len(names) + 0.8)
-        return tall / max(self._inside[3] - self._inside[1] - tall, LINE)
+        self._taken.append(boxes[where])
+        return where
 
     def _corners(self, names: Sequence[str]) -> dict[str, Box]:
         left, bottom, right, top = self._inside
@@ -110,31 +103,31 @@ class Labels:
     def along(self, value: float, text: str, vertical: bool) -> None:
         """A label at a line across the axes, upright beside a vertical one."""
         left, bottom, right, top = self._inside
+        corner = self._axes.get_xlim()[0], self._axes.get_ylim()[0]
+        line = self._at(value, corner[1])[0] if vertical else self._at(corner[0], value)[1]
+        start, end = (bottom + 4.0, top) if vertical else (left + 3.0, right)
         wide = LETTER * len(text)
-        places: list[tuple[Any, ...]] = []
+        places = []
         for share in SHARES:
             for side in (2.0, -2.0):
-                low = side - (LINE if side < 0 else 0.0)
-                if vertical:
-                    x, y = self._at(value, self._axes.get_ylim()[0])[0], bottom + 4.0
-                    y += share * (top - bottom)
-                    box = (x + low, y, x + low + LINE, y + wide)
-                    place = (value, (y - bottom) / (top - bottom))
-                    look = {"rotation": 90, "va": "bottom", "ha": "left" if side > 0 else "right"}
-                    offset, coordinates = (side, 0.0), self._axes.get_xaxis_transform()
-                else:
-                    x, y = left + 3.0, self._at(self._axes.get_xlim()[0], value)[1]
-                    x += share * (right - left)
-                    box = (x, y + low, x + wide, y + low + LINE)
-                    place = ((x - left) / (right - left), value)
-                    look = {"ha": "left", "va": _above(side)}
-                    offset, coordinates = (0.0, side), self._axes.get_yaxis_transform()
-                places.append((box, offset, place, coordinates, look))
+                a, b = start + share * (end - start), line + side - (LINE if side < 0 else 0.0)
+                box = (b, a, b + LINE, a + wide) if vertical else (a, b, a + wide, b + LINE)
+                places.append((box, (a - (bottom if vertical else left)), side))
         found = self._best([box for box, *_ in places])
-        if found is not None:
-            _, offset, place, coordinates, look = places[found]
-            held = self._held(value, None) if vertical else self._held(None, value)
-            self._write(text, offset, place, coordinates, held, **look)
+        if found is None:
+            return
+        _, at, side = places[found]
+        if vertical:
+            self._write(
+                text, (side, 0.0), (value, at / (top - bottom)), self._axes.get_xaxis_transform(),
+                self._held(value, None), rotation=90, va="bottom",
+                ha="left" if side > 0 else "right",
+            )  # fmt: skip
+        else:
+            self._write(
+                text, (0.0, side), (at / (right - left), value), self._axes.get_yaxis_transform(),
+                self._held(None, value), ha="left", va=_above(side),
+            )  # fmt: skip
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
         a, b = in_points(self._axes, x, y)[0]

@@ -126,14 +126,8 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         line(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)), gid=f"level{i}")
     labels = _labels(axes, panel)
     if panel.legend is not None and (names := axes.get_legend_handles_labels()[1]):
-        where, covered = labels.corner(names)
-        if covered and panel.log_y and panel.y_range is None:
-            low, high = axes.get_ylim()
-            axes.set_ylim(low, high * (high / low) ** labels.share(names))
-            labels = _labels(axes, panel)
-            where, _ = labels.corner(names)
+        where = labels.corner(names)
         axes.legend(loc=cast(Any, where), borderaxespad=0.2)
-        labels.take_corner(names, where)
     for mark in panel.marks:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
@@ -160,14 +154,12 @@ def _leaves(panel: Panel, curve: Curve) -> bool:
 
 
 def _ranges(axes: "Axes", panel: Panel) -> None:
-    from matplotlib.ticker import MaxNLocator, MultipleLocator
+    from matplotlib.ticker import MultipleLocator
 
     if panel.log_x:
         log_axis(axes.xaxis, *(panel.x_range or positive_range(c.x for c in panel.curves)))
     elif panel.x_range:
         axes.set_xlim(*panel.x_range)
-    if panel.whole_x:
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if panel.log_y:
         log_axis(axes.yaxis, *(panel.y_range or positive_range(c.y for c in panel.curves)))
     elif panel.y_range:

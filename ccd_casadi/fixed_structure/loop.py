@@ -170,17 +170,12 @@ class PlantSet:
         p = plant.poles
         omega = self.frequency(np.asarray(v, float))
         period = None if free else self.period
-        f, slope = transfer(p, omega, period, self.delay)
+        f = transfer(p, omega, period, self.delay)[0]
         gap = p[:, None] - p[None, :]
         near = np.abs(gap) <= CLOSE * np.maximum(np.abs(p)[:, None], np.abs(p)[None, :])
-        middle = 0.5 * (p[:, None] + p[None, :])
-        between = np.where(
-            near,
-            transfer(middle.ravel(), omega, period, self.delay)[1].reshape(-1, *gap.shape)
-            if (near.sum() > len(p))
-            else slope[:, :, None] * np.ones(len(p)),
-            (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap),
-        )
+        between = (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap)
+        i, j = np.nonzero(near)
+        between[:, i, j] = transfer(0.5 * (p[i] + p[j]), omega, period, self.delay)[1]
         c, b = left @ plant.reading, right @ plant.drive.T
         pairs = [
             (c[:, :, None] * between * b[:, None, :], plant.dA),

@@ -114,11 +114,11 @@ def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
 
 
 def uncertain_plant(
-    problem: CoDesignProblem, theta: Sequence[float], models: Sequence[Evaluate] = ()
+    problem: CoDesignProblem, theta: Sequence[float], known: Sequence[Mechanics] = ()
 ) -> UncertainPlant:
     """The model at θ with every option set, and the box of what may differ from it.
 
-    `models`: what evaluates them; the plants themselves where none are given.
+    `known`: their matrices, in the place of the plants' own.
     """
     u, held = sections_of_problem(problem).uncertainty, problem.source.held
     options = _options(problem)
@@ -128,8 +128,7 @@ def uncertain_plant(
         return mechanics(wider[option], (*theta, *values.tolist()))
 
     return UncertainPlant(
-        tuple(model(theta) for model in models)
-        or tuple(mechanics(plant_of(option), theta) for option in options),
+        tuple(known) or tuple(mechanics(plant_of(option), theta) for option in options),
         problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
         tuple((name, low, held[name], high) for name, low, high in u.ranges), along,
     )  # fmt: skip

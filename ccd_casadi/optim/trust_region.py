@@ -129,6 +129,9 @@ class Model(ABC, Generic[Data]):
     carried = False  # whether σ >= 0 falls away: f is the largest row
     corrected = False  # whether a trial that gains too little is corrected to second order
     growing = False  # whether the penalty grows with the multipliers
+    # Whether a row that ends below its bound by little of what it moves counts with its curvature,
+    # as it may bend over it. Searches over K alone end in better optima without.
+    bending = False
 
     @abstractmethod
     def at(self, x: Array) -> Iterate[Data] | None:
@@ -259,8 +262,9 @@ def best_step(
         if turn == 0:
             straight = gain(way)
         holds = mu > HOLDS * weight
-        # A row that ends below its bound by little of what it moves may bend over it.
-        counts = holds | (offset + at @ found[0] > -BENDS * (np.abs(slopes) @ np.abs(found[0])))
+        counts = holds.copy()
+        if model.bending:
+            counts |= offset + at @ found[0] > -BENDS * (np.abs(slopes) @ np.abs(found[0]))
         counts[bent] = False
         fresh = np.flatnonzero(counts & (chosen < rows.curved))
         if len(fresh) and rows.hessians is not None:

@@ -212,7 +212,7 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
 
 def near(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[float]) -> Evaluate:
     """θ -> Mechanics from what is known: the plant's own way, or to first order around `here`."""
-    if plant.nearby is not None:
+    if plant.nearby is not None and known:
         return plant.nearby(known)
     system = mechanics(plant, here)
     return lambda theta: to_first_order(system, np.array(theta) - np.array(here))

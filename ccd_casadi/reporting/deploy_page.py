@@ -5,9 +5,9 @@ import numpy as np
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.c_code import COMPILE
+from ccd_casadi.deployment.discretise import Conversion
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
-from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.words import figure_rows, order_words, reason_words, short_status
 from ccd_casadi.drawing.content import (
@@ -58,7 +58,7 @@ def deploy_page(
     if moved is not None:
         sections.append(Section("A move on the machine", move_blocks(moved)))
     sections += [
-        Section("Sampling rate", _rates(found)),
+        Section("Sampling rate", (_rates(found),)),
         Section("Orders", tuple(block for item in found.orders for block in _orders(item, run))),
         Section("As sections",
                 tuple(block for item in found.orders for block in _sections(item, run))),
@@ -142,27 +142,18 @@ def _step(run: FinishedRun, found: Deployment) -> Figure:
     return Figure(Lines(((panel,),), "Step of the reference", (3.0,)), caption, (table,))
 
 
-def _rates(found: Deployment) -> tuple[Block, ...]:
-    rows = tuple(
-        (
-            trial.conversion.label,
-            "none" if trial.needed_hz is None else number(trial.needed_hz, 4),
-            "used" if trial.conversion == found.conversion else "",
-        )
-        for trial in found.trials
+def _rates(found: Deployment) -> Words:
+    hz = "no rate" if found.needed_hz is None else f"{number(found.needed_hz, 4)} Hz"
+    if found.conversion is Conversion.TUSTIN:
+        return Words(f"The loop was designed for {hz} with Tustin's rule, hold and delay in it.")
+    lead = (
+        " The lead filter makes up for the phase of hold and delay, and raises the gain at half "
+        "the sampling rate."
     )
-    if found.orders[0].chosen.method is Reduction.NONE and len(found.trials) == 1:
-        words = (
-            f"The loop was designed for {number(found.trials[0].needed_hz)} Hz with Tustin's rule, "
-            "hold and delay in it."
-        )
-        return (Words(words),)
-    words = (
-        "At this rate and above, the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay "
-        "included. The lead filter makes up for the phase of hold and delay, and raises the gain "
-        "at half the sampling rate."
+    return Words(
+        f"From {hz} on the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay included "
+        f"({found.conversion.value}).{lead if found.conversion is Conversion.LEAD else ''}"
     )
-    return Words(words), Table(("method", "needed rate, Hz", ""), rows)
 
 
 def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:

@@ -37,7 +37,7 @@ def _prediction(result: Mapping[str, Any]) -> str:
         return ""
     if line.get("left_out") is not None:
         missed = number(100.0 * line["left_out"], 2)
-        return f" It is a sample of the surrogate, which without it misses it by {missed} %."
+        return f" It is a sample of the surrogate, and is missed by {missed} % without that sample."
     return f" The prediction errs by {number(result['verification_error'], 2)} of the truth."
 
 

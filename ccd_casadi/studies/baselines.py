@@ -19,13 +19,7 @@ from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
-from ccd_casadi.inner_problem.problem import (
-    CoDesignProblem,
-    plant_of,
-    scaled_plant,
-    true_design,
-    true_inner,
-)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
 from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
@@ -96,10 +90,6 @@ class Baseline(ABC):
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
         """Its controller, SI."""
 
-    def swept_loss(self, theta: tuple[float, ...], bandwidth: float) -> float:
-        """What J loses to the true inner problem at θ where ω_b (rad/s) is of a coarse sweep."""
-        return 0.0
-
 
 class MixedBaseline(Baseline):
     """The paper's own: a sweep of (ω_S, ω_T)."""
@@ -135,9 +125,6 @@ class MixedBaseline(Baseline):
             omega_low=problem.inner.omega_low, gamma_backoff=problem.inner.gamma_backoff,
         )  # fmt: skip
         return made.controller
-
-    def swept_loss(self, theta: tuple[float, ...], bandwidth: float) -> float:
-        return (true_inner(self.problem, theta).bandwidth - bandwidth) * abs(self.problem.w2)
 
 
 class SectionsBaseline(Baseline):

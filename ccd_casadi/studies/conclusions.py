@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.studies.baselines import baseline_of
-from ccd_casadi.support.units import HZ
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.support.units import counted
 
 EQUAL = 1e-6  # relative difference of J that counts as none
 LABELS = {
@@ -54,42 +53,27 @@ def _beside(figures: dict[str, Any]) -> str:
 def _descent(
     problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str
 ) -> tuple[dict[str, Any], list[str]]:
-    """How far a descent ends from the best, and which of gradient, sweep or step stopped it."""
+    """How far a descent ends from the best, and what stopped it."""
     gap = run["objective"] - best["objective"]
     ratio = run["syntheses"] / best["syntheses_to_optimum"]
-    theta = tuple(run["theta"].values())
-    baseline = baseline_of(problem)
-    swept_loss = baseline.swept_loss(theta, HZ * run["bandwidth_hz"])
-    moved = max(
-        abs(a - b) / (high - low)
-        for a, b, low, high in zip(
-            theta, best["theta"].values(), problem.lower, problem.upper, strict=True
-        )
-    )
+    ends = zip(run["theta"].values(), best["theta"].values(), *box(problem), strict=True)
+    moved = max(abs(a - b) / (high - low) for a, b, low, high in ends)
     found = {
         "objective_gap": gap,
         "synthesis_ratio": ratio,
-        "loss_to_swept_inner": swept_loss,
         "distance_to_best": moved,
         "stop": run["stop"],
         "last_gradient": run["history"][-1]["gradient"],
     }
     words = [
-        f"S{LABELS[name][1:]} (best of {run['runs']} runs) ends at J = "
+        f"S{LABELS[name][1:]} (best of {counted(run['runs'], 'run')}) ends at J = "
         f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, "
         f"{ratio:.0f} times as many; all its runs together took {run['syntheses_of_all_runs']}."
     ]
-    if gap > EQUAL * abs(best["objective"]) and not baseline.swept:
+    if gap > EQUAL * abs(best["objective"]):
         words.append(
-            f"It stopped because of: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
+            f"It stopped: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
             "from the best one."
-        )
-    elif gap > EQUAL * abs(best["objective"]):
-        share = min(1.0, max(0.0, swept_loss / gap)) if gap > 0 else 0.0
-        words.append(
-            f"It stopped because of: {run['stop']}. Of its gap, {100 * share:.0f} % is the inner "
-            f"sweep's coarse grid (the true inner optimum at its theta is worth {swept_loss:.3g} "
-            f"more), the rest its theta, {100 * moved:.2g} % of the box from the best one."
         )
     return found, words
 

@@ -36,7 +36,7 @@ def shown(value: float, unit: str, digits: int = 3) -> str:
     ('41 µm', '10 mm', '180 ms', '0 m')
     """
     read, factor = shown_unit(unit, value)
-    return f"{factor * value:.{digits}g} {read}"
+    return f"{number(factor * value, digits)} {read}"
 
 
 def metres(value: float, digits: int = 3) -> str:

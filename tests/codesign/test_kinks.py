@@ -10,7 +10,6 @@ from helpers import few, problem
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.verdict import State, optimal
 from ccd_casadi.codesign.verified_sections import VerifiedSections
@@ -20,6 +19,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.optim.pieces import Local, descend
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 
 J0 = -700.0
@@ -156,7 +156,7 @@ def test_elsewhere_on_a_kink_it_is_the_distance_of_the_hull_from_zero(
 
 @dataclass
 class Told:
-    """J = the largest of pieces over θ, through ω_b* = -J, as `TrueBandwidth` tells it."""
+    """J = the largest of pieces over θ, through ω_b* = -J, as a sampler tells it."""
 
     case: CoDesignProblem
     of: Pieces
@@ -172,8 +172,8 @@ class Told:
             tuple(map(float, theta)), -value, gradient, np.nan, np.nan, (), "", 0.0, 1
         )
 
-    def all_at(self, thetas: np.ndarray) -> list[BandwidthSample]:
-        return [self.at(theta) for theta in thetas]
+    def bandwidths(self, thetas: np.ndarray, label: str) -> list[BandwidthSample]:
+        return [self.at(theta) for theta in np.atleast_2d(thetas)]
 
 
 def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate:
@@ -181,7 +181,7 @@ def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate
     lower, width = np.array(told.case.lower), np.subtract(told.case.upper, told.case.lower)
     envelope = replace(envelope_of(slopes), to_theta=-slopes / width)
     sample = replace(told.at(lower + width * z), gradient=tuple(-slopes[0] / width))
-    return theta_kkt(told.case, sample, cast(TrueBandwidth, told), envelope)
+    return theta_kkt(told.case, sample, cast(Sampler, told), envelope)
 
 
 def case() -> CoDesignProblem:

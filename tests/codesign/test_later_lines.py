@@ -30,7 +30,7 @@ def verdict_of(folder: Path) -> dict:
 def test_after_deploy_and_robustness_no_page_says_what_the_run_no_longer_does(copied: Path) -> None:
     before = verdict_of(copied)
     assert before["deployable"]["state"] == "unknown"
-    quick = ["--quiet", "--method", "foh", "--lead", "on"]
+    quick = ["--quiet"]
     assert deploy([str(copied), "--rate-hz", "10000", *quick]) == 0
     few = ["--quiet", "--samples", "20", "--workers", "1"]
     assert robustness([str(copied), *few]) == 0

@@ -21,7 +21,7 @@ from ccd_casadi.deploy import main
 from ccd_casadi.deployment.channels import assemble, split
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.reduction import Limits, Reduction, reductions, smallest
-from ccd_casadi.deployment.timing import Discretisation, Timing
+from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure, responses
@@ -29,7 +29,7 @@ from ccd_casadi.synthesis.interchange import read_mat
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, synthesise
 
 ROOT = Path(__file__).parents[2]
-QUICK = ["--method", "foh", "--lead", "on", "--quiet"]
+QUICK = ["--quiet"]
 
 
 def copied(run: Path, folder: Path) -> Path:
@@ -70,7 +70,7 @@ def test_a_plant_of_two_channels_is_deployed_channel_by_channel() -> None:
         responses(plant, whole, omega)[1], responses(plant, made.controller, omega)[1],
         rtol=0, atol=1e-6 * np.abs(responses(plant, made.controller, omega)[1]).max(),
     )  # fmt: skip
-    found = deploy(as_run(plant, made), Timing(method=Discretisation.RAMP, lead=True))
+    found = deploy(as_run(plant, made), Timing(lead=True))
     assert found.passed
     assert found.order < len(made.controller.A)
     K, exact = found.realisation.system, found.sampled
@@ -192,7 +192,7 @@ def test_an_unstable_loop_leaves_no_code(
     two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "controller.c").write_text("of an earlier deployment")
-    options = ["--rate-hz", "400", "--out", str(tmp_path), "--method", "tustin", "--quiet"]
+    options = ["--rate-hz", "400", "--out", str(tmp_path), "--lead", "off", "--quiet"]
     assert main([str(two_mass_run), *options]) == 4
     left = {path.name for path in tmp_path.iterdir()}
     assert left == {"deploy.json", "report.html", "report.json"}
@@ -203,7 +203,7 @@ def test_an_unstable_loop_leaves_no_code(
 
 def test_the_peak_is_the_one_that_the_simulation_shows(two_mass_run: Path) -> None:
     """SLICOT's AB13DD gives 1.737 here, where the loop has 1.877."""
-    timing = Timing(12500.0, 2e-4, method=Discretisation.RAMP, lead=True)
+    timing = Timing(12500.0, 2e-4, lead=True)
     found = deploy(read_run(two_mass_run), timing)
     K, exact = found.realisation.system, found.sampled
     measured = measure_set([found.plant], K, exact.bandwidth, seed=0)[0]

@@ -68,7 +68,7 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
     assert "prediction errs by 6.3e-12 of the truth" in conclusion(result)
     result["verdict"]["predicted"] |= {"left_out": 0.022}
     assert "6.3e-12" not in conclusion(result)
-    assert "misses it by 2.2 %" in conclusion(result)
+    assert "is missed by 2.2 %" in conclusion(result)
 
 
 @pytest.mark.parametrize(

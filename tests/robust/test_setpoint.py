@@ -14,7 +14,6 @@ from ccd_casadi.analysis.move import mass_feedforward, simulate
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -149,7 +148,7 @@ def test_a_sampled_move_tends_to_the_continuous_one() -> None:
     apart = []
     for rate in (4e3, 8e3):
         period = 1.0 / rate
-        tustin = Conversion(Discretisation.TUSTIN, False)
+        tustin = Conversion.TUSTIN
         K = discretise(controller, tustin, period, 0.5 * period)
         found = simulate(Loop(plant, K, Sampling(rate, 0.5e6 * period)), profile, axis=0,
                          forces=None, window=1e-7, bandwidth_hz=15.0)  # fmt: skip

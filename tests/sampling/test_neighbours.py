@@ -11,7 +11,7 @@ from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.sampling import sampler as module
@@ -58,8 +58,8 @@ def test_a_cliff_is_passed_by_its_controller(cliff: float) -> None:
     asked: list[tuple] = []
     with pytest.MonkeyPatch.context() as patch, SampleStore(":memory:") as store:
         patch.setattr(module, "inner_unit", branches(cliff, asked))
-        truth = TrueBandwidth(Sampler(two_branches(), store, Workers(1)), "")
-        best = pieces_from(truth, truth.at(np.array([55.0, 60.0])), 1e-9)
+        sampler = Sampler(two_branches(), store, Workers(1))
+        best = pieces_from(sampler, sampler.bandwidths(np.array([55.0, 60.0]))[0], 1e-9)
     assert best.theta[0] == pytest.approx(55.0 + 15.0 * SLOPE / 80.0, abs=0.02)
     assert best.kappa == GOOD
     assert len(asked) < 60

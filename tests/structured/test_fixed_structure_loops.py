@@ -18,7 +18,6 @@ from fixed_structure_loops import (
 )
 
 from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
 from ccd_casadi.fixed_structure.design import problem_for
@@ -121,7 +120,7 @@ def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
     tau = np.log(0.1)
     found = assess(problem, kappa, tau, depth=-3.0)
     si = problem.structure.in_units(kappa, members.omega_0, members.force)
-    conversion = Conversion(Discretisation.TUSTIN, False)
+    conversion = Conversion.TUSTIN
     K = discretise(state_space(problem.structure, si), conversion, sampling.period, sampling.delay)
     S = closed_loop(sampled(plant().plant_si(), sampling.period, sampling.delay), K).S
     w = found.poles[0] * 0.5 * members.period
