@@ -1,23 +1,33 @@
 """Bounds on every controller beside designs of random problems: none may exceed its bound.
 
     OPENBLAS_NUM_THREADS=1 nice python benchmarks/limitations.py [--problems N] [--write]
+    OPENBLAS_NUM_THREADS=1 nice python benchmarks/limitations.py --shipped
 
 The problems are the climbs of random_sections.py (chains of one to three masses, half of them
 sampled), with the bounds that their designs keep. A row each: the design's ω_b, what a T in a
 finite basis reaches (a controller of high order), and what the certificate forbids, in Hz.
+`--shipped`: the designs of shipped_designs.json and of rib_stage_design instead, which were found
+with the set and are held against the bound on the model.
 """
 
 import argparse
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+import rib_stage_built as rib
+import shipped_designs as designs
 from random_sections import HZ, WHOLE, case, climbed
 
+from ccd_casadi.cases.case import load_case, parse_theta
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.limitations.bound import inside, outside
 from ccd_casadi.limitations.limits import limits_of
+from ccd_casadi.limitations.of_problem import Gap, gap_of
+from ccd_casadi.support.errors import UserError
 
 
 def row(seed: int) -> dict[str, Any] | None:
@@ -37,11 +47,41 @@ def row(seed: int) -> dict[str, Any] | None:
     return {"seed": seed, **found, "seconds_outside": between - begun}
 
 
+def shipped() -> None:
+    """A line for each shipped design: its ω_b and what no controller reaches at its θ."""
+    for name, kept in json.loads(designs.RESULTS.read_text()).items():
+        if kept["bandwidth_hz"] is None:
+            continue
+        with TemporaryDirectory() as folder:
+            case = load_case(designs.placed(name, Path(folder)))
+            try:
+                found = gap_of(problem_of(case), parse_theta(case, kept["theta"]), within=False)
+            except UserError as unknown:
+                print(name, unknown)
+                continue
+        show(name, kept["bandwidth_hz"], found)
+    kept = json.loads((rib.DESIGN / "inner.json").read_text())
+    problem = problem_of(load_case(designs.ROOT / "runs" / "rib_stage_built.toml"))
+    bound = gap_of(problem, rib.theta_of(rib.DESIGN), within=False)
+    show("rib_stage_design", kept["bandwidth_hz"], bound)
+
+
+def show(name: str, hz: float, found: Gap) -> None:
+    """Over its bound a design would refute it."""
+    most = found.outside / HZ
+    print(f"{name}: {hz:.2f} Hz, bound {most:.2f} Hz, gap {100.0 * (most / hz - 1.0):.0f} %"
+          f"{', REFUTED' if hz > most else ''}", flush=True)  # fmt: skip
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     arguments.add_argument("--problems", type=int, default=60)
     arguments.add_argument("--write", action="store_true", help="keep the rows in limitations.json")
+    arguments.add_argument("--shipped", action="store_true")
     options = arguments.parse_args()
+    if options.shipped:
+        shipped()
+        return
     rows: list[dict[str, Any]] = []
     seed = 0
     while len(rows) < options.problems:

@@ -134,21 +134,29 @@ def positioning(b1: float, b2: float, b12: float, k: float) -> StateSpace:
     return StateSpace(A, B, np.array([[0.0, 0.0, 1.0, 0.0]]), np.zeros((1, 1)))
 
 
-def of_positioning(draws: int) -> list[list[str]]:
-    """Lead-lag and notch for the largest bandwidth on four corners: damping and k at either end."""
+CENTRE = np.array([1e-6, 1e-6, 5e-7, 0.013])  # of b_1, b_2, b_12, k
+REACH = CENTRE * np.array([0.5, 0.5, 0.5, 0.25])
+
+
+def tuned_positioning() -> tuple[StateSpace, list[StateSpace]]:
+    """Lead-lag and notch for the largest bandwidth on four corners: damping and k at either end;
+    all corners."""
     import control
 
-    centre = np.array([1e-6, 1e-6, 5e-7, 0.013])
-    reach = centre * np.array([0.5, 0.5, 0.5, 0.25])
-    corners = [positioning(*(centre + reach * np.array(e))) for e in product((-1, 1), repeat=4)]
+    corners = [positioning(*(CENTRE + REACH * np.array(e))) for e in product((-1, 1), repeat=4)]
     structure = Structure(integrator=False, lead=1, biquads=1, roll_off=0, least_damping=0.05)
     tuned = ccd.tune(
         [control.ss(G.A, G.B, G.C, G.D) for G in (*corners[:2], *corners[-2:])],
         rate_hz=RATE, S_max=1.55, effort=9.0, structure=structure, starts=6,
     )  # fmt: skip
-    K = tuned.controller
+    return tuned.controller, corners
+
+
+def of_positioning(draws: int) -> list[list[str]]:
+    """The goals on all corners and on draws."""
+    K, corners = tuned_positioning()
     rng = np.random.default_rng(1)
-    unseen = [positioning(*(centre + reach * rng.uniform(-1, 1, 4))) for _ in range(draws)]
+    unseen = [positioning(*(CENTRE + REACH * rng.uniform(-1, 1, 4))) for _ in range(draws)]
     found = np.array([goals(G, K) for G in corners + unseen])
     crossover, disk, fastest = found[:, 0].min(), found[:, 1].min(), found[:, 2].max()
     stable = int((found[:, 3] < 0.0).sum())

@@ -79,9 +79,9 @@ def shipped() -> dict[str, tuple[str, Path | None, str]]:
     }  # fmt: skip
 
 
-def designed(name: str, folder: Path) -> dict[str, Any]:
-    """`inner` of one design into a folder; the answer is kept there."""
-    theta, home, text = shipped()[name]
+def placed(name: str, folder: Path) -> Path:
+    """The case of a design, in a folder of its own."""
+    _, home, text = shipped()[name]
     folder.mkdir(parents=True, exist_ok=True)
     if home is None:
         (folder / "my_stage.py").write_text(tutorial("tutorial", "my_stage.py"))
@@ -90,8 +90,22 @@ def designed(name: str, folder: Path) -> dict[str, Any]:
         text = text.replace('plants = ["', f'plants = ["{home}/')
     case = folder / "input.toml"
     case.write_text(text)
-    out = io.StringIO()
-    words = [str(case), "--theta", theta, "--out", str(folder), "--workers", "1", "--quiet"]
+    return case
+
+
+def designed(name: str, folder: Path) -> dict[str, Any]:
+    """`inner` of one design into a folder; the answer is kept there."""
+    case, out = placed(name, folder), io.StringIO()
+    words = [
+        str(case),
+        "--theta",
+        shipped()[name][0],
+        "--out",
+        str(folder),
+        "--workers",
+        "1",
+        "--quiet",
+    ]
     with contextlib.redirect_stdout(out):
         inner.main(words)
     (folder / "answer.json").write_text(out.getvalue())

@@ -3,11 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import cho_solve
 
 from surrogates.covariance import Hyperparameters, Kernel
 from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
-from surrogates.interface import Array, SurrogateFitError, errors
+from surrogates.interface import Array, SurrogateFitError
 from surrogates.likelihood import (
     LENGTH_BOUNDS,
     NOISE_BOUNDS,
@@ -34,8 +33,8 @@ def fit_process(
     """Return the process that maximises log p(Y, dY | X) (R & W eq. 5.8).
 
     Over length scales, signal and, where it is not given, noise variance, from
-    `starts` seeded starts; then `centred` and its bands `calibrated`. That of gradients
-    is estimated always.
+    `starts` seeded starts; its bands are then `calibrated`. That of gradients is estimated
+    always.
 
     Raises:
         SurrogateFitError: more observations than an exact process holds, contradictory
@@ -48,7 +47,7 @@ def fit_process(
         )
     parameters = estimate(samples, kernel, seed, starts)
     process = conditioned(parameters, samples, kernel, uneven_noise(samples))
-    return calibrated(centred(process))
+    return calibrated(process)
 
 
 def estimate(samples: Samples, kernel: Kernel, seed: int = 0, starts: int = 5) -> Hyperparameters:
@@ -105,28 +104,6 @@ def _parameters(natural: Array) -> Hyperparameters:
 
 # Samples below which a quantile of 95 % is the largest of all, and says little.
 LEAST_TO_CALIBRATE = 20
-
-
-def centred(process: GaussianProcess) -> GaussianProcess:
-    """Return the process about its best linear unbiased mean in place of the sample mean.
-
-    μ = 1ᵀK⁻¹t / 1ᵀK⁻¹1 (the ones of the values only), in scaled units: samples that stand
-    close together count less. Source: R & W, eq. 2.43, with a constant basis.
-    """
-    n = len(process.X)
-    ones = np.zeros(process.targets.size)
-    ones[:n] = 1.0
-    along = cho_solve((process.factor, True), ones)
-    mu = float(process.weights[:n].sum() / along[:n].sum())
-    moved = replace(
-        process,
-        output_mean=process.output_mean + process.output_scale * mu,
-        targets=process.targets - mu * ones,
-        weights=process.weights - mu * along,
-    )
-    residuals, _ = loo_errors(moved)
-    values = moved.output_mean + moved.output_scale * moved.targets[:n]
-    return replace(moved, loo=errors(residuals, values))
 
 
 def calibrated(process: GaussianProcess) -> GaussianProcess:

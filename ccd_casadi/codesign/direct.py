@@ -35,11 +35,6 @@ class Direct:
         Of the inner problem.
     box_points : int
         True inner problems over the box in the global check at the end.
-
-    Examples
-    --------
-    >>> Direct(starts=2).starts
-    2
     """
 
     starts: int = 4

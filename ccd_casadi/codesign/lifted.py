@@ -50,11 +50,6 @@ class Lifted:
         needs at n = 4, six times at n = 8.
     starts, tolerance, max_refinements, kernel, box_points
         As for `Nested`.
-
-    Examples
-    --------
-    >>> Lifted(points=24, tolerance=1e-4).starts
-    16
     """
 
     points: int = 0

@@ -47,11 +47,6 @@ class Nested:
         "matern52", "rbf", or "auto", which predicts left-out samples best.
     box_points : int
         True inner problems over the box in the global check at the end.
-
-    Examples
-    --------
-    >>> Nested(plan="sobol", points=24).starts
-    16
     """
 
     plan: str = "grid"

@@ -18,7 +18,7 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.cases.run_folder import read_json, with_function
+from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
@@ -38,6 +38,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_
 from ccd_casadi.inner_problem.sections_plant_set import (
     plants_of,
     sections_of_problem,
+    structure_of,
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
@@ -182,12 +183,17 @@ class SectionsOuter(ThetaOuter):
         return SectionsOuter(sampler.of(problem), words if lost else "")
 
     def continued(self, folder: Path, seed: int) -> "SectionsOuter":
-        """With the anchors and the plant set of a run, or those of a search where it has none."""
+        """With the anchors, plants and controller of a run; those of a search where it has none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
             return self.prepared(seed)
-        problem = with_function(path, sampler.problem, read_json(path))
-        return SectionsOuter(sampler.of(problem)).prepared(seed)
+        result = read_json(path)
+        problem = with_function(path, sampler.problem, result)
+        outer = SectionsOuter(sampler.of(problem)).prepared(seed)
+        if (folder / "controller.json").exists():
+            theta = [float(result["theta"][name]) for name in problem.names]
+            outer.sampler.climbed(theta, sections_kappa(folder, structure_of(problem)))
+        return outer
 
     def ended(self, x: Array) -> SectionsEnd:
         theta = self.theta_of(x)

@@ -1,11 +1,9 @@
 """Controllers of lower order, the loop measured and certified stable with each of them.
 
-Three ways, because none is the best at every order. Each balances K, and sets the states at rest
+Two ways, because neither is the best at every order. Each balances K, and sets the states at rest
 that matter least (singular perturbation, so that K(0) is kept):
 
 * its stable part (Moore 1981);
-* normalised left coprime factors K = M⁻¹N, the stable [N M] balanced: also the unstable poles of K
-  may go;
 * closed-loop balancing (Enns 1984; Ceton, Wortelboer and Bosgra 1993): balanced are the
   controller's blocks of the loop's Gramians from r to y, that is K weighted by S on its input
   and by S G on its output.
@@ -18,15 +16,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.linalg import (
-    LinAlgError,
-    block_diag,
-    eigh,
-    schur,
-    solve_continuous_are,
-    solve_sylvester,
-    svd,
-)
+from scipy.linalg import block_diag, eigh, schur, solve_sylvester, svd
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
 
 from ccd_casadi.deployment.channels import Channel
@@ -45,7 +35,6 @@ class Reduction(StrEnum):
     """How a controller was reduced."""
 
     PERTURBATION = "singular perturbation"
-    COPRIME = "coprime factors"
     CLOSED_LOOP = "closed-loop balancing"
     NONE = "as designed"
 
@@ -136,31 +125,6 @@ def _perturbation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | Non
     )
 
 
-def _coprime(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
-    """K = M⁻¹N with [N M] = (A + HC, [B + HD, H], C, [D, I]), normalised up to a constant."""
-    m, p = K.B.shape[1], K.C.shape[0]
-    R = np.eye(p) + K.D @ K.D.T
-    try:
-        Z = solve_continuous_are(K.A.T, K.C.T, K.B @ K.B.T, R, s=K.B @ K.D.T)
-    except (LinAlgError, ValueError):
-        return None
-    H = -(Z @ K.C.T + K.B @ K.D.T) @ np.linalg.inv(R)
-    factors = StateSpace(
-        K.A + H @ K.C, np.hstack([K.B + H @ K.D, H]), K.C, np.hstack([K.D, np.eye(p)])
-    )
-    small = _without_fast(factors, factors, r)
-    if abs(np.linalg.det(small.D[:, m:])) < NEGLIGIBLE:
-        return None
-    inverse = np.linalg.inv(small.D[:, m:])
-    back = small.B[:, m:] @ inverse
-    return StateSpace(
-        small.A - back @ small.C,
-        small.B[:, :m] - back @ small.D[:, :m],
-        inverse @ small.C,
-        inverse @ small.D[:, :m],
-    )
-
-
 def _closed_loop(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace:
     return _without_fast(K, closed_loop(plant.system, K).T, r)
 
@@ -197,7 +161,6 @@ def _residual(K: StateSpace, r: int) -> StateSpace:
 
 _METHODS: dict[Reduction, Callable[[ScaledPlant, StateSpace, int], StateSpace | None]] = {
     Reduction.PERTURBATION: _perturbation,
-    Reduction.COPRIME: _coprime,
     Reduction.CLOSED_LOOP: _closed_loop,
 }
 

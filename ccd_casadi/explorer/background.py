@@ -1,27 +1,20 @@
-"""What takes longer than a drag: exact searches, samples of a slow plant, and a whole solve."""
+"""What takes longer than a drag: exact searches, the model of a slow plant, a whole solve."""
 
 import multiprocessing
-import os
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.explorer.designs import elements_at
-from ccd_casadi.explorer.modes import Theta, fit_modes, plan
-from ccd_casadi.explorer.session import Session
-from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.explorer.known_plant import KnownPlant
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import become_worker
-
-BEHIND = 10  # niceness of what fills the box
 
 Progress = Callable[[str], None]
 Then = Callable[[Any], None]
@@ -31,12 +24,10 @@ Failed = Callable[[BaseException], None]
 _words: Any = None  # in a worker: where it tells how far it is
 
 
-def _prepare(user_code: bool, behind: bool, words: Any) -> None:
+def _prepare(user_code: bool, words: Any) -> None:
     """In a worker: one BLAS thread, Ctrl-C left to the parent, and no life beyond it."""
     global _words
     _words = words
-    if behind and hasattr(os, "nice"):
-        os.nice(BEHIND)  # the page comes first
     threadpool_limits(limits=1)
     permit_user_code(user_code).__enter__()
     become_worker()
@@ -48,15 +39,15 @@ def _working(given: tuple[Callable[[Any, Progress], Any], Any]) -> Any:
 
 
 class Background:
-    """One process for what the user waits for, the others for what makes dragging better.
+    """A process for what the user waits for, a thread for what makes dragging better.
 
     `then`, `failed` and `told` are called in another thread.
     """
 
-    def __init__(self, workers: int, user_code: bool = True) -> None:
-        self._sizes = {"asked": 1, "filling": max(1, workers - 1)}
+    def __init__(self, user_code: bool = True) -> None:
         self._user_code = user_code
-        self._pools: dict[str, ProcessPoolExecutor] = {}  # made when they are needed
+        self._process: ProcessPoolExecutor | None = None  # made when it is needed
+        self._thread = ThreadPoolExecutor(1)
         self._closed = False
         self._context = multiprocessing.get_context("spawn")
         self._words = self._context.SimpleQueue()
@@ -67,62 +58,23 @@ class Background:
         while (words := self._words.get()) is not None:
             self._told(words)
 
-    def _pool(self, name: str) -> ProcessPoolExecutor:
-        if name not in self._pools:
-            given = (self._user_code, name == "filling", self._words)
-            self._pools[name] = ProcessPoolExecutor(
-                self._sizes[name], self._context, _prepare, given
-            )
-        return self._pools[name]
-
     def ask(
         self, work: Callable[[Any, Progress], Any], task: Any, then: Then, failed: Failed,
         told: Progress = lambda words: None,
     ) -> Future:  # fmt: skip
         """Do what the user waits for, one after the other; `told` hears how far the work is."""
         self._told = told
-        return self._submit("asked", _working, (work, task), then, failed)
+        if self._process is None:
+            given = (self._user_code, self._words)
+            self._process = ProcessPoolExecutor(1, self._context, _prepare, given)
+        return self._submit(self._process, _working, (work, task), then, failed)
 
-    def fill(self, session: Session, problem: CoDesignProblem, told: Callable[[], None]) -> None:
-        """Sample a slow plant over its box and fit the surrogate of its modes again and again.
-
-        `told` is called after every sample and every fit. What was sampled is kept in the session's
-        folder.
-        """
-        known = session.known
-        assert known is not None
-        fitted = 0
-
-        def refit() -> None:
-            nonlocal fitted
-            if known.due(fitted):
-                fitted = len(known.exact)
-                task = (list(known.exact), list(known.exact.values()))
-                self._submit("filling", _fit, task, took, print_failure)
-                known.save(session.folder)
-
-        def took(found: Any) -> None:
-            known.surrogate = found
-            told()
-
-        def sampled(found: tuple[Theta, Mechanics]) -> None:
-            known.exact[found[0]] = found[1]
-            ended()
-            refit()
-
-        def ended(error: BaseException | None = None) -> None:
-            known.missing -= 1
-            told()
-
-        refit()
-        wanted = [t for t in plan(problem.lower, problem.upper) if t not in known.exact]
-        known.missing = len(wanted)
-        for theta in wanted:
-            self._submit("filling", _sample, (problem, theta), sampled, ended)
+    def renew(self, known: KnownPlant, then: Then) -> None:
+        """Make the model of a slow plant anew; of megabytes, it stays in this process."""
+        self._submit(self._thread, lambda _: known.renew(), None, then, print_failure)
 
     def _submit(
-        self, pool: str, work: Callable[[Any], Any], task: Any, then: Then,
-        failed: Failed,
+        self, pool: Executor, work: Callable[[Any], Any], task: Any, then: Then, failed: Failed,
     ) -> Future:  # fmt: skip
         def done(future: Future) -> None:
             if self._closed or future.cancelled():
@@ -133,7 +85,7 @@ class Background:
             else:
                 failed(error)
 
-        future = self._pool(pool).submit(work, task)
+        future = pool.submit(work, task)
         future.add_done_callback(done)
         return future
 
@@ -141,9 +93,10 @@ class Background:
         """End what is under way."""
         self._closed = True
         self._words.put(None)
-        for pool in self._pools.values():
-            running = list((pool._processes or {}).values())
-            pool.shutdown(wait=False, cancel_futures=True)
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        if self._process is not None:
+            running = list((self._process._processes or {}).values())
+            self._process.shutdown(wait=False, cancel_futures=True)
             for process in running:
                 process.terminate()
 
@@ -151,14 +104,6 @@ class Background:
 def print_failure(error: BaseException) -> None:
     """On stderr: what the page can do without."""
     print(f"warning: {error}", file=sys.stderr)
-
-
-def _sample(task: tuple[CoDesignProblem, Theta]) -> tuple[Theta, Mechanics]:
-    return task[1], elements_at(*task).system
-
-
-def _fit(task: tuple[list[Theta], list[Mechanics]]) -> Any:
-    return fit_modes(*task)
 
 
 class Solve:

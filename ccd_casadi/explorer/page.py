@@ -22,7 +22,6 @@ from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.explorer.landscape import landscape_of, run_surrogate
 from ccd_casadi.explorer.map_figure import MapFigure
 from ccd_casadi.explorer.message import Message
-from ccd_casadi.explorer.modes import frequency_error, in_modal_form
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure, cursor, legend_html
 from ccd_casadi.explorer.panels import EMPTY, FIGURES, LOOKS, OVER_HZ, Drawn, drawn
 from ccd_casadi.explorer.pins import Kept, Pins
@@ -80,7 +79,6 @@ class Page:
         self._message.applied_in(document)
         self.pins.table.tags = [self.answer, self._message]  # so that they are sent
         self.note, self.output = Div(name="note"), Div(name="output")
-        self.filling = Div(name="filling")
         self.modes = Div(stylesheets=[WIDE])
         self.design = _button("Design sections here", "design", self.design_sections)
         self.solve_button = _button("Solve from here", "solve", self.start_solve)
@@ -99,7 +97,7 @@ class Page:
         wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
         roots: dict[str, list[Any]] = {
             "controls": self.controls.all(),
-            "note_place": [self.note, self.filling, self.output],
+            "note_place": [self.note, self.output],
             "modes": [self.modes],
             "buttons_place": [wrapped],
             "pins_place": [self.pins.table],
@@ -139,15 +137,8 @@ class Page:
         self.document.add_timeout_callback(still, TOGETHER)
 
     def improved(self) -> None:
-        """There is a sample more of the modes; what is drawn is so anew where it is better so."""
-        known = self.session.known
-        assert known is not None
-        words = known.progress
-        self.filling.text = f"<p>{words}</p>" if words else ""
-        if (
-            self.now is not None
-            and self.now.look.elements.words != known.at(self.now.look.theta).words
-        ):
+        """The model of a slow plant was made anew: draw what is not the plant's own on it."""
+        if self.now is not None and not self.now.look.elements.exact:
             self.moved(False)
 
     def _answer(self) -> None:
@@ -251,12 +242,13 @@ class Page:
         known = self.session.known
         assert known is not None
         self.note.text = ""
-        fresh = look.theta not in known.exact  # a sample of the surrogate's own checks nothing
-        if fresh and known.surrogate is not None and in_modal_form(look.elements.system):
-            off = frequency_error(known.surrogate.at(look.theta), look.elements.system)
-            words = f"the surrogate's frequencies are off by {100.0 * off:.2g} % at most here"
+        count = len(known.exact)
+        off = self.session.took(look)
+        if off is not None:
+            words = f"the frequencies drawn while you dragged were off by {100.0 * off:.2g} % here"
             self.note.text = f"<p>{words}</p>"
-        self.session.took(look)
+        if len(known.exact) > count:
+            self.background.renew(known, self._then(lambda _: self.improved()))
         self.modes.text = modes
         if newest is None or newest == look.knobs:
             if self.controls.knobs() == look.knobs:

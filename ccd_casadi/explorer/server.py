@@ -41,7 +41,7 @@ class Explorer:
         self, session: Session, *, workers: int, seed: int = 0, user_code: bool = True
     ) -> None:
         self.session = session
-        self.background = Background(workers, user_code)
+        self.background = Background(user_code)
         self._pages: list[Page] = []
         self._kept: dict[str, Kept] = {}  # by the tab that the address names
         self._of_solves = ("--workers", str(workers), "--seed", str(seed))
@@ -61,9 +61,8 @@ class Explorer:
         self.url = f"http://{HOST}:{self._server.port}/{token}/"
         # known only now; Bokeh's own default is localhost by name
         self._server._tornado._websocket_origins = {f"{HOST}:{self._server.port}"}
-        problem = session.problems.at(session.start)
         if session.known is not None:
-            self.background.fill(session, problem, self._surrogate_made)
+            self.background.renew(session.known, self._renewed)
 
     def _document(self, document: Document) -> None:
         context = document.session_context
@@ -89,7 +88,7 @@ class Explorer:
         self._pages.remove(page)
         page.close()
 
-    def _surrogate_made(self) -> None:
+    def _renewed(self, _: None) -> None:
         for page in list(self._pages):
             page.document.add_next_tick_callback(page.improved)
 

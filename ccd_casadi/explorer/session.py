@@ -20,11 +20,11 @@ from ccd_casadi.explorer.designs import (
     without_controller,
 )
 from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
-from ccd_casadi.explorer.modes import KnownModes, in_modal_form
+from ccd_casadi.explorer.known_plant import KnownPlant
 from ccd_casadi.explorer.sections import Designed, anchored, judged_look
 from ccd_casadi.explorer.words import surface_modes_html
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.machine import lumped
 from ccd_casadi.sampling.rows import hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
@@ -55,13 +55,10 @@ class Session:
         self.search_seconds = np.inf  # of the last full search
         found = lumped(first.system)
         self.reference = 1.0 if found is None else float(np.abs(found.masses).max())
-        self.known: KnownModes | None = None
+        self.known: KnownPlant | None = None
         if self.slow:
-            key = problem_hash(problem.source.identity() | {"theta": list(problem.names)})
-            self.known = KnownModes(problem.lower, problem.upper, key)
-            self.known.exact[self.start.theta] = first.system
-            if in_modal_form(first.system):
-                self.known.load(folder, first.system)
+            self.known = KnownPlant(plant_of(problem), problem.lower, problem.upper)
+            self.known.learn(self.start.theta, first.system)
         inner = problem.inner
         # until something was searched: the middle of the ranges
         self.point = tuple(float(np.sqrt(a * b)) for a, b in (inner.omega_S, inner.omega_T))
@@ -116,11 +113,15 @@ class Session:
         """Whether a full search is over within a drag's patience."""
         return self.known is None and self.search_seconds < QUICK
 
-    def took(self, look: Look) -> None:
-        """A full search ended: its weights are those of the syntheses to come."""
+    def took(self, look: Look) -> float | None:
+        """A full search ended: its weights are those of the syntheses to come.
+
+        How far off the model of a slow plant was at this θ, relative; None where there was none.
+        """
         self.point = (look.figures.omega_S, look.figures.omega_T)
-        if self.known is not None and look.elements.exact:
-            self.known.exact[look.theta] = look.elements.system
+        if self.known is None or not look.elements.exact:
+            return None
+        return self.known.learn(look.theta, look.elements.system)
 
     def keep(self, looks: Sequence[Look]) -> None:
         """Write designs that were looked at into the store: a search with every synthesis of it.

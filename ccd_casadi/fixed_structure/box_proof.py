@@ -40,7 +40,7 @@ class ProofOutcome(StrEnum):
     OPEN = "stability is not proven on the whole box within the number of boxes"
     REFUTED = "a plant of the box exceeds a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
-    NOT_SQUARE = "the plant has not as many channels as outputs"
+    NOT_SQUARE = "the plant has several outputs and not as many channels"
     NOT_MODAL = "a given damping matrix couples the modes"
     VARIES = "a theta that varies moves the modes, so its range was searched"
 
@@ -125,7 +125,7 @@ def prove(
     outputs = inputs = np.eye(1)
     if isinstance(structure, ChannelStructure):
         outputs, inputs = structure.decoupling.outputs, structure.decoupling.inputs
-    if len(uncertain.options[0].C) != outputs.shape[1] or outputs.shape[0] != outputs.shape[1]:
+    if len(uncertain.options[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
         return Proof(ProofOutcome.NOT_SQUARE, slack, names)
     if uncertain.ranges:
         return Proof(ProofOutcome.VARIES, slack, names)
@@ -153,16 +153,17 @@ def prove(
     share = (most_boxes or MOST_BOXES) // len(models)
     if many and most_boxes is None:
         share = MOST_OF_MANY
-    whole = _divide(families, uncertain.box, slack, share)
+    whole = divide(families, uncertain.box, slack, share)
     bare = replace(bounds, weighted_level=None, compliance_max=None)
     if not several or bare == bounds or whole.proven or whole.refuted:
         return whole
     bared = [replace(own, bounds=bare) for own in families]
-    return replace(_divide(bared, uncertain.box, slack, share), of_S=True)
+    return replace(divide(bared, uncertain.box, slack, share), of_S=True)
 
 
-def _divide(families: list[LoopFamily], box: Array, slack: float, share: int) -> Proof:
-    """Branch and bound of every option, with so many boxes of each."""
+def divide(families: list[LoopFamily], box: Array, slack: float, share: int) -> Proof:
+    """Branch and bound of every option's loops, each stable at one point of `box` (2, n): so many
+    boxes of each."""
     levels: dict[str, float] = {}
     names, looked = families[0].names, 0
     for option, family in enumerate(families):

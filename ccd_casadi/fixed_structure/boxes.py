@@ -91,7 +91,7 @@ def axis_of(boxes: Boxes, period: float | None, delay: float) -> Axis:
 
 
 def gain_of(structure: Structure, kappa: Array, axis: Axis, integrator: bool) -> Affine:
-    """K of a structure, where all channels have an `integrator` y K."""
+    """K of a structure, or y K where the channels have an `integrator`."""
     values, x, y = np.exp(kappa), axis.x, axis.y
     one = Affine(np.ones(len(x.centre)), np.zeros_like(x.slope), np.zeros(len(x.centre)))
     above, below = one * values[0], one
@@ -109,6 +109,8 @@ def gain_of(structure: Structure, kappa: Array, axis: Axis, integrator: bool) ->
         above = above * x
     if structure.integrator and not integrator:
         below = below * y
+    if integrator and not structure.integrator:
+        above = above * y
     return above * inverse(below)
 
 

@@ -102,7 +102,12 @@ class LoopFamily:
         w, T = W.norms(), W.from_one(y).norms()
         # what is left: Δ, of which `known` by discs and `faintly` by gains not followed; then E
         grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
-        faintly = (_sizes(c, b) * (np.abs(m) + r)).sum(axis=0) * grain
+        apart = (
+            np.linalg.norm(self.plant.reading, axis=1)[:, None]
+            * np.abs(self.plant.drive @ self.inputs)
+            * np.linalg.norm(self.outputs, axis=0)
+        )
+        faintly = np.einsum("iN,ic,Nc->N", np.abs(m) + r, apart, faint)
         known = _left(others * r, c, rows)
         off = known + faintly + moved
         good &= damped & W.good & (w[0] * off < 1.0)
@@ -174,19 +179,25 @@ class LoopFamily:
 
     @property
     def _integrator(self) -> bool:
-        return all(own.integrator for own, _ in self.parts)
+        """Of one output any channel's holds it, of several each has its own."""
+        known = [own.integrator for own, _ in self.parts]
+        return any(known) if len(self.outputs) == 1 else all(known)
 
     def _gains(self, axis: Axis) -> tuple[np.ndarray, Array, Array]:
         """K̂ of every channel in the middle (N, c), and how far K̂ lies from it at most, relative
-        (N,); where that is far, as at infinity, the middle is 0 and |K̂| is in the last (N, c)."""
+        (N,); where that is far, as at infinity, the middle is 0 and |K̂| is in the last (N, c).
+
+        Where several channels share an output, E would not be a factor of theirs alone: how far
+        they lie from the middle is in the last too."""
         found, faint, loose = [], [], np.zeros(len(axis.x.centre))
+        own = self.outputs.shape[0] == self.outputs.shape[1]
         for structure, kappa in self.parts:
             K = gain_of(structure, kappa, axis, self._integrator)
             radius = K.reach + K.rest
             near = radius < FAR * np.abs(K.centre)
             found.append(np.where(near, K.centre, 0.0))
-            faint.append(np.where(near, 0.0, np.abs(K.centre) + radius))
-            loose = np.maximum(loose, np.where(near, radius / np.abs(K.centre), 0.0))
+            faint.append(np.where(near, 0.0 if own else radius, np.abs(K.centre) + radius))
+            loose = np.maximum(loose, np.where(near & own, radius / np.abs(K.centre), 0.0))
         return np.array(found).T, loose, np.array(faint).T
 
     def _inside(self, boxes: Boxes) -> Array:

@@ -25,8 +25,7 @@ OVERTAKING = 4.0  # times the gain of its last round: what a search behind may s
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
 MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
-LOWERED = 6  # steps at most to the bandwidth of a controller
-NEWTON = 8  # and to that of one that is known
+NEWTON = 8  # steps at most to the bandwidth of a controller
 WITHIN = 1e-4  # ln: a violation that the end of a search may have
 
 
@@ -102,24 +101,20 @@ def started(problem: LoopProblem, kappa: Array) -> Point:
     ω_low is none.
     """
     tau = problem.begin(kappa)
-    first = point = Point(kappa, tau, assess(problem, kappa, tau))
-    for _ in range(LOWERED):
-        peaks = point.assessment.peaks
-        if peaks is None or not (over := peaks.value > WITHIN).any():
-            return point
-        if not (peaks.to_tau[over] > 0.0).all():
-            break
-        tau -= float((peaks.value[over] / peaks.to_tau[over]).max())
-        if tau < np.log(problem.low):
-            break
-        point = Point(kappa, tau, assess(problem, kappa, tau))
-    return first
+    first = Point(kappa, tau, assess(problem, kappa, tau))
+    peaks = first.assessment.peaks
+    if peaks is None or not (over := peaks.value > WITHIN).any() or (peaks.to_tau[over] <= 0).any():
+        return first
+    own = at_its_bandwidth(problem, kappa)
+    inside = own.assessment.violation <= WITHIN and np.log(problem.low) <= own.tau < tau
+    return own if inside else first
 
 
 def at_its_bandwidth(problem: LoopProblem, kappa: Array) -> Point:
-    """A known controller at the largest ω_b that the shape and -3 dB leave it.
+    """A controller at the largest ω_b that the shape and -3 dB leave it.
 
-    From below a climb would first make another controller of it, and end in another optimum.
+    There a known one begins: from below a climb would first make another controller of it, and end
+    in another optimum.
     """
     tau = problem.begin(kappa)
     for _ in range(NEWTON):

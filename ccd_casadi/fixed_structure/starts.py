@@ -38,10 +38,10 @@ STIFFNESS_LINE = -1.0  # d ln|G|/d ln ω above which the stiffness holds what is
 def by_rules(problem: Problem, crossovers: Array) -> Array:
     """(N, n) controllers by rules: PID with roll-off at each crossover, notches at resonances.
 
-    Notches come narrow and wide, and shifted to either side; in one more shape the last biquad
-    lifts |L| at the first anti-resonance, whose dip bounds |S|. Of several biquads two are skewed
-    notches at the first resonance too, which turn its circle away from -1; where the shape ends at
-    ω_b the last one is a filter at the crossover instead.
+    Notches come narrow and wide, and shifted to either side; in two more shapes the last biquad is
+    a lead, or lifts |L| at the first anti-resonance, whose dip bounds |S|. Of several biquads two
+    are skewed notches at the first resonance too, which turn its circle away from -1; where the
+    shape ends at ω_b the last one is a filter at the crossover instead.
     """
     tops, count = problem.resonances, problem.structure.biquads
     plain = [(0.5, 1.0), (1.0, 1.0), (0.5, 0.8), (0.5, 1.25)]
@@ -54,7 +54,8 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
             shapes += [(1.0, 1.0, (ratio * crossover, 1.02, 0.1, 0.07)) for ratio in (0.7, 1.0)]
         elif skewed:
             shapes.append((0.5, 1.0, ()))  # the notches beyond the skewed ones
-        if count:  # the dip of |L| at an anti-resonance, where S rises too
+        if count:  # a lead of second order; the dip of |L| at an anti-resonance, where S rises too
+            shapes.append((0.5, 1.0, (8.0 * crossover, 0.125, 1.0, 0.7)))
             shapes += [(0.5, 1.0, (dip, 1.0, 0.5, 0.1)) for dip in problem.antiresonances[:1]]
         for turn, (width, below, lift) in enumerate(shapes):
             values = _around(problem, float(crossover), np.random.default_rng(0), 0.0)

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.inner_problem.objective import objective, objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_search import joined
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -33,14 +33,14 @@ def begun(
     problem: CoDesignProblem, known: Iterable[BandwidthSample], theta: Theta
 ) -> CoDesignProblem:
     """The problem with the neighbour's controller that promises most at a new θ as an anchor."""
-    samples, values = _usable(known), []
-    near = _nearest(problem, samples, theta)
-    for one in near:
-        values.append(one.value + float(np.subtract(theta, one.theta) @ one.gradient))
+    near = _nearest(problem, _usable(known), theta)
     if not near:
         return problem
-    best = np.argmax(values) if problem.figure.larger_is_better else np.argmin(values)
-    return joined(problem, np.array(near[best].kappa), ())
+
+    def promise(one: BandwidthSample) -> float:
+        return problem.figure.gain(_branch(one, theta, one.gradient), near[0].value)
+
+    return joined(problem, np.array(max(near, key=promise).kappa), ())
 
 
 def alone(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
@@ -59,40 +59,31 @@ def promised(
     Only where that counts: near the best θ, or where it would be a better one. `tried`: the κ that
     a θ was climbed from in vain.
     """
-    samples, figure, found = _usable(known), problem.figure, {}
-    if not samples:
-        return {}
-    lower, upper = box(problem)
-    best = min(samples, key=lambda sample: objective_of(problem, sample))
-    least = objective_of(problem, best)
+    samples = _usable(known)
+    found: dict[Theta, tuple[float, Theta]] = {}
+    best = min(samples, key=lambda one: objective_of(problem, one), default=None)
     for there in samples:
-        before = tried.get(there.theta, ())
-        if len(before) >= TRIES:
-            continue
-        hopes: list[tuple[float, Theta]] = []
-        for one in _nearest(problem, samples, there.theta):
-            slope = 0.5 * np.add(one.gradient, there.gradient)
-            value = one.value + float(np.subtract(there.theta, one.theta) @ slope)
-            away = np.abs(np.subtract(there.theta, best.theta) / (upper - lower)).max()
-            counts = away <= NEAR or objective(problem, there.theta, value) < least
-            if value > 0.0 and counts and one.kappa not in before:
-                hopes.append((figure.gain(value, there.value), one.kappa))
-        gain, kappa = max(hopes, default=(0.0, ()))
-        if gain > WORTH:
-            found[there.theta] = kappa
-    return found
-
-
-def better(problem: CoDesignProblem, one: BandwidthSample, than: BandwidthSample | None) -> bool:
-    """Whether a sample is to replace the one that is known at its θ."""
-    if than is None or not than.feasible:
-        return than is None or one.feasible
-    return one.feasible and problem.figure.gain(one.value, than.value) > 0.0
+        assert best is not None
+        theta, before = there.theta, tried.get(there.theta, ())
+        for one in _nearest(problem, samples, theta) if len(before) < TRIES else []:
+            value = _branch(one, theta, there.gradient)
+            counts = float(_away(problem, best.theta, theta)) <= NEAR
+            counts = counts or objective(problem, theta, value) < objective_of(problem, best)
+            gain = problem.figure.gain(value, there.value) if value > 0.0 else 0.0
+            if counts and one.kappa not in before and gain > found.get(theta, (WORTH, ()))[0]:
+                found[theta] = (gain, one.kappa)
+    return {theta: kappa for theta, (_, kappa) in found.items()}
 
 
 def _usable(known: Iterable[BandwidthSample]) -> list[BandwidthSample]:
     """Those with a controller of fixed structure, and slopes."""
     return [one for one in known if one.kappa and np.isfinite(one.gradient).all()]
+
+
+def _branch(one: BandwidthSample, theta: Theta, gradient: Theta) -> float:
+    """The value that a sample's branch has at another θ, where its gradient is this one."""
+    slope = 0.5 * np.add(one.gradient, gradient)
+    return one.value + float(np.subtract(theta, one.theta) @ slope)
 
 
 def _nearest(
@@ -102,7 +93,12 @@ def _nearest(
     others = [one for one in samples if one.theta != theta]
     if not others:
         return []
-    lower, upper = box(problem)
-    thetas: Array = np.array([one.theta for one in others])
-    away = np.abs((thetas - theta) / (upper - lower)).max(axis=1)
+    away = _away(problem, [one.theta for one in others], theta)
     return [others[i] for i in np.argsort(away, kind="stable")[: len(theta) + MORE]]
+
+
+def _away(problem: CoDesignProblem, thetas: Theta | Sequence[Theta], theta: Theta) -> Array:
+    """How far θ lie from one, in shares of the box."""
+    return np.asarray(
+        np.abs(np.subtract(thetas, theta) / np.subtract(problem.upper, problem.lower)).max(-1)
+    )

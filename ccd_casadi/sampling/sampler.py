@@ -18,7 +18,7 @@ from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.sampling.neighbours import alone, begun, better, promised
+from ccd_casadi.sampling.neighbours import alone, begun, promised
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import (
     BandwidthSample,
@@ -156,7 +156,9 @@ class Sampler:
                 sample = bandwidth_sample(theta, known)
             except (KeyError, TypeError, ValueError) as error:
                 raise self.store.damaged() from error
-            if better(self.problem, sample, self.solved.get(theta)):
+            before = self.solved.get(theta, sample)
+            gain = self.problem.figure.gain(sample.value, before.value)  # NaN: one is infeasible
+            if theta not in self.solved or gain > 0.0 or sample.feasible > before.feasible:
                 if theta in self.solved:
                     self.raised += 1
                     best = (best_key(self.inner_hash, theta), owners[theta], theta, known)

@@ -5,7 +5,6 @@ it held. What goes through the pipe is pickled, which is how Python's processes 
 processes that this one started, and is never stored.
 """
 
-import importlib
 import math
 import multiprocessing
 import os
@@ -16,6 +15,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from multiprocessing import connection, resource_tracker
 from typing import Any, ParamSpec, Self, TypeVar
 
@@ -174,7 +174,7 @@ def interrupts_held() -> Iterator[None]:
 def _serve(pipe: connection.Connection, module: str) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends."""
     become_worker()
-    importlib.import_module(module)
+    import_module(module)
     with suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(answered(pipe.recv_bytes()))

@@ -34,6 +34,8 @@ def test_importing_it_loads_nothing_that_can_wait(module: str, heavy: tuple[str,
         [sys.executable, "-c", words], capture_output=True, text=True, check=True
     )
     assert json.loads(found.stdout) == []
+
+
 # whose docstrings are prose still
 PROSE = {
     "Bounds", "CoDesignProblem", "Errors", "Extrapolation", "GaussianProcess", "Hyperparameters",

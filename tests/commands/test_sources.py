@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / name).rglob("*.py"))
 # Pipes between the processes of one run.
 LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/sampling/cluster.py"}
-# They import by names that sources spell out: optional packages, what a command needs, names.
+# They import by names that sources spell out: optional packages, what a command or a worker needs.
 # Processes of this Python with a module of the package; the person's C compiler on our own C code.
 PROCESSES = {
     ("ccd_casadi/deployment/fmu.py", "subprocess.run"),
@@ -22,6 +22,7 @@ PROCESSES = {
 BY_NAME = {
     "ccd_casadi/support/errors.py",
     "ccd_casadi/support/command_line.py",
+    "ccd_casadi/support/worker_process.py",
     "ccd_casadi/kernels/compilation.py",
     "ccd_casadi/kernels/compiled.py",
     "surrogates/lazy_names.py",

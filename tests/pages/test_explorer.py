@@ -16,13 +16,14 @@ from ccd_casadi.explorer.background import Solve
 from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
+from ccd_casadi.explorer.known_plant import KnownPlant, frequency_error
 from ccd_casadi.explorer.landscape import landscape_of
-from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.panels import FIGURES, drawn
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import machine_html, move_words, standing_html, survival_words
+from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.reporting.bode import loop_panels
 from ccd_casadi.reporting.machine import lumped, lumped_svg
 from ccd_casadi.reporting.true_samples import read_truths
@@ -295,35 +296,30 @@ def family(theta):
     return Mechanics(np.eye(3), np.zeros((3, 3)), lam, B, B.T.copy(), 0.01, none)
 
 
-def test_the_surrogate_of_the_modes_is_as_good_as_it_says(tmp_path):
-    lower, upper = (0.5, 1.0), (2.0, 3.0)
-    known = KnownModes(lower, upper, "a plant")
-    thetas = plan(lower, upper)
-    for theta in thetas[:32]:
-        known.exact[theta] = family(theta)
-    assert in_modal_form(family(thetas[0]))
-    assert known.due(0)
-    assert not known.due(32)
-    elements = known.at(thetas[40])
-    assert not elements.exact
-    assert "nearest exact" in elements.words
-    known.surrogate = fit_modes(list(known.exact), list(known.exact.values()))
-    away = [frequency_error(known.at(t).system, family(t)) for t in thetas[32:64]]
-    assert max(away) < 20.0 * known.surrogate.errors.max() + 1e-9
-    assert max(away) < 0.01
-    for theta in thetas[32:36]:
-        near, exact = known.at(theta), family(theta)
-        assert not near.exact
-        assert pytest.approx(exact.B, rel=0.01, abs=0.01) == near.system.B
-    assert known.at(thetas[0]).exact
-    known.save(tmp_path)
-    again = KnownModes(lower, upper, "a plant")
-    again.load(tmp_path, family(thetas[0]))
-    assert again.exact.keys() == known.exact.keys()
-    assert again.exact[thetas[3]].K.tolist() == known.exact[thetas[3]].K.tolist()
-    other = KnownModes(lower, upper, "another plant")
-    other.load(tmp_path, family(thetas[0]))
-    assert not other.exact
+def test_a_slow_plant_is_drawn_by_a_model_whose_error_was_measured(session):
+    problem = session.problems.at(session.start)
+    plant, start = plant_of(problem), np.array(session.start.theta)
+    known = KnownPlant(plant, problem.lower, problem.upper)
+    width = np.array(problem.upper) - np.array(problem.lower)
+    away = [tuple(start + share * width) for share in (0.005, 0.01, 0.02, 0.04)]
+
+    def own(theta):
+        return mechanics(plant, theta, derivatives=False)
+
+    assert known.learn(tuple(start), own(start)) is None
+    assert known.at(tuple(start)).exact
+    assert "nearest solved" in known.at(away[0]).words
+    known.renew()
+    off = [frequency_error(known.at(theta).system, own(theta)) for theta in away]
+    assert 0.0 < off[0] < 0.3 * off[1] < 0.09 * off[2]  # to first order: by the square of the step
+    assert known.at(away[0]).error == np.inf  # nothing was checked
+    assert known.learn(away[1], own(away[1])) == off[1]
+    assert known.at(away[0]).error == off[1]
+    assert not known.at(away[0]).exact
+    assert known.at(away[3]).error == np.inf  # farther away than what was checked
+    assert known.at(away[1]).exact
+    known.renew()
+    assert frequency_error(known.at(away[2]).system, own(away[2])) < off[2]
 
 
 def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):

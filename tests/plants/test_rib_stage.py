@@ -262,6 +262,21 @@ def test_outputs_decouple_the_square_stage_exactly() -> None:
     )
 
 
+def test_z_alone_has_the_modes_that_it_moves_and_is_that_channel() -> None:
+    alone = RibStage(order=COARSE, outputs="z").mechanics(B)
+    three = RibStage(order=COARSE, outputs="rigid").mechanics(B)
+    assert alone.B.shape == (len(alone.K), 1)
+    assert len(alone.K) < len(three.K)
+    for omega in (500.0, 3000.0, 8000.0):
+        z = response(alone, omega)[0, 0]
+        np.testing.assert_allclose(z, response(three, omega)[0, 0], rtol=1e-9)
+    for own, whole in zip(alone.derivatives[3:], three.derivatives[3:], strict=True):
+        assert own.size < whole.size
+    heavy = Geometry(point_masses=(PointMass(0.02, 0.0, 0.05),))
+    with pytest.raises(StageError, match="z moves tip or tilt"):
+        RibStage(geometry=heavy, order=COARSE, outputs="z").mechanics(B)
+
+
 def test_signs_hold_along_a_path() -> None:
     stage = RibStage(order=COARSE)
     path = [stage.mechanics(theta).B for theta in np.linspace(A, B, 7)]

@@ -172,6 +172,29 @@ def test_a_disc_holds_a_quotient_even_where_its_denominator_may_be_nought() -> N
         assert (np.abs(value - centre) <= radius * (1.0 + 1e-9)).all()
 
 
+@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
+def test_two_actuators_on_one_sensor_are_proven_together(sampling) -> None:
+    """One output, a channel for each actuator, an integrator in one of them."""
+    slopes = (*CARTS.derivatives[:4], np.zeros((0, 1, 4)))
+    one = replace(CARTS, C=READING[:1], derivatives=slopes)
+    box = UncertainPlant((one,), SUSPENSION, WEIGHTS.M_K, resonance_shift=0.02, gain=0.02)
+    fast = replace(ONE, integrator=False)
+    both = ChannelStructure(given_decoupling(("a", "b"), [[1], [1]], [[1, 0], [0, 1]]), (ONE, fast))
+    slow = KAPPA[: len(ONE.names)]
+    kappa = np.concatenate([slow, np.delete(slow, 1)])
+    kappa[len(ONE.names)] += np.log(0.1)
+    rng = np.random.default_rng(4)
+    points = [(0, box.box[0] + rng.random(2) * (box.box[1] - box.box[0])) for _ in range(20)]
+    found = certify(box.plants(points), both.state_space(kappa), BARE, sampling).plants
+    seen = max(one.S_peak for one in found)
+    assert all(one.stable for one in found)
+    proof = prove(box, both, kappa, 1.0, replace(BARE, S_max=seen), sampling)
+    assert proof.proven, proof.words
+    assert 1.0 <= proof.levels["S_MAX"] <= 1.05
+    refuted = prove(box, both, kappa, 1.0, replace(BARE, S_max=0.9 * seen), sampling, slack=1e-3)
+    assert refuted.outcome is ProofOutcome.REFUTED
+
+
 def test_the_norm_with_discs_holds_and_keeps_apart_what_is_apart() -> None:
     rng, count, n = np.random.default_rng(11), 30, 5
 

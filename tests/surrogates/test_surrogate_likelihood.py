@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-from surrogate_draws import BOX, KERNELS, drawn, few, seeds, smooth
+from surrogate_draws import KERNELS, drawn, few, seeds
 
-from surrogates import Hyperparameters, Kernel, design, fit, loo_errors
+from surrogates import Hyperparameters, Kernel
 from surrogates.covariance import covariance, observed_covariance, radial
 from surrogates.likelihood import log_likelihood
 
@@ -86,17 +86,3 @@ def test_likelihood_of_values_is_scikit_learns(kernel: Kernel) -> None:
     ours = log_likelihood(kernel, X, t, p)
     assert ours[0] == pytest.approx(expected, rel=1e-12)
     np.testing.assert_allclose(np.r_[ours[1][2], ours[1][:2], ours[1][3]], slope, rtol=1e-9)
-
-
-@pytest.mark.parametrize("with_gradients", [False, True])
-def test_fitted_mean_is_the_best_linear_unbiased_one(with_gradients: bool) -> None:
-    X = design("lhs", **BOX, n=14, seed=2)
-    Y, dY = smooth(X)
-    gp = fit(X, Y, **BOX, dY=dY if with_gradients else None, starts=1)
-    K = observed_covariance(gp.kernel, gp.X, gp.hyperparameters, with_gradients, gp.jitter)
-    ones = (np.arange(len(K)) < 14).astype(float)
-    # Generalised least squares of what is left about the mean: nothing.
-    left = ones @ np.linalg.solve(K, gp.targets) / (ones @ np.linalg.solve(K, ones))
-    assert abs(left) < 1e-6
-    residuals, _ = loo_errors(gp)
-    assert gp.loo.rms == pytest.approx(np.sqrt(np.mean(residuals**2)))

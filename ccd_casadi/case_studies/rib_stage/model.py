@@ -19,7 +19,9 @@ from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.threads import side_by_side
 
-OUTPUTS = ("corners", "rigid", "modal4")
+APART = 1e-9  # relative: a mode with less of z is not moved by it
+OUTPUTS = ("corners", "rigid", "modal4", "z")
+ROWS = {"z": 1, "rigid": 3, "modal4": 4}  # directions of those that are not the corners
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,8 @@ class RibStage:
 
     `actuators` and `sensors` are points (x, y) of the lower face in m; None means the four
     corners. `outputs`: "corners" keeps forces (N) and displacements (m) as they are, "rigid"
-    decouples to z, tip and tilt by orthonormal rigid-body directions, "modal4" adds the twist.
+    decouples to z, tip and tilt by orthonormal rigid-body directions, "modal4" adds the twist, "z"
+    keeps that alone and the modes that it moves, of a stage whose point masses leave it apart.
     `truncation`: "symmetry" keeps `modes` of each symmetry, so that crossing frequencies do not
     make the model jump; "frequency" keeps as many of the lowest of all. A stage whose point
     masses break the square has no symmetries and is truncated by frequency.
@@ -175,15 +178,22 @@ def assembled(
     sens = [points.index(p) for p in stage.sensor_points]
     B, dB, C, dC = u[:, act], du[:, :, act], u[:, sens].T, du[:, :, sens].transpose(0, 2, 1)
     if stage.outputs != "corners":
-        rows = 3 if stage.outputs == "rigid" else 4
-        drive = orthonormal_directions(stage.actuator_points, rows).T
-        read = orthonormal_directions(stage.sensor_points, rows)
+        rows = max(ROWS[stage.outputs], 3)
+        drive = orthonormal_directions(stage.actuator_points, rows)[: ROWS[stage.outputs]].T
+        read = orthonormal_directions(stage.sensor_points, rows)[: ROWS[stage.outputs]]
         B, dB, C, dC = B @ drive, dB @ drive, read @ C, read @ dC
+    K = np.diag([0.0, 0.0, 0.0, *lam])
+    if stage.outputs == "z":
+        moved = np.abs(B[:, 0]) > APART * np.abs(B).max()
+        if moved[1:3].any():
+            raise StageError("z moves tip or tilt of this stage; choose other outputs")
+        K, dK, n = K[moved][:, moved], dK[:, moved][:, :, moved], int(moved.sum())
+        B, dB, C, dC = B[moved], dB[:, moved], C[:, moved], dC[:, :, moved]
     zero = np.zeros((len(du), n, n))
     result = Mechanics(
         M=np.eye(n),
         D=np.zeros((n, n)),
-        K=np.diag([0.0, 0.0, 0.0, *lam]),
+        K=K,
         B=B,
         C=C,
         damping_ratio=stage.damping_ratio,

@@ -9,7 +9,7 @@ import casadi as ca
 from ccd_casadi.case_studies.rib_stage import reduced
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE, FINE, MeshOrder
-from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, RibStage
+from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, ROWS, RibStage
 from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
 from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
@@ -78,7 +78,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
 
     evaluate, theta = evaluator(stage, True), ca.SX.sym("theta", len(NAMES))
     mass, constraints = stage.hardware([theta[i] for i in evaluate.place])
-    count = {"rigid": 3, "modal4": 4}.get(stage.outputs)
+    count = ROWS.get(stage.outputs)
     references = {}
     if stage.modes != TWENTY:
         references["20 flexible modes"] = replace(stage, modes=TWENTY)
