@@ -83,6 +83,11 @@ class Outer(ABC):
         return np.asarray(x, float)[: len(self.problem.names)]
 
     @property
+    def may_try_again(self) -> bool:
+        """Whether searches from beside an end that is not stationary pay."""
+        return True
+
+    @property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of x."""
         return box(self.problem)

@@ -170,6 +170,10 @@ class SectionsOuter(ThetaOuter):
         super().__init__(sampler)
         self.words = words
 
+    @property
+    def may_try_again(self) -> bool:
+        return plant_of(self.problem).nearby is None
+
     def prepared(self, seed: int) -> "SectionsOuter":
         """Searched at the start for anchors and the plant set, where there are none."""
         sampler = self.sampler
@@ -280,11 +284,12 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     the sampler of the problem that has it: with more plants, where worse ones were found.
 
     By the joint search where J counts the bandwidth; from there, where J is not stationary, by
-    pieces (`pieces`), which know kinks.
+    pieces (`pieces`), which know kinks, unless each θ is a finite-element model.
     """
     if sampler.problem.figure is BANDWIDTH:
         sampler, best, _ = together(sampler, theta, teller("on the way", sampler.quiet))
-        if best.feasible and _stationary(sampler, best):
+        dear = plant_of(sampler.problem).nearby is not None
+        if best.feasible and (dear or _stationary(sampler, best)):
             return sampler, best
         theta = np.array(best.theta)
     problem = sampler.problem

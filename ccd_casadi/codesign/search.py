@@ -74,7 +74,8 @@ def _looked(found: Searched, formulation: Formulation, seed: int) -> Searched:
         look = look_over_box(outer, end, formulation.box_points, seed, outcome.surrogates)
     if look.x is not None:
         end = best_end([end, outer.ended(look.x)], outer.kkt_level, formulation.tolerance)
-    if np.isfinite(end.kkt.stationarity) and end.kkt.stationarity > outer.kkt_level:
+    residual = end.kkt.stationarity
+    if outer.may_try_again and np.isfinite(residual) and residual > outer.kkt_level:
         with outer.sampler.spent.on("polish"):
             starts = perturbed(outer, end.x, seed)
         ends = [end, *map(outer.ended, starts)]

@@ -120,10 +120,8 @@ def together(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = asked.kept("finished", (*best.theta, best.bandwidth), Place,
-                      partial(finished, problem, best))  # fmt: skip
-    if tell is not None:
-        tell("finished on the plants themselves")
+    make_end = partial(finished, problem, best)
+    best = asked.kept("finished", (*best.theta, best.bandwidth), Place, make_end)
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.climbed(best.theta, best.kappa)
@@ -135,12 +133,18 @@ def together(
 def finished(problem: CoDesignProblem, best: Place) -> Place:
     """The joint optimum near by, on the plants themselves to first order around each end before: so
     near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
+    lower, upper = box(problem)
+    models, reach = nearby(problem, (), best.theta), CLOSE
+    best, J = JointModel(problem, models, best, reach).adapted()
     for _ in range(ENDINGS):
-        models = nearby(problem, (), best.theta)
-        end = proposed(problem, models, best, CLOSE, LAST_GAIN).end
-        lower, upper = box(problem)
+        end = proposed(problem, models, best, reach, LAST_GAIN).end
         away = float(np.abs((np.array(end.theta) - best.theta) / (upper - lower)).max())
-        best = end
+        others = nearby(problem, (), end.theta)
+        end, there = JointModel(problem, others, end, reach).adapted()
+        if there < J:
+            best, J, models = end, there, others
+        else:
+            reach *= 0.1
         if away < MET:
             break
     return best
