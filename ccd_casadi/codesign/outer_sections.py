@@ -144,6 +144,7 @@ def teller(label: str, quiet: bool) -> Callable[[str], None]:
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
+WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -209,7 +210,7 @@ class SectionsOuter(ThetaOuter):
             worst, members = worst_members(problem, best.theta, found.design, 0, tell)
             raced = None if members else raced_at(asked, best)
             gap = 0.0 if raced is None else _gap(problem, best, raced)
-            if raced is None or gap <= WORTH:
+            if raced is None or gap <= (WORTH if self.may_try_again else WORTH_ELEMENTS):
                 break
             asked.climbed(best.theta, raced.design.kappa.tolist())
             theta = np.array(best.theta)
