@@ -153,7 +153,9 @@ def test_nested_looks_around_the_only_feasible_sample(reach: float) -> None:
             found.append(BandwidthSample(theta, value, (0.0, 1.0), 1e3, 1e2, (), "", 0.0, 1))
         return found
 
-    sampler = SimpleNamespace(problem=case, bandwidths=bandwidths, spent=Spent())
+    sampler = SimpleNamespace(
+        problem=case, bandwidths=bandwidths, spent=Spent(), latest=list, raised=0
+    )
     options = Nested(points=3, starts=4, max_refinements=3)
     found = solve_nested(sampler, options, seed=0)  # type: ignore[arg-type]
     assert len(asked) > 10 + 5  # the plan and the start, then around what is feasible
