@@ -52,7 +52,7 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     spent = (SimpleNamespace(),) * (rounds + 1)
     outcome = FormulationResult(end.x, spent, (process,), None, False, "")  # type: ignore[arg-type]
     outer = SimpleNamespace(
-        sampler=SimpleNamespace(spent=Spent()), kkt_level=1e-4,
+        sampler=SimpleNamespace(spent=Spent()), kkt_level=1e-4, may_try_again=False,
         samples_of=lambda end, inputs: (np.array([end.value]), np.full((1, 1), np.nan)),
         learnt=lambda outcome, end: Outer.learnt(outer, outcome, end),
     )  # fmt: skip

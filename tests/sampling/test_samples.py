@@ -209,6 +209,7 @@ def row(unit, i):
     reals = dict.fromkeys(NAMES, float(unit))
     return Sample(**(reals | {"key": f"{unit}-{i}", "theta": (float(unit), float(i)),
                   "outcome": "certified", "reason": name, "certified": True}))
+print('imported', flush=True)
 sys.stdin.readline()
 with SampleStore(path) as store:
     units = list(range(60))
@@ -230,7 +231,9 @@ def writer(path: Path, name: str, pause: float = 0.0) -> subprocess.Popen[str]:
 def test_processes_that_write_the_same_rows_at_once(tmp_path: Path) -> None:
     path = tmp_path / "s.sqlite"
     running = [writer(path, name) for name in "abc"]
-    time.sleep(0.6)  # imported: all of them create the file at the same moment
+    for process in running:  # then all of them create the file at the same moment
+        assert process.stdout is not None
+        assert process.stdout.readline() == "imported\n"
     for process in running:
         assert process.stdin is not None
         process.stdin.write("\n")
@@ -274,6 +277,7 @@ def test_a_kill_leaves_whole_units_only(tmp_path: Path) -> None:
         process = writer(path, str(attempt), 0.001)
         assert process.stdin is not None
         assert process.stdout is not None
+        assert process.stdout.readline() == "imported\n"
         process.stdin.write("\n")
         process.stdin.flush()
         told.add(int(process.stdout.readline()))
