@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,9 +25,11 @@ from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import pieces_from
-from ccd_casadi.codesign.theta_joint import together, with_members
+from ccd_casadi.codesign.theta_joint import objectives_beside, together, with_members
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
@@ -47,6 +49,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     judged_widely,
     proof_of,
     tolerance_prices,
+    worse_than_drawn,
     worst_members,
 )
 from ccd_casadi.inner_problem.sections_search import joined, least_from, prepared, race, with_range
@@ -131,6 +134,12 @@ def value_at(sampler: Sampler, best: BandwidthSample) -> SectionsValue:
     return sampler.of(problem).kept("value", best.theta, SectionsValue, make)
 
 
+def proven_at(sampler: Sampler, theta: Sequence[float], made: SectionsDesign) -> Proof:
+    """Branch and bound over the box of plants at θ, from the store if it is there."""
+    make = partial(proof_of, sampler.problem, theta, made)
+    return sampler.kept(f"proof {made.bandwidth!r}", theta, Proof, make)
+
+
 def teller(label: str, quiet: bool) -> Callable[[str], None]:
     """Lines of progress on stderr."""
 
@@ -173,7 +182,7 @@ class SectionsOuter(ThetaOuter):
 
     @property
     def may_try_again(self) -> bool:
-        return plant_of(self.problem).nearby is None
+        return not dear(self.problem)
 
     def prepared(self, seed: int) -> "SectionsOuter":
         """Searched at the start for anchors and the plant set, where there are none."""
@@ -201,10 +210,10 @@ class SectionsOuter(ThetaOuter):
         return outer
 
     def ended(self, x: Array) -> SectionsEnd:
-        theta = self.theta_of(x)
+        asked, theta = self.sampler, self.theta_of(x)
         for _ in range(TAKEN):
-            with self.sampler.spent.on("polish"):
-                asked, best = polish_sections(self.sampler, theta)
+            with asked.spent.on("polish"):
+                asked, best = polish_sections(asked, theta)
             problem, found = asked.problem, value_at(asked, best)
             tell = teller("at the end", asked.quiet)
             worst, members = worst_members(problem, best.theta, found.design, 0, tell)
@@ -221,11 +230,26 @@ class SectionsOuter(ThetaOuter):
         )  # fmt: skip
 
     def joined(self, end: End) -> "SectionsOuter | None":
+        """With the plants that it does not keep: those that were searched, or drawn."""
         end = cast(SectionsEnd, end)
-        if not end.members:
+        members = end.members or self._failing(end)
+        if not members:
             return None
         anchored = joined(end.asked.problem, end.found.design.kappa, ())
-        return SectionsOuter(with_members(end.asked.of(anchored), end.members))
+        return SectionsOuter(with_members(end.asked.of(anchored), members))
+
+    def _failing(self, end: SectionsEnd) -> tuple[Member, ...]:
+        """Plants drawn for this alone: those that judge the answer are drawn apart, at its end."""
+        asked, theta, made = end.asked, end.best.theta, end.found.design
+        if not end.feasible or proven_at(asked, theta, made).close:
+            return ()
+        draw = 1 + len(sections_of_problem(asked.problem).members)
+        drawn, failing = fresh_yield(asked.problem, theta, made, asked.workers, draw)
+        if drawn is None or not failing:
+            return ()
+        tell = teller("at the end", asked.quiet)
+        tell(drawn.words)
+        return worse_than_drawn(asked.problem, theta, made, failing, tell)
 
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)
@@ -234,10 +258,13 @@ class SectionsOuter(ThetaOuter):
         raced = raced_at(asked, best) if end.raced is None else end.raced
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        kkt = theta_kkt(problem, best, asked, end.found.envelope)
+        beside = partial(objectives_beside, problem, best, asked.quiet)
+        known = dear(problem) and problem.figure is BANDWIDTH
+        kkt = theta_kkt(problem, best, asked, end.found.envelope, beside if known else None)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
-        proof = proof_of(problem, best.theta, made)
-        drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
+        proof, drawn = proven_at(asked, best.theta, made), None
+        if not proof.close:
+            drawn = fresh_yield(problem, best.theta, made, asked.workers)[0]
         with Progress(1, "what limits it", quiet=asked.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = asked.kept("costs", best.theta, Costs, make)
@@ -280,6 +307,11 @@ def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: SectionsValue) 
     return problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
 
 
+def dear(problem: CoDesignProblem) -> bool:
+    """Whether the elements of another θ take as long as a search there."""
+    return plant_of(problem).nearby is not None
+
+
 def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more plants, where worse ones were found.
@@ -287,13 +319,13 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     By the joint search where J counts the bandwidth; from there, where J is not stationary, by
     pieces (`pieces`), which know kinks, unless each θ is a finite-element model.
     """
-    if sampler.problem.figure is BANDWIDTH:
+    problem = sampler.problem
+    if problem.figure is BANDWIDTH:
         sampler, best, _ = together(sampler, theta, teller("on the way", sampler.quiet))
-        dear = plant_of(sampler.problem).nearby is not None
-        if best.feasible and (dear or _stationary(sampler, best)):
+        problem = sampler.problem
+        if best.feasible and (dear(problem) or _stationary(sampler, best)):
             return sampler, best
         theta = np.array(best.theta)
-    problem = sampler.problem
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
     near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)

@@ -17,6 +17,7 @@ from functools import cache, partial
 
 import numpy as np
 
+from ccd_casadi.fixed_structure.composite import plants_of_rows
 from ccd_casadi.fixed_structure.decoupling import in_units_of
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
@@ -42,6 +43,7 @@ from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Progress
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
@@ -57,6 +59,7 @@ SETTLED = 3e-4  # of J: less is not worth another set of plants
 ENDINGS, CLOSE, MET = 3, 0.02, 1e-4  # searches on the plants to first order; of the box
 LAST_GAIN = 1e-10  # of w2 ω_b
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
+NEARLY = 0.02  # ln: of its bound, so near a plant may bind within a step of differences
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
 
 
@@ -159,6 +162,29 @@ def with_members(sampler: Sampler, members: Sequence[Member]) -> Sampler:
     return sampler.of(with_sections(sampler.problem, members=(*known, *members)))
 
 
+def objectives_beside(
+    problem: CoDesignProblem, sample: BandwidthSample, quiet: bool, thetas: Array
+) -> Array:
+    """By how much J is larger at θ (n, n_θ) beside a sample, by climbs of its controller on the
+    plants to first order there; of the set those that come `NEARLY` to a bound."""
+    here = Place(sample.theta, sample.kappa, sample.bandwidth)
+    models = nearby(problem, (), here.theta)
+    whole = JointModel(problem, models, here, 0.0)
+    _, kappa, tau = whole.parts(whole.start)
+    rows = assess(whole.first_loops, kappa, tau, each=True).peaks
+    assert rows is not None
+    near = np.unique(plants_of_rows(whole.first_loops, rows)[rows.value > -NEARLY])
+    members = [(option, tuple(point.tolist())) for option, point in
+               (whole.members[i] for i in near.tolist())]  # fmt: skip
+    problem, found = with_sections(problem, members=tuple(members)), []
+    with Progress(1 + len(thetas), "certificate", quiet=quiet) as bar:
+        for theta in [np.array(here.theta), *thetas]:
+            there = replace(here, theta=tuple(theta.tolist()))
+            found.append(JointModel(problem, models, there, 0.0).adapted(STEPS)[1])
+            bar.advance()
+    return np.array(found[1:]) - found[0]
+
+
 def proposed(
     problem: CoDesignProblem,
     models: Sequence[Evaluate],
@@ -215,14 +241,14 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         omega_b = float(np.exp(tau) * loops.plants.omega_0)
         return Place(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
 
-    def adapted(self) -> tuple[Place, float]:
+    def adapted(self, steps: int = ADAPTING) -> tuple[Place, float]:
         """The middle after a few steps of the controller alone, and J there with what is left of a
         violation; infinite where a loop is unstable."""
         z, kappa, tau = self.parts(self.start)
         found = assess(self.first_loops, kappa, tau)
         if not found.stable:
             return self.place(self.start), np.inf
-        point = ascend(self.first_loops, Point(kappa, tau, found), iterations=ADAPTING,
+        point = ascend(self.first_loops, Point(kappa, tau, found), iterations=steps,
                        radius=FIRST).point  # fmt: skip
         x = np.concatenate([z, point.kappa, [point.tau]])
         unmet = float(hardware_at(self.problem, self.middle).constraints.max(initial=0.0))

@@ -19,6 +19,9 @@ another controller is the better one beside it, true values there tell (`Kink.sl
 direction left its two sides are all that there is, of several directions some are looked along.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from scipy.linalg import qr
 from scipy.optimize import nnls
@@ -42,6 +45,7 @@ from ccd_casadi.support.arrays import Array
 # The envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3: a residual
 # below that says nothing of a kink.
 SMOOTH = 1e-3
+Beside = Callable[[Array], Array]
 EQUATION = 10.0  # weight of the controller's own conditions, which no θ may pay for
 BESIDE = 10.0 * STEP  # of the box: differences of true values and gradients
 
@@ -51,11 +55,13 @@ def theta_kkt(
     sample: BandwidthSample,
     truth: Sampler | None = None,
     envelope: Envelope | None = None,
+    beside: Beside | None = None,
 ) -> KktCertificate:
     """Residuals of optimality at a sample.
 
     With `envelope`, of the design there, also where ω_b* has a kink; where `truth` may be evaluated
-    with slopes to its sides, or the second-order check where it has none.
+    with slopes to its sides, or the second-order check where it has none. `beside`: where true
+    values are dear, by how much J is larger at θ (n, n_θ) next to it on plants to first order.
     """
     lower, upper = box(problem)
     width = upper - lower
@@ -82,9 +88,11 @@ def theta_kkt(
     Z = _steepest_first(at.free(nu), at.gradient)
     second = np.inf if Z.shape[1] == 0 else None
     if Z.shape[1] and truth is not None and kink is not None:
-        slopes = _slopes(problem, truth, sample, Z, at.size)
-        kink = Kink(kink.one_gradient, slopes, kink.multipliers)
-    elif Z.shape[1] and truth is not None:
+        slopes = _slopes(
+            problem, beside or partial(_more, problem, truth, sample), sample, Z, at.size
+        )
+        kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
+    elif Z.shape[1] and truth is not None and beside is None:
         second = reduced_curvature(Z, _hessian(problem, truth, sample, Z), at.size)
     return at.certificate(nu, residual, second, kink)
 
@@ -125,7 +133,7 @@ def _steepest_first(Z: Array, gradient: Array) -> Array:
 
 
 def _slopes(
-    problem: CoDesignProblem, truth: Sampler, sample: BandwidthSample, Z: Array, size: float
+    problem: CoDesignProblem, more: Beside, sample: BandwidthSample, Z: Array, size: float
 ) -> tuple[tuple[float, float], ...]:
     """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
     and over `size`; all are asked for at once."""
@@ -134,12 +142,19 @@ def _slopes(
     sides = np.array([sign * BESIDE * z * width for z in Z.T for sign in (-1.0, 1.0)])
     ends = np.clip(theta + sides, lower, upper)
     steps = np.linalg.norm((ends - theta) / width, axis=1)
-    J = objective(problem, sample.theta, sample.value)
     far = np.flatnonzero(steps > 0.5 * BESIDE)
     found = np.full(len(ends), np.nan)
-    for i, there in zip(far, truth.bandwidths(ends[far], "certificate"), strict=True):
-        found[i] = (objective(problem, there.theta, there.value) - J) / (steps[i] * size)
+    found[far] = more(ends[far]) / (steps[far] * size)
     return tuple((float(low), float(high)) for low, high in found.reshape(-1, 2))
+
+
+def _more(
+    problem: CoDesignProblem, truth: Sampler, sample: BandwidthSample, thetas: Array
+) -> Array:
+    """By how much J is larger at θ (n, n_θ) than at a sample."""
+    J = objective(problem, sample.theta, sample.value)
+    there = truth.bandwidths(thetas, "certificate")
+    return np.array([objective(problem, one.theta, one.value) - J for one in there])
 
 
 def _hessian(

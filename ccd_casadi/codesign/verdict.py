@@ -105,7 +105,8 @@ def optimal(
         return Line(State.FAILED, f"{words}; {known}", figures)
     words = (
         f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
-        f"controller together, {kink.one_gradient:.2g} with one side's gradient alone; true J "
+        f"controller together, {kink.one_gradient:.2g} with one side's gradient alone; "
+        f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
     known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)

@@ -75,12 +75,16 @@ def worse_members(
     turn: int,
     progress: Progress | None = None,
     within: float = WITHIN,
+    begin: Sequence[tuple[int, Array]] = (),
 ) -> tuple[Excess, tuple[Member, ...]]:
-    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
+    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`.
+
+    From those to `begin` at, or from a lattice.
+    """
     sections = sections_of_problem(problem)
     heads, count = worst_plants(
         uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem), sections.sampling,
-        seed=sections.seed + turn,
+        seed=sections.seed + turn, begin=begin,
     )  # fmt: skip
     if progress is not None:
         progress(f"{np.exp(heads[0].value):.6g} of a bound at most on {count} plants")
@@ -121,19 +125,24 @@ def fresh_yield(
     theta: Sequence[float],
     made: SectionsDesign,
     workers: Pool | None = None,
-) -> Yield | None:
-    """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
+    draw: int = 0,
+) -> tuple[Yield | None, tuple[Member, ...]]:
+    """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged; and
+    those that do not.
 
-    The options are drawn alike often. None where there is no box to draw from.
+    The options are drawn alike often. None where there is no box to draw from. Each `draw` has its
+    own plants.
     """
     sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
     if not uncertain.names or made.controller is None:
-        return None
+        return None, ()
     count = FRESH if plant_of(problem).outputs == 1 else FRESH_OF_SEVERAL
-    rng, (low, high) = np.random.default_rng((sections.seed, FRESH_SEED)), uncertain.box
+    rng = np.random.default_rng((sections.seed, FRESH_SEED + draw))
+    low, high = uncertain.box
     option = rng.integers(len(uncertain.options), size=count).tolist()
     point = rng.uniform(low, high, (count, len(low)))
-    plants = uncertain.plants(list(zip(option, point, strict=True)))
+    points = list(zip(option, point, strict=True))
+    plants = uncertain.plants(points)
     found = _judged(problem, plants, made.controller, workers).plants
     bounds, least = bounds_of(problem).looser(LOOSE), made.bandwidth * (1.0 - LOOSE)
     kept = [
@@ -142,7 +151,25 @@ def fresh_yield(
         <= 1.0 + TOLERANCE
         for one in found
     ]  # fmt: skip
-    return Yield(sum(kept), count)
+    failing = [(o, tuple(map(float, p))) for (o, p), keeps in zip(points, kept, strict=True)
+               if not keeps]  # fmt: skip
+    return Yield(sum(kept), count), tuple(failing)
+
+
+def worse_than_drawn(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    failing: Sequence[Member],
+    progress: Progress | None = None,
+) -> tuple[Member, ...]:
+    """The worst plants near those that failed, or these themselves: what the set lacks."""
+    begin = [(option, np.array(point)) for option, point in failing]
+    uncertain = uncertain_plant(problem, theta)
+    found = worse_members(
+        problem, uncertain, made.kappa, made.bandwidth, 0, progress, begin=begin
+    )[1]  # fmt: skip
+    return found or tuple(failing[:AT_ONCE])
 
 
 def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Proof:

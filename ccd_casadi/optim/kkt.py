@@ -29,12 +29,14 @@ class Kink:
     one_gradient: the residual with that of one side alone. slopes: of J to the two sides of each of
     some orthogonal directions, all that the active bounds leave; differences of true values, per
     share of the box, over ‖∇J‖∞; NaN where there is no design. multipliers: of the bounds on the
-    loop by kind, change of ln of the inner value per ln of a bound.
+    loop by kind, change of ln of the inner value per ln of a bound. first_order: the slopes are on
+    plants to first order, climbed to from the design's controller.
     """
 
     one_gradient: float
     slopes: tuple[tuple[float, float], ...]
     multipliers: dict[str, float]
+    first_order: bool = False
 
     @property
     def least_slope(self) -> float:

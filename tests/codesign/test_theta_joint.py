@@ -10,7 +10,7 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
-from ccd_casadi.codesign.theta_joint import JointModel, Place, proposed, together
+from ccd_casadi.codesign.theta_joint import JointModel, Place, objectives_beside, proposed, together
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
@@ -108,6 +108,11 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         again = together(other, np.array(problem.start))[1]
         assert (again.theta, again.kappa) == (best.theta, best.kappa)  # all from the store
         assert other.spent.total == spent
+        # Beside it J is told by plants to first order as by true ones, but for their curvature.
+        there = np.array(best.theta) + 0.03 * np.array([[1, 0], [0, 1], [1, 1]])
+        told = objectives_beside(problem, best, True, there)
+        true = [objective_of(problem, one) for one in sampler.bandwidths(there)]
+        assert told == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
 
 
 def test_where_each_theta_is_dear_none_is_sampled() -> None:

@@ -113,7 +113,7 @@ def mechanics(stage: RibStage, made: Sequence[Basis], theta: Sequence[float]) ->
     return assembled(stage, lam[3:], u, du, dK)
 
 
-@lru_cache(maxsize=12)  # of each stage those that grow from each other
+@lru_cache(maxsize=6)  # of three stages the last and the one that it grows from
 def bases(stage: RibStage, known: tuple[Theta, ...]) -> tuple[Basis, ...]:
     """Those of the groups of the square, from what is known at some θ."""
     disc, here = discretisation(stage), np.array(known[-1])
