@@ -49,7 +49,6 @@ from ccd_casadi.inner_problem.sections_robustness import (
     judged_widely,
     proof_of,
     tolerance_prices,
-    worse_than_drawn,
     worst_members,
 )
 from ccd_casadi.inner_problem.sections_search import joined, least_from, prepared, race, with_range
@@ -245,11 +244,9 @@ class SectionsOuter(ThetaOuter):
             return ()
         draw = 1 + len(sections_of_problem(asked.problem).members)
         drawn, failing = fresh_yield(asked.problem, theta, made, asked.workers, draw)
-        if drawn is None or not failing:
-            return ()
-        tell = teller("at the end", asked.quiet)
-        tell(drawn.words)
-        return worse_than_drawn(asked.problem, theta, made, failing, tell)
+        if drawn is not None:
+            teller("at the end", asked.quiet)(drawn.words)
+        return failing
 
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)

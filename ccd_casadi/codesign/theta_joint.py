@@ -17,7 +17,6 @@ from functools import cache, partial
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.composite import plants_of_rows
 from ccd_casadi.fixed_structure.decoupling import in_units_of
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
@@ -59,7 +58,6 @@ SETTLED = 3e-4  # of J: less is not worth another set of plants
 ENDINGS, CLOSE, MET = 3, 0.02, 1e-4  # searches on the plants to first order; of the box
 LAST_GAIN = 1e-10  # of w2 ω_b
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
-NEARLY = 0.02  # ln: of its bound, so near a plant may bind within a step of differences
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
 
 
@@ -166,17 +164,9 @@ def objectives_beside(
     problem: CoDesignProblem, sample: BandwidthSample, quiet: bool, thetas: Array
 ) -> Array:
     """By how much J is larger at θ (n, n_θ) beside a sample, by climbs of its controller on the
-    plants to first order there; of the set those that come `NEARLY` to a bound."""
-    here = Place(sample.theta, sample.kappa, sample.bandwidth)
+    plants to first order there."""
+    here, found = Place(sample.theta, sample.kappa, sample.bandwidth), []
     models = nearby(problem, (), here.theta)
-    whole = JointModel(problem, models, here, 0.0)
-    _, kappa, tau = whole.parts(whole.start)
-    rows = assess(whole.first_loops, kappa, tau, each=True).peaks
-    assert rows is not None
-    near = np.unique(plants_of_rows(whole.first_loops, rows)[rows.value > -NEARLY])
-    members = [(option, tuple(point.tolist())) for option, point in
-               (whole.members[i] for i in near.tolist())]  # fmt: skip
-    problem, found = with_sections(problem, members=tuple(members)), []
     with Progress(1 + len(thetas), "certificate", quiet=quiet) as bar:
         for theta in [np.array(here.theta), *thetas]:
             there = replace(here, theta=tuple(theta.tolist()))

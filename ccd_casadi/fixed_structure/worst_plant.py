@@ -115,17 +115,13 @@ def worst_plants(
     *,
     seed: int = 0,
     count: int = LATTICE,
-    begin: Sequence[tuple[int, Array]] = (),
 ) -> tuple[list[Excess], int]:
-    """The worst plants found, the worst first, and how many were looked at.
-
-    Searched from the worst of a lattice of `count` plants, or from those to `begin` at.
-    """
+    """The worst plants found, the worst first, and how many were looked at."""
 
     def values(points: Sequence[tuple[int, Array]]) -> Array:
         return excesses(uncertain, points, structure, kappa, bandwidth, bounds, sampling)
 
-    points = list(begin) or lattice(uncertain, count, seed)
+    points = lattice(uncertain, count, seed)
     value = values(points)
     looked, n = len(points), len(uncertain.names)
     first = np.argsort(-value)[:SEARCHES]

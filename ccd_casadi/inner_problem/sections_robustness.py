@@ -75,16 +75,12 @@ def worse_members(
     turn: int,
     progress: Progress | None = None,
     within: float = WITHIN,
-    begin: Sequence[tuple[int, Array]] = (),
 ) -> tuple[Excess, tuple[Member, ...]]:
-    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`.
-
-    From those to `begin` at, or from a lattice.
-    """
+    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
     sections = sections_of_problem(problem)
     heads, count = worst_plants(
         uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem), sections.sampling,
-        seed=sections.seed + turn, begin=begin,
+        seed=sections.seed + turn,
     )  # fmt: skip
     if progress is not None:
         progress(f"{np.exp(heads[0].value):.6g} of a bound at most on {count} plants")
@@ -128,7 +124,7 @@ def fresh_yield(
     draw: int = 0,
 ) -> tuple[Yield | None, tuple[Member, ...]]:
     """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged; and
-    those that do not.
+    some that do not, to be added.
 
     The options are drawn alike often. None where there is no box to draw from. Each `draw` has its
     own plants.
@@ -141,8 +137,7 @@ def fresh_yield(
     low, high = uncertain.box
     option = rng.integers(len(uncertain.options), size=count).tolist()
     point = rng.uniform(low, high, (count, len(low)))
-    points = list(zip(option, point, strict=True))
-    plants = uncertain.plants(points)
+    plants = uncertain.plants(list(zip(option, point, strict=True)))
     found = _judged(problem, plants, made.controller, workers).plants
     bounds, least = bounds_of(problem).looser(LOOSE), made.bandwidth * (1.0 - LOOSE)
     kept = [
@@ -151,25 +146,8 @@ def fresh_yield(
         <= 1.0 + TOLERANCE
         for one in found
     ]  # fmt: skip
-    failing = [(o, tuple(map(float, p))) for (o, p), keeps in zip(points, kept, strict=True)
-               if not keeps]  # fmt: skip
-    return Yield(sum(kept), count), tuple(failing)
-
-
-def worse_than_drawn(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    made: SectionsDesign,
-    failing: Sequence[Member],
-    progress: Progress | None = None,
-) -> tuple[Member, ...]:
-    """The worst plants near those that failed, or these themselves: what the set lacks."""
-    begin = [(option, np.array(point)) for option, point in failing]
-    uncertain = uncertain_plant(problem, theta)
-    found = worse_members(
-        problem, uncertain, made.kappa, made.bandwidth, 0, progress, begin=begin
-    )[1]  # fmt: skip
-    return found or tuple(failing[:AT_ONCE])
+    failing = [(option[i], tuple(point[i].tolist())) for i in np.flatnonzero(~np.array(kept))]
+    return Yield(sum(kept), count), tuple(failing[:AT_ONCE])
 
 
 def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Proof:
