@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,8 +28,6 @@ from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import objectives_beside, together, with_members
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
-from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
@@ -133,12 +131,6 @@ def value_at(sampler: Sampler, best: BandwidthSample) -> SectionsValue:
     return sampler.of(problem).kept("value", best.theta, SectionsValue, make)
 
 
-def proven_at(sampler: Sampler, theta: Sequence[float], made: SectionsDesign) -> Proof:
-    """Branch and bound over the box of plants at θ, from the store if it is there."""
-    make = partial(proof_of, sampler.problem, theta, made)
-    return sampler.kept(f"proof {made.bandwidth!r}", theta, Proof, make)
-
-
 def teller(label: str, quiet: bool) -> Callable[[str], None]:
     """Lines of progress on stderr."""
 
@@ -153,6 +145,7 @@ def teller(label: str, quiet: bool) -> Callable[[str], None]:
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
 WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
+LOOKS, APART = 5, 100  # for plants that an end does not keep, each elsewhere in the box
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -229,24 +222,19 @@ class SectionsOuter(ThetaOuter):
         )  # fmt: skip
 
     def joined(self, end: End) -> "SectionsOuter | None":
-        """With the plants that it does not keep: those that were searched, or drawn."""
+        """With plants that it does not keep, of those searched or drawn for this alone: fresh ones
+        judge the answer."""
         end = cast(SectionsEnd, end)
-        members = end.members or self._failing(end)
+        problem, theta, members = end.asked.problem, end.best.theta, end.members
+        tell = teller("at the end", end.asked.quiet)
+        for look in range(1, LOOKS + 1 if end.feasible and not members else 1):
+            members = worst_members(problem, theta, end.found.design, APART + look, tell)[1]
+            if members:
+                break
         if not members:
             return None
-        anchored = joined(end.asked.problem, end.found.design.kappa, ())
+        anchored = joined(problem, end.found.design.kappa, ())
         return SectionsOuter(with_members(end.asked.of(anchored), members))
-
-    def _failing(self, end: SectionsEnd) -> tuple[Member, ...]:
-        """Plants drawn for this alone: those that judge the answer are drawn apart, at its end."""
-        asked, theta, made = end.asked, end.best.theta, end.found.design
-        if not end.feasible or proven_at(asked, theta, made).close:
-            return ()
-        draw = 1 + len(sections_of_problem(asked.problem).members)
-        drawn, failing = fresh_yield(asked.problem, theta, made, asked.workers, draw)
-        if drawn is not None:
-            teller("at the end", asked.quiet)(drawn.words)
-        return failing
 
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)
@@ -259,9 +247,8 @@ class SectionsOuter(ThetaOuter):
         known = dear(problem) and problem.figure is BANDWIDTH
         kkt = theta_kkt(problem, best, asked, end.found.envelope, beside if known else None)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
-        proof, drawn = proven_at(asked, best.theta, made), None
-        if not proof.close:
-            drawn = fresh_yield(problem, best.theta, made, asked.workers)[0]
+        proof = proof_of(problem, best.theta, made, asked.workers)
+        drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
         with Progress(1, "what limits it", quiet=asked.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = asked.kept("costs", best.theta, Costs, make)

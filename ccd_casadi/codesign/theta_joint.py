@@ -46,6 +46,7 @@ from ccd_casadi.support.progress import Progress
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
+KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that worse plants are looked for and the plants made anew
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 PENALTY = (
@@ -111,7 +112,7 @@ def together(
             break
         if not promised:
             continue
-        known.append(found.end.theta)
+        known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
         models = nearby(problem, known, found.end.theta)
         end, there = JointModel(problem, models, found.end, reach).adapted()
         gained = J - there

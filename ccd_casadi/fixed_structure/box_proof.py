@@ -21,6 +21,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool, Workers
 
 SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
 SLACK_OF_MANY = 0.05  # of several channels or many parameters
@@ -110,13 +111,14 @@ def prove(
     *,
     slack: float | None = None,
     most_boxes: int | None = None,
+    workers: Pool | None = None,
 ) -> Proof:
     """Bounds and stability of the SI controller κ with ω_b (rad/s) on the whole box.
 
     Of plants with modal damping. The box is that of `uncertain`, all its options; the plant's
     modal data and κ count as exact. Of several channels or more than four parameters with
     `SLACK_OF_MANY` by default, and of several channels the whole's bounds; where the boxes do not
-    suffice for all of these, those on |S| alone.
+    suffice for all of these, those on |S| alone. The options are spread over `workers`.
     """
     names = uncertain.names
     several = isinstance(structure, ChannelStructure)
@@ -153,50 +155,65 @@ def prove(
     share = (most_boxes or MOST_BOXES) // len(models)
     if many and most_boxes is None:
         share = MOST_OF_MANY
-    whole = divide(families, uncertain.box, slack, share)
+    whole = divide(families, uncertain.box, slack, share, workers)
     bare = replace(bounds, weighted_level=None, compliance_max=None)
     if not several or bare == bounds or whole.proven or whole.refuted:
         return whole
     bared = [replace(own, bounds=bare) for own in families]
-    return replace(divide(bared, uncertain.box, slack, share), of_S=True)
+    return replace(divide(bared, uncertain.box, slack, share, workers), of_S=True)
 
 
-def divide(families: list[LoopFamily], box: Array, slack: float, share: int) -> Proof:
+def divide(
+    families: list[LoopFamily], box: Array, slack: float, share: int, workers: Pool | None = None
+) -> Proof:
     """Branch and bound of every option's loops, each stable at one point of `box` (2, n): so many
     boxes of each."""
+    tasks = [(option, family, box, slack, share) for option, family in enumerate(families)]
+    found = dict((workers or Workers(1)).map_unordered(_divided_option, tasks))
+    proofs = [found[option] for option in range(len(families))]
+    for proof in proofs:
+        if proof.refuted:
+            return proof
     levels: dict[str, float] = {}
-    names, looked = families[0].names, 0
-    for option, family in enumerate(families):
-        queue, spent = [_first(family, box)], 0
-        while queue:
-            boxes = queue.pop(0)
-            for start in range(0, len(boxes.chart), AT_ONCE):
-                part = boxes.only(np.arange(start, min(start + AT_ONCE, len(boxes.chart))))
-                with np.errstate(all="ignore"):  # of boxes that enclose nothing
-                    found = family.enclose(part)
-                spent += len(part.chart)
-                worst = found.highest.max(axis=0)
-                k, j = np.unravel_index(np.argmax(found.lowest), found.lowest.shape)
-                if found.lowest[k, j] > 1.0 + slack:
-                    middle = 0.5 * (part.low + part.high)[1:, j]
-                    passed = (found.names[k], float(found.lowest[k, j]))
-                    return Proof(ProofOutcome.REFUTED, slack, names, {}, looked + spent, option,
-                                 tuple(map(float, middle)), passed)  # fmt: skip
-                closed = worst <= 1.0 + slack
-                if spent >= share:
-                    closed[:] = True
-                for name, value in zip(found.names, found.highest[:, closed], strict=True):
-                    levels[name] = max(levels.get(name, 0.0), float(value.max(initial=0.0)))
-                if not closed.all():
-                    queue.append(_divided(part.only(~closed), found.spread[:, ~closed]))
-        looked += spent
+    for name, value in (item for proof in proofs for item in proof.levels.items()):
+        levels[name] = max(levels.get(name, 0.0), value)
     highest = max(levels.values(), default=0.0)
     outcome = ProofOutcome.PROVEN
     if not np.isfinite(highest):
         outcome = ProofOutcome.OPEN
     elif highest > 1.0 + slack:
         outcome = ProofOutcome.LOOSER
-    return Proof(outcome, slack, names, levels, looked)
+    boxes = sum(proof.boxes for proof in proofs)
+    return Proof(outcome, slack, families[0].names, levels, boxes)
+
+
+def _divided_option(task: tuple[int, LoopFamily, Array, float, int]) -> tuple[int, Proof]:
+    """The number of an option, and what is proven of it; its outcome is refuted, or still open."""
+    option, family, box, slack, share = task
+    levels: dict[str, float] = {}
+    names, queue, spent = family.names, [_first(family, box)], 0
+    while queue:
+        boxes = queue.pop(0)
+        for start in range(0, len(boxes.chart), AT_ONCE):
+            part = boxes.only(np.arange(start, min(start + AT_ONCE, len(boxes.chart))))
+            with np.errstate(all="ignore"):  # of boxes that enclose nothing
+                found = family.enclose(part)
+            spent += len(part.chart)
+            worst = found.highest.max(axis=0)
+            k, j = np.unravel_index(np.argmax(found.lowest), found.lowest.shape)
+            if found.lowest[k, j] > 1.0 + slack:
+                middle = 0.5 * (part.low + part.high)[1:, j]
+                passed = (found.names[k], float(found.lowest[k, j]))
+                return option, Proof(ProofOutcome.REFUTED, slack, names, {}, spent, option,
+                                     tuple(map(float, middle)), passed)  # fmt: skip
+            closed = worst <= 1.0 + slack
+            if spent >= share:
+                closed[:] = True
+            for name, value in zip(found.names, found.highest[:, closed], strict=True):
+                levels[name] = max(levels.get(name, 0.0), float(value.max(initial=0.0)))
+            if not closed.all():
+                queue.append(_divided(part.only(~closed), found.spread[:, ~closed]))
+    return option, Proof(ProofOutcome.OPEN, slack, names, levels, spent)
 
 
 def _first(family: LoopFamily, box: Array) -> Boxes:

@@ -29,6 +29,7 @@ class Triangular:
     def __init__(self, systems: Sequence[StateSpace]) -> None:
         forms = [schur(x.A, output="complex") for x in systems]
         self.T = np.array([T for T, _ in forms])
+        self.coupled = np.triu((self.T != 0.0).any(axis=0), 1)  # few states of a modal plant are
         self.B = np.array([Q.conj().T @ x.B for (_, Q), x in zip(forms, systems, strict=True)])
         self.C = np.array([x.C @ Q for (_, Q), x in zip(forms, systems, strict=True)])
         self.D = np.array([x.D for x in systems])
@@ -50,8 +51,8 @@ class Triangular:
         known: dict[int, np.ndarray] = {}
         for i in reversed(range(T.shape[-1])):
             right = B[..., i, :] + np.zeros((*s.shape, 1), complex)
-            for j, value in known.items():
-                right += T[..., i, j, None] * value
+            for j in np.flatnonzero(self.coupled[i]).tolist():
+                right += T[..., i, j, None] * known[j]
             known[i] = right / (s - T[..., i, i])[..., None]
             total += C[..., :, i, None] * known[i][..., None, :]
         return total

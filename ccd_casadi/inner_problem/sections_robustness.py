@@ -121,20 +121,16 @@ def fresh_yield(
     theta: Sequence[float],
     made: SectionsDesign,
     workers: Pool | None = None,
-    draw: int = 0,
-) -> tuple[Yield | None, tuple[Member, ...]]:
-    """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged; and
-    some that do not, to be added.
+) -> Yield | None:
+    """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
 
-    The options are drawn alike often. None where there is no box to draw from. Each `draw` has its
-    own plants.
+    The options are drawn alike often. None where there is no box to draw from.
     """
     sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
     if not uncertain.names or made.controller is None:
-        return None, ()
+        return None
     count = FRESH if plant_of(problem).outputs == 1 else FRESH_OF_SEVERAL
-    rng = np.random.default_rng((sections.seed, FRESH_SEED + draw))
-    low, high = uncertain.box
+    rng, (low, high) = np.random.default_rng((sections.seed, FRESH_SEED)), uncertain.box
     option = rng.integers(len(uncertain.options), size=count).tolist()
     point = rng.uniform(low, high, (count, len(low)))
     plants = uncertain.plants(list(zip(option, point, strict=True)))
@@ -146,16 +142,20 @@ def fresh_yield(
         <= 1.0 + TOLERANCE
         for one in found
     ]  # fmt: skip
-    failing = [(option[i], tuple(point[i].tolist())) for i in np.flatnonzero(~np.array(kept))]
-    return Yield(sum(kept), count), tuple(failing[:AT_ONCE])
+    return Yield(sum(kept), count)
 
 
-def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Proof:
+def proof_of(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    workers: Pool | None = None,
+) -> Proof:
     """Branch and bound over the whole box of plants at θ."""
     sections = sections_of_problem(problem)
     return prove(
         uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
-        bounds_of(problem), sections.sampling,
+        bounds_of(problem), sections.sampling, workers=workers,
     )  # fmt: skip
 
 

@@ -151,12 +151,9 @@ def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
     for more, survived in ((1.0, 40), (1.05, 0)):
         bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
         made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
-        drawn, failing = sections_robustness.fresh_yield(run.problem, run.theta, made)
+        drawn = sections_robustness.fresh_yield(run.problem, run.theta, made)
         assert drawn is not None
         assert (drawn.survived, drawn.draws) == (survived, 40)
-        assert len(failing) == min(40 - survived, sections_robustness.AT_ONCE)
-        others = sections_robustness.fresh_yield(run.problem, run.theta, made, draw=1)[1]
-        assert not set(others) & set(failing)
 
 
 def test_inner_and_deploy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
