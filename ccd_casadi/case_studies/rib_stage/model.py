@@ -21,6 +21,7 @@ from ccd_casadi.support.threads import side_by_side
 
 APART = 1e-9  # relative: a mode with less of z is not moved by it
 OUTPUTS = ("corners", "rigid", "modal4", "z")
+_spectra: dict[tuple[Any, ...], ModeSet] = {}
 ROWS = {"z": 1, "rigid": 3, "modal4": 4}  # directions of those that are not the corners
 
 
@@ -124,20 +125,15 @@ def discretisation(stage: RibStage) -> Discretisation:
 
 
 def modes_at(stage: RibStage, theta: tuple[float, ...]) -> ModeSet:
-    """The spectra at θ, whatever actuators, sensors and outputs the stage has."""
-    return _spectra(stage.order, stage.geometry, stage.modes, stage.truncation, theta)
-
-
-@lru_cache(maxsize=1)  # factorisations are large
-def _spectra(
-    order: MeshOrder,
-    geometry: Geometry,
-    count: ModeCount,
-    truncation: str,
-    theta: tuple[float, ...],
-) -> ModeSet:
-    disc = discretise(order, geometry.side, geometry.material)
-    return solve_modes(disc, geometry, np.array(theta), count, truncation == "frequency")
+    """The spectra at θ, whatever actuators, sensors and outputs it has; the last are kept."""
+    key = (stage.order, stage.geometry, stage.modes, stage.truncation, theta)
+    if key not in _spectra:
+        _spectra.clear()  # factorisations are large: they go before others are made
+        by_frequency = stage.truncation == "frequency"
+        _spectra[key] = solve_modes(
+            discretisation(stage), stage.geometry, np.array(theta), stage.modes, by_frequency
+        )
+    return _spectra[key]
 
 
 @lru_cache(maxsize=16)
