@@ -30,9 +30,14 @@ class Kernel(StrEnum):
 class Hyperparameters:
     """What the likelihood determines, in the scaled units of the unit box.
 
-    length_scales (d,) are fractions of the box; signal_variance σ² and the two
-    noise variances are in units of the sample variance of the output, the
-    gradient's per box width squared.
+    Parameters
+    ----------
+    length_scales : array (d,)
+        Fractions of the box.
+    signal_variance, noise_variance : float
+        In units of the sample variance of the output.
+    gradient_noise_variance : float
+        The same per box width squared.
     """
 
     length_scales: Array

@@ -13,11 +13,17 @@ from surrogates.interface import Array
 
 
 class SurrogateRegressor(RegressorMixin, BaseEstimator):
-    """`fit` and `predict` of a surrogate, thinly: everything is that of `surrogates.fit`.
+    """`fit` and `predict` of scikit-learn, by `surrogates.fit`.
 
-    X (n, d) and y (n,) in their own units; the box is the range of X. `noise` None estimates it,
-    0 interpolates. After `fit`, `surrogate_` is the surrogate itself, ready for `to_casadi`.
+    After `fit`, `surrogate_` is the surrogate itself, ready for `to_casadi`.
 
+    Parameters
+    ----------
+    kernel, noise, starts, seed
+        As for `surrogates.fit`; the box is the range of X.
+
+    Examples
+    --------
     >>> import numpy as np
     >>> X = np.linspace(0.0, 3.0, 12)[:, None]
     >>> model = SurrogateRegressor(kernel="rbf", noise=0.0).fit(X, np.sin(X[:, 0]))

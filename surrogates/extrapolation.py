@@ -21,10 +21,16 @@ OUTSIDE = 1e-9
 class Extrapolation:
     """How far a point is from the samples, in the unit box, and what follows.
 
-    hull: the distance to their convex hull; nearest: to the nearest sample; spacing: the
-    median distance of a sample to its nearest neighbour. deviation: the predicted
-    deviation over that met one spacing from the samples (95 % quantile), None where that is 0.
-    reasons: a sentence for everything amiss; none, and the point is supported.
+    Parameters
+    ----------
+    hull, nearest : float
+        Distance to the samples' convex hull, and to the nearest one.
+    spacing : float
+        Median distance of a sample to its nearest neighbour.
+    deviation : float or None
+        Predicted deviation over that one spacing from the samples (95 % quantile); None: that is 0.
+    reasons : tuple of str
+        A sentence for everything amiss; with none the point is supported.
     """
 
     hull: float
@@ -40,15 +46,31 @@ class Extrapolation:
 
 
 def extrapolation(surrogate: GaussianProcess, X: ArrayLike, x: ArrayLike) -> Extrapolation:
-    """Compare a point x (d,) with the samples X (n, d) a surrogate was fitted to.
+    """Compare a point with the samples that a surrogate was fitted to.
 
     Flagged are points outside the box, further outside the convex hull of the samples
     than their typical spacing (in many inputs almost every point of the box is a
     little outside it), further from every sample than twice the widest gap among them,
     or where the deviation is twice the largest that is usual one spacing from a sample.
 
-    Raises:
-        ValueError: the point or the samples do not have the surrogate's inputs.
+    Parameters
+    ----------
+    surrogate : GaussianProcess
+        What was fitted.
+    X : array (n, d)
+        Its samples, in input units.
+    x : array (d,)
+        The point.
+
+    Returns
+    -------
+    Extrapolation
+        Distances, and a reason for each flag.
+
+    Raises
+    ------
+    ValueError
+        The point or the samples do not have the surrogate's inputs.
     """
     from scipy.spatial import cKDTree
 

@@ -77,10 +77,19 @@ def fit_outputs(
     seed: int = 0,
     starts: int = 5,
 ) -> tuple[GaussianProcess, ...]:
-    """Fit one process to each column of Y (n, k), with dY (n, k, d) if it is given.
+    """Fit one process to each column of Y; the outputs are taken as independent.
 
-    The outputs are taken as independent. Noises are one for all or a sequence of one to each
-    output (which may be (n,) in turn); everything else is as in `fit`, and so are the errors.
+    Parameters
+    ----------
+    X, Y, dY, lower, upper, kernel, seed, starts
+        As for `fit`, with outputs (n, k) and gradients (n, k, d).
+    noise : float or sequence, optional
+        One for all outputs, or one for each (a number or an array (n,)).
+
+    Returns
+    -------
+    tuple of GaussianProcess
+        One for each output, in order. Raises what `fit` does.
     """
     values = np.asarray(Y, dtype=float)
     slopes = None if dY is None else np.asarray(dY, dtype=float)

@@ -30,15 +30,20 @@ class GaussianProcess:
     With x̂ = (x - lower) / (upper - lower) and k̂ the covariances of f(x̂) with the
     observations, mean(x) = output_mean + output_scale k̂(x̂)ᵀ weights.
 
-    kernel: the covariance family. lower, upper (d,): the box, input units.
-    output_mean, output_scale: shift and scale of the outputs, output units.
-    hyperparameters: in scaled units. X (n, d): the samples in the unit box.
-    targets: scaled values (n,), or values then gradients by component (n (1 + d),).
-    weights: α = K⁻¹ targets. jitter: what the factorisation needed on its diagonal.
-    loo: closed-form leave-one-out errors, hyperparameters and scales kept.
-    sample_noise: variances (n,) in scaled units of samples that differ in their noise,
-    on top of the one in the hyperparameters; empty (0,) where they do not.
-    band: the factor on the predicted deviation that `calibration.calibrated` found, 1 without it.
+    Parameters
+    ----------
+    kernel, hyperparameters : Kernel, Hyperparameters
+        The covariance, in scaled units.
+    lower, upper, output_mean, output_scale : array (d,), float
+        The box, and shift and scale of the outputs.
+    X, targets, weights : array
+        Samples (n, d) in the unit box; scaled values (n,), or values then gradients by component
+        (n (1 + d),); α = K⁻¹ targets.
+    jitter, loo : float, Errors
+        What the factorisation needed on its diagonal; closed-form leave-one-out errors.
+    sample_noise, band : array, float
+        Scaled variances (n,) of samples that differ in their noise, on top of the one in the
+        hyperparameters, else empty; factor on the deviation that `calibration.calibrated` found.
     """
 
     kernel: Kernel
@@ -143,13 +148,26 @@ def condition(
 ) -> GaussianProcess:
     """Condition a process of given (scaled) hyperparameters on samples.
 
-    X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X. `noise` (n,) are
-    standard deviations of Y where the samples differ in it, output units; their
-    variances add to that of the hyperparameters.
+    Parameters
+    ----------
+    hyperparameters : Hyperparameters
+        In scaled units.
+    X, Y, dY, lower, upper, kernel
+        As for `fit`; the box is required.
+    noise : array (n,), optional
+        Deviations of samples that differ in it, output units; their variances add to that of the
+        hyperparameters.
 
-    Raises:
-        SurrogateFitError: wrong shapes, values that are not finite, or a covariance
-            that is singular beyond a small jitter.
+    Returns
+    -------
+    GaussianProcess
+        The process.
+
+    Raises
+    ------
+    SurrogateFitError
+        Wrong shapes, values that are not finite, or a covariance that is singular beyond a small
+        jitter.
     """
     samples = checked(X, Y, lower, upper, dY, noise)
     own = np.empty(0) if noise is None else samples.noise_variances
@@ -185,13 +203,21 @@ def conditioned(
 
 
 def loo_errors(process: GaussianProcess) -> tuple[Array, Array]:
-    """Return residuals y_i - μ_{-i} (n,) and their deviations (n,), output units.
+    """Residuals y_i - μ_{-i} and their deviations, by the rows B_i of K⁻¹ of each sample.
 
-    Leaving sample i out with its gradient, B_i being its rows of K⁻¹,
-    residual = ((K⁻¹)_{B_i B_i})⁻¹ α_{B_i} and covariance = ((K⁻¹)_{B_i B_i})⁻¹, of
-    which the first component is the value. Exact for fixed hyperparameters and
-    output scaling; the noise is part of the deviation. Source: R & W eq. 5.12,
-    blockwise. The deviations are those of the process before `band`.
+    Leaving sample i out with its gradient (Rasmussen & Williams, 5.12, blockwise),
+    residual = ((K⁻¹)_{B_i B_i})⁻¹ α_{B_i} and covariance = ((K⁻¹)_{B_i B_i})⁻¹, of which the first
+    component is the value. Exact for fixed hyperparameters and output scaling.
+
+    Parameters
+    ----------
+    process : GaussianProcess
+        Whose samples are left out in turn.
+
+    Returns
+    -------
+    residuals, deviations : array (n,)
+        In output units; the deviations with the noise, before `band`.
     """
     n = len(process.X)
     c = process.targets.size // n

@@ -14,10 +14,15 @@ class SurrogateFitError(ValueError):
 
 @dataclass(frozen=True)
 class Errors:
-    """Prediction errors on samples left out: rms and max in output units, Q² ≤ 1.
+    """Prediction errors on samples left out.
 
-    Q² = 1 - Σ (y - ŷ)² / Σ (y - ȳ)²: 1 is exact, 0 no better than the mean. For
-    samples that do not vary it is 1 if they are predicted exactly and 0 otherwise.
+    Parameters
+    ----------
+    rms, max : float
+        In output units.
+    q2 : float
+        Q² = 1 - Σ (y - ŷ)² / Σ (y - ȳ)²: 1 is exact, 0 no better than the mean. Of samples that do
+        not vary it is 1 if they are predicted exactly and 0 otherwise.
     """
 
     rms: float
@@ -26,8 +31,20 @@ class Errors:
 
 
 def errors(residuals: ArrayLike, Y: ArrayLike) -> Errors:
-    """Summarise residuals y - ŷ (n,) at samples Y (n,).
+    """Summarise residuals y - ŷ at samples.
 
+    Parameters
+    ----------
+    residuals, Y : array (n,)
+        In output units.
+
+    Returns
+    -------
+    Errors
+        rms, largest and Q².
+
+    Examples
+    --------
     >>> errors([0.0, 3.0, 4.0], [0.0, 5.0, 10.0])
     Errors(rms=2.886751345948129, max=4.0, q2=0.5)
     """

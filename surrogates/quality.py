@@ -42,16 +42,24 @@ class Missed:
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """One output, its errors in `unit`.
+    """One output of a surrogate, judged at samples left out [1]_.
 
-    true, predicted (n,): each sample, and its prediction without it; standardised (n,): the
-    difference over the deviation of the band; coverage: share inside nominal 95 % bands.
-    loo: errors left out one by one. extrapolates: what is amiss at the point of interest, nothing
-    where samples support it. at_point: where that point is itself a sample, the error there without
-    it in `unit` and in predicted deviations; None elsewhere. around: the same of every sample
-    around that point, itself included.
+    Parameters
+    ----------
+    name, unit : str
+        Of the output; errors are in `unit`.
+    true, predicted, standardised : array (n,)
+        Each sample, its prediction without it, and the difference over the deviation of the band.
+    loo, coverage : Errors, float
+        Errors left out one by one; share inside nominal 95 % bands.
+    extrapolates : tuple of str
+        What is amiss at the point of interest; nothing where samples support it.
+    at_point : (float, float) or None
+        Where that point is a sample, the error there without it, in `unit` and in deviations.
+    around : tuple of Missed
+        The same of every sample around that point, itself included.
 
-    Source: Rasmussen & Williams (2006), section 5.4.2 on leave-one-out.
+    .. [1] Rasmussen & Williams (2006), 5.4.2.
     """
 
     name: str
@@ -126,13 +134,28 @@ def quality_of(
     factor: float = 1.0,
     logarithm: bool = False,
 ) -> Quality:
-    """Judge a process by the samples it holds, and at a point of interest x (d,).
+    """Judge a process by the samples it holds, and at a point of interest.
 
-    `factor` turns its output into `unit`; of a `logarithm` the samples and their predictions
-    are given as what it is the logarithm of.
+    Parameters
+    ----------
+    process : GaussianProcess
+        What is judged.
+    x : array (d,)
+        The point of interest, in input units.
+    name, unit, factor : str, str, float
+        Of the output, as the result gives them; the factor turns it into `unit`.
+    logarithm : bool
+        The output is a logarithm: samples and predictions are those of its exponential.
 
-    Raises:
-        ValueError: the point does not have the process's inputs.
+    Returns
+    -------
+    Quality
+        Errors left out, coverage, support at x.
+
+    Raises
+    ------
+    ValueError
+        The point does not have the process's inputs.
     """
     samples, residuals, deviations = _left_out(process)
     standardised = residuals / (process.band * deviations)

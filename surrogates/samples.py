@@ -12,8 +12,16 @@ from surrogates.interface import Array, SurrogateFitError, box
 class Samples:
     """Samples of one output in a box.
 
-    lower, upper (d,), X (n, d): input units. Y (n,), noise (n,) or None where it is
-    unknown: output units, the noise as standard deviations. dY (n, d) = ∂Y/∂X or None.
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box, input units.
+    X, Y : array (n, d), array (n,)
+        Places and values.
+    dY : array (n, d), optional
+        Gradients ∂Y/∂X.
+    noise : array (n,), optional
+        Standard deviations in output units; None: unknown.
     """
 
     lower: Array
@@ -64,14 +72,27 @@ def checked(
     dY: ArrayLike | None = None,
     noise: ArrayLike | None = None,
 ) -> Samples:
-    """Return the samples as float arrays; bounds left out are the range of X.
+    """Samples as float arrays, checked.
 
-    X (n, d), Y (n,), dY (n, d) or None, noise a deviation, one to each sample (n,), or
-    None.
+    Parameters
+    ----------
+    X, Y, dY : array (n, d), array (n,), array (n, d) or None
+        Places, values and gradients ∂Y/∂X.
+    lower, upper : array (d,), optional
+        The box, in input units; left out, the range of X.
+    noise : float or array (n,), optional
+        Deviation of Y; a single one becomes one for each sample.
 
-    Raises:
-        SurrogateFitError: wrong shapes, values that are not finite, negative noise, or
-            no range of X to scale an input by.
+    Returns
+    -------
+    Samples
+        Arrays of float64.
+
+    Raises
+    ------
+    SurrogateFitError
+        Wrong shapes, values that are not finite, negative noise, or no range of X to scale an
+        input by.
     """
     points, values = np.array(X, dtype=float), np.array(Y, dtype=float)
     if points.ndim != 2 or len(points) < 2:

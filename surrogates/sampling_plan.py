@@ -21,13 +21,27 @@ class DesignKind(StrEnum):
 
 
 def grid(lower: ArrayLike, upper: ArrayLike, points_per_axis: int | list[int]) -> Array:
-    """Return the full tensor grid, last input running fastest, bounds included.
+    """The full tensor grid, the last input running fastest, bounds included.
 
-    n = Π_j points_per_axis_j rows; an axis of one point sits at the middle.
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+    points_per_axis : int or sequence
+        For all inputs or for each; an axis of one point is in the middle.
 
-    Raises:
-        ValueError: bad bounds, or fewer than one point on an axis.
+    Returns
+    -------
+    array (N, d)
+        The product of the axes.
 
+    Raises
+    ------
+    ValueError
+        Bad bounds, or fewer than one point on an axis.
+
+    Examples
+    --------
     >>> grid([0, 0], [1, 2], 2).tolist()
     [[0.0, 0.0], [0.0, 2.0], [1.0, 0.0], [1.0, 2.0]]
     """
@@ -44,21 +58,44 @@ def grid(lower: ArrayLike, upper: ArrayLike, points_per_axis: int | list[int]) -
 
 
 def corners(lower: ArrayLike, upper: ArrayLike) -> Array:
-    """Return the 2^d corners of the box, to add to a plan that avoids them."""
+    """The corners of the box, to add to a plan that avoids them.
+
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+
+    Returns
+    -------
+    array (2^d, d)
+        The corners.
+    """
     return grid(lower, upper, 2)
 
 
 def sobol(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
-    """Return n points (n, d) of a scrambled Sobol sequence.
+    """n points of a scrambled Sobol sequence [1]_; plans of one seed are nested.
 
-    The balance of the sequence is a property of its first 2^m points. For another
-    n the next power of two is drawn and cut, so that plans of one seed are nested:
-    `sobol(..., n)` is the head of `sobol(..., m)` for every m > n.
+    Balanced are its first 2^m points: for another n the next power of two is drawn and cut.
 
-    Raises:
-        ValueError: bad bounds, or n < 1.
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+    n, seed : int
+        Number of points, and seed of the scrambling.
 
-    Source: Owen, "Scrambling Sobol' and Niederreiter-Xing points", J. Complexity 1998.
+    Returns
+    -------
+    array (n, d)
+        The points.
+
+    Raises
+    ------
+    ValueError
+        Bad bounds, or n < 1.
+
+    .. [1] Owen, "Scrambling Sobol' and Niederreiter-Xing points", J. Complexity 1998.
     """
     from scipy.stats import qmc  # 0.5 s to import, so only where it is needed
 
@@ -69,12 +106,24 @@ def sobol(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
 
 
 def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
-    """Return n points (n, d), exactly one in each of the n slices of every input.
+    """n points, exactly one in each of the n slices of every input (McKay et al., 1979).
 
-    Raises:
-        ValueError: bad bounds, or n < 1.
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+    n, seed : int
+        Number of points, and seed.
 
-    Source: McKay, Beckman and Conover, Technometrics 1979.
+    Returns
+    -------
+    array (n, d)
+        The points.
+
+    Raises
+    ------
+    ValueError
+        Bad bounds, or n < 1.
     """
     from scipy.stats import qmc
 
@@ -88,11 +137,29 @@ def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Ar
 def design(
     kind: DesignKind | str, lower: ArrayLike, upper: ArrayLike, n: int, seed: int = 0
 ) -> Array:
-    """Return the plan named `kind`; n is the points per axis for 'grid', else all points.
+    """The plan named `kind` over a box.
 
-    Raises:
-        ValueError: unknown kind, bad bounds or n < 1.
+    Parameters
+    ----------
+    kind : DesignKind or str
+        "grid", "sobol" or "lhs".
+    lower, upper : array (d,)
+        The box.
+    n, seed : int
+        Points along each axis of a grid, else all points; seed of the others.
 
+    Returns
+    -------
+    array (N, d)
+        The points.
+
+    Raises
+    ------
+    ValueError
+        Unknown kind, bad bounds or n < 1.
+
+    Examples
+    --------
     >>> design("lhs", [0.0], [1.0], 4, seed=1).shape
     (4, 1)
     """

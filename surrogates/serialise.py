@@ -37,12 +37,19 @@ def save(
 ) -> None:
     """Write surrogates to a JSON file, replacing it in one step or not at all.
 
-    `extra` is stored alongside and may hold anything JSON can: where the samples came
-    from, units, names.
+    Parameters
+    ----------
+    surrogates : GaussianProcess or sequence
+        What to write.
+    path : path
+        The file.
+    extra : dict, optional
+        Anything that JSON holds, stored alongside: origin of the samples, units, names.
 
-    Raises:
-        TypeError: a surrogate of unknown kind, or `extra` is not JSON.
-        ValueError: a number that is not finite.
+    Raises
+    ------
+    TypeError, ValueError
+        `extra` is not JSON; a number is not finite.
     """
     members = list(surrogates) if isinstance(surrogates, Sequence) else [surrogates]
     text = json.dumps(
@@ -57,12 +64,24 @@ def save(
 
 
 def load(path: str | os.PathLike[str]) -> tuple[tuple[GaussianProcess, ...], dict[str, Any]]:
-    """Return the surrogates of a file written by `save`, and its `extra`.
+    """Read a file written by `save`.
 
-    Raises:
-        SurrogateFileError: the file is truncated, foreign, of another schema, or its
-            arrays contradict each other.
-        OSError: the file cannot be read.
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    tuple of GaussianProcess, dict
+        The surrogates and `extra`.
+
+    Raises
+    ------
+    SurrogateFileError
+        The file is truncated, foreign, of another schema, or its arrays contradict each other.
+    OSError
+        The file cannot be read.
     """
     try:
         document = json.loads(Path(path).read_bytes(), parse_constant=_refuse)

@@ -84,10 +84,23 @@ class FinishedRun(Shown):
 
 
 def read_run(folder: str | Path) -> FinishedRun:
-    """The run in `folder` (case.toml, result.json, controller.json).
+    """Read a finished run, and certify its controller again.
 
-    Raises UserError with a remedy where a file is missing, damaged or foreign, where the run
-    found no feasible design, or where the controller is not certified on its plant any more.
+    Parameters
+    ----------
+    folder : path
+        With case.toml, result.json and controller.json.
+
+    Returns
+    -------
+    FinishedRun
+        What `deploy`, `robustness` and `samples_frame` take.
+
+    Raises
+    ------
+    UserError
+        A file is missing, damaged or foreign, the run found no feasible design, or the controller
+        is not certified on its plant any more.
     """
     folder = Path(folder)
     if not folder.is_dir():

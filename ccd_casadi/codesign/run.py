@@ -143,7 +143,15 @@ OUTERS: dict[type[ControllerProblem], type[Outer]] = {
 def verify(sampler: Sampler, x: Array) -> Verified:
     """Polish the design at x on the truth, compare it with the whole inner problem, judge it.
 
-    x is θ, followed by ln ω_S and ln ω_T for mixed sensitivity.
+    Parameters
+    ----------
+    sampler, x : Sampler, array
+        θ in SI, followed by ln ω_S and ln ω_T (rad/s) for mixed sensitivity.
+
+    Returns
+    -------
+    Verified
+        The design with its certificates.
     """
     outer = outer_of(sampler)
     end = outer.ended(x)

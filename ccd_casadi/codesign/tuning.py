@@ -44,9 +44,14 @@ AT_REST = 1e-7  # of the largest root: below, it lies at 0
 
 @dataclass(frozen=True)
 class Tuned:
-    """A tuned controller: `design` on the lines of `case`; `models`: plants in discrete time.
+    """A tuned controller.
 
-    `norms`: ‖S‖∞ of each model's closed loop, infinite where its poles are not all stable.
+    Parameters
+    ----------
+    case, design : MeasuredCase, MeasuredDesign
+        The lines, and the design on them.
+    models, norms : tuple of StateSpace, tuple of float
+        Plants in discrete time, and ‖S‖∞ of their loops, infinite where poles are not stable.
     """
 
     case: MeasuredCase
@@ -79,15 +84,34 @@ def tune(
         max ω_b   s.t.  on each plant: stable, |S| <= S_max, |S(jω)| <= 1/√2 for ω <= ω_b,
                         |S(jω)| <= shape (ω/ω_b)/√2,   |KS| <= effort/|G| about ω_b
 
-    `plants`: one or a list (a set, one controller for all): a file as `read_frequency_response`
-    takes it or a .mat file with A, B, C, D (and Ts), a `MeasuredResponse`, or of python-control an
-    FRD, a TransferFunction or a StateSpace.
-    K runs at `rate_hz`: models, stable or not, are held, responses have the hold in them. `delay`
-    (s) comes on top of both. `effort` keeps noise and lead in bounds. `structure`: by default with
-    a biquad for each resonance, three at most.
+    Parameters
+    ----------
+    plants : path, MeasuredResponse or system of python-control, or a list of them
+        A file as `read_frequency_response` takes it or .mat with A, B, C, D (and Ts), or an FRD, a
+        TransferFunction, a StateSpace; of a list one controller for all.
+    rate_hz, delay : float
+        Of K, Hz (models, stable or not, are held; responses have the hold in them); besides, s.
+    S_max, shape, effort : float
+        The bounds; `effort` keeps noise and lead in bounds.
+    structure : Structure, optional
+        Left out, a biquad for each resonance, three at most.
+    starts, seed : int
+        Of the multi-start search.
+    progress, workers
+        As for `synthesise_sections`; a pool of processes.
 
-    Raises UserError for what is no such plant, and for a model without a rate.
+    Returns
+    -------
+    Tuned
+        The design, and its loops on the models.
 
+    Raises
+    ------
+    UserError
+        Something is no such plant, or a model comes without a rate.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd, control
     >>> found = ccd.tune(control.tf([1.0], [1.0, 3.0, 3.0, 1.0]), rate_hz=10.0, starts=2)
     >>> found.design.usable, found.design.structure.biquads

@@ -121,9 +121,16 @@ class Verified(ABC):
 
 @dataclass(frozen=True)
 class Solution(Shown):
-    """Result of a run: the JSON result and the objects behind it (None: infeasible).
+    """Result of a run: the JSON result and the objects behind it.
 
-    `problem` is the one solved: of a robust case that leaves its design plant open, the best one's.
+    Parameters
+    ----------
+    result, outcome : dict, FormulationResult
+        The content of result.json, and how the formulation ended.
+    verified, quality : Verified or None, tuple of Quality
+        The design (None: infeasible), and its surrogates.
+    problem : CoDesignProblem
+        The one solved: of a robust case that leaves its design plant open, the best one's.
     """
 
     result: dict[str, Any]

@@ -45,12 +45,30 @@ def deploy(
     saturation: float | None = None,
     progress: Callable[[str], None] = lambda words: None,
 ) -> Deployment:
-    """Reduce, discretise and verify the controller of a run; `progress` is called at each step.
+    """Reduce, discretise and verify the controller of a run.
 
     All of it on the nominal plant and on every plant of the run's [robust] set. Sections are
     deployed as they are: nothing is reduced, and where the case gives a rate it is that, by
-    Tustin's rule. Raises UserError where no sampling rate is enough, or the given one is no rate
-    for this loop.
+    Tustin's rule.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        As `read_run` gives it.
+    timing : Timing
+        Rate and delay, where they are given.
+    saturation, progress : float, callable
+        Largest force, N; is given a line at each step.
+
+    Returns
+    -------
+    Deployment
+        The sampled controller with its figures.
+
+    Raises
+    ------
+    UserError
+        No sampling rate is enough, or the given one is no rate for this loop.
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
     designed, family, dense = run.problem.sampling, members(run), members(run, dense=True)

@@ -57,7 +57,7 @@ class ChannelBounds:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds that hold on every plant; SI, frequencies in rad/s, None: no such bound.
+    """Bounds that hold on every plant; SI, None: no such bound.
 
         |S(jω)| <= S_max,   |S(jω_low)| <= S_low
         |S(jω)| <= 1/√2                             for ω <= ω_b
@@ -67,7 +67,20 @@ class Bounds:
 
     The shape makes ω_b a bandwidth: a narrow filter at ω_b could hold |S| at 1/√2 up to there and
     let it leap to S_max above. Without an integrator S does not fall to zero: the shape then counts
-    from ω_low on. `channels`: empty, or tighter bounds for each channel, in the structure's order.
+    from ω_low on.
+
+    Parameters
+    ----------
+    S_max, S_low, omega_low : float
+        Peak of |S|; |S| at ω_low (rad/s).
+    shape, shape_ends : float or None, ShapeEnd
+        Slope of |S| in units of the line through 1/√2 at ω_b, and where it ends.
+    weighted_level, weights : float or None, Weights or None
+        Of W_KS KS and W_T T.
+    compliance_max : float or None
+        m/N.
+    channels : tuple of ChannelBounds
+        Empty, or tighter bounds for each channel, in the structure's order.
     """
 
     S_max: float

@@ -101,10 +101,21 @@ def certify(
     integrator: bool = True,
     workers: Pool | None = None,
 ) -> Certificate:
-    """Judge an SI controller (e in, u out) on plants against the bounds, σ_max of each matrix.
+    """Judge an SI controller on plants against the bounds, σ_max of each matrix.
 
-    Of channels with bounds of their own the rows besides. `integrator`: the shape counts from 0 on,
-    else from ω_low. ω_b is the least of all plants. The plants are spread over `workers`.
+    Parameters
+    ----------
+    plants, controller : sequence of ScaledPlant, StateSpace
+        All of the set; e in, u out.
+    bounds, integrator : Bounds, bool
+        Of channels with bounds of their own those besides. The shape counts from 0 on, or ω_low.
+    sampling, workers : Sampling, Pool, optional
+        None: a continuous loop; the plants are spread over them.
+
+    Returns
+    -------
+    Certificate
+        Stability, figures over bounds, and ω_b in rad/s, the least of all plants.
     """
     sizes = [(plant.A.shape, plant.B.shape, plant.C.shape) for plant in plants]
     alike = [[i for i, own in enumerate(sizes) if own == size] for size in dict.fromkeys(sizes)]

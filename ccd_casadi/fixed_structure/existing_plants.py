@@ -37,16 +37,37 @@ def synthesise_sections(
                         |S(jω)| <= 1/√2 for ω <= ω_b, |S(jω)| <= shape (ω/ω_b)/√2,
                         |W_KS KS|, |W_T T| <= weighted_level, |GS| <= compliance_max
 
-    `plants`: one or several, SISO, force (N) to displacement (m): `control.StateSpace`,
-    `control.TransferFunction`, or `ScaledPlant` as `scaled_plant` gives it. They have to be stable:
-    give a free mass the slow suspension that it has, if only of its cables. With `sampling` hold
-    and delay are exact. `M_K` (N/m) sets the scale of control systems; without it that of
-    `bounds.weights`, or where there are none ω₀ = 10 ω_low/S_low. `initial`: parameters
-    κ of earlier designs that start beside `starts` others.
+    Parameters
+    ----------
+    plants : control.StateSpace, control.TransferFunction or ScaledPlant, or a list of them
+        SISO and stable, force (N) to displacement (m). Give a free mass the slow suspension that it
+        has, if only of its cables.
+    structure, bounds : Structure, Bounds
+        Sections of K, and what holds on every plant.
+    sampling : Sampling, optional
+        Rate and delay, exact; left out, the loop is continuous.
+    M_K : float, optional
+        Scale of control systems, N/m; left out, that of `bounds.weights`, or that of
+        ω₀ = 10 ω_low/S_low.
+    starts, seed : int
+        Of the multi-start search.
+    initial, progress : sequence of array, callable
+        Parameters κ of earlier designs, which start beside the others; is given a line at a time.
 
-    The `outcome` says how it ended, `controller` is K(s) in SI (e = r - y to force). Raises
-    UserError for a system that is no continuous one, PlantError for one that cannot be a plant.
+    Returns
+    -------
+    SectionsDesign
+        `outcome` says how it ended; `controller` is K(s) in SI, e = r - y to force.
 
+    Raises
+    ------
+    UserError
+        A system is no continuous one.
+    PlantError
+        A system cannot be a plant.
+
+    Examples
+    --------
     >>> import control
     >>> import ccd_casadi as ccd
     >>> plant = control.tf([1.0], [2.0, 12.0, 800.0])  # 2 kg on 800 N/m

@@ -127,12 +127,24 @@ class MeasuredResponse:
 
 
 def read_frequency_response(path: str | Path) -> MeasuredResponse:
-    """A CSV with a header of f_hz and re, im (or magnitude or magnitude_db, and phase_deg or
-    phase_rad), or a .mat or .npz file with these names or with f_hz and a complex G. Beside re and
-    im, or G, there may be the `spread` of repeated measurements.
+    """Read a measured frequency response.
 
-    G is displacement over force, m/N; of several channels (k, p, m), .mat and .npz only. Raises
-    UserError with what is missing.
+    Parameters
+    ----------
+    path : path
+        CSV with a header of f_hz and re, im (or magnitude or magnitude_db, and phase_deg or
+        phase_rad), or .mat or .npz with these names or with f_hz and a complex G. Beside re and im,
+        or G, there may be the `spread` of repeated measurements.
+
+    Returns
+    -------
+    MeasuredResponse
+        G in m/N at its lines; of several channels (k, p, m), .mat and .npz only.
+
+    Raises
+    ------
+    UserError
+        Something is missing, and what.
     """
     path = Path(path)
     if path.suffix.lower() == ".npz":

@@ -35,13 +35,28 @@ class SectionsOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class SectionsDesign(Shown):
-    """A controller of fixed structure; SI, frequencies in rad/s.
+    """A controller of fixed structure, and how it was found; SI, frequencies in rad/s.
 
-    `kappa` are the logarithms of its parameters in rad/s and N/m, `controller` the same as a state
-    space (sampled loops: to be discretised by Tustin's rule without prewarping). `bandwidth` holds
-    on every plant. `frequencies` bounded those of K's roots. `multipliers` by kind of bound: change
-    of ln ω_b per ln of it. `short` names the bounds that the nearest controller misses, with the
-    factor, where none meets all.
+    Parameters
+    ----------
+    outcome, words : SectionsOutcome, str
+        How it ended, and why.
+    structure, kappa : Structure or ChannelStructure, array (p,)
+        Sections of K; logarithms of their parameters in rad/s and N/m.
+    frequencies : tuple of two floats
+        Bounds of K's roots.
+    controller : StateSpace or None
+        K(s), e to force; of a sampled loop it is discretised by Tustin's rule without prewarping.
+    bandwidth, certificate : float, Certificate or None
+        ω_b that holds on every plant; what was judged.
+    multipliers : dict
+        By kind of bound: change of ln ω_b per ln of the bound.
+    at_box, kkt_residual : tuple, float
+        Parameters at their own bounds; how nearly the design is an optimum.
+    short : dict
+        Where no controller meets every bound: those that the nearest one misses, with the factor.
+    local_optima, starts, evaluations, seed, seconds
+        Of the search: where it ended, how often it started, loops, randomness, time.
     """
 
     outcome: SectionsOutcome

@@ -32,7 +32,17 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Structure:
-    """Number of sections of each kind; `least_damping` of the biquads' zeros and poles."""
+    """Number of sections of each kind in K(s).
+
+    Parameters
+    ----------
+    integrator : bool
+        Whether K has one, with a zero.
+    lead, biquads, roll_off : int
+        First-order leads, pairs of zeros and poles, order of the roll-off.
+    least_damping : float
+        Of the biquads' zeros and poles.
+    """
 
     integrator: bool = True
     lead: int = 1

@@ -34,10 +34,39 @@ NUMERICS = 11  # raised whenever a change of ours moves the numbers that a sampl
 
 @dataclass(frozen=True)
 class CoDesignProblem(Shown):
-    """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout.
+    """The co-design problem (paper, equation (9)); SI throughout.
 
-    Made by `problem_of`; `dataclasses.replace` makes variants of it:
+        min w1 f(θ) + w2 ω_b*(θ)   s.t.  lower <= θ <= upper,   λ(θ) <= 0
 
+    Made by `problem_of`; `dataclasses.replace` makes variants of it.
+
+    Parameters
+    ----------
+    source : PlantSource
+        The plant, and what identifies it in a store.
+    names, units, lower, upper, start : tuple (n,)
+        Of θ, in order.
+    w1, w2 : float
+        Weights of f(θ) and of the bandwidth (rad/s).
+    weights, inner : Weights, InnerProblem
+        W_S, W_KS, W_T; and S_max, S_low and ω_low (rad/s) of the inner problem.
+    suspension : Suspension
+        What modes without stiffness are given.
+    method : str
+        "search" or "sweep" of the inner problem.
+    robust : RobustSet, optional
+        Perturbed plants that the controller has to serve.
+    controller : ControllerProblem
+        Mixed sensitivity, or sections.
+    budget : ErrorBudget, optional
+        What moves the stage: judged, no part of a synthesis.
+    cost_unit : str
+        Of f(θ).
+    listed : tuple of (str, tuple of float)
+        Parameters that are one of a few values.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd
     >>> from dataclasses import replace
     >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
@@ -122,10 +151,25 @@ def plant_of(problem: CoDesignProblem) -> Plant:
 
 
 def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:
-    """The scaled plant M_K G(jω₀ω) at θ, with its family where the problem is a robust one.
+    """The scaled plant M_K G(jω₀ω), with its family where the problem is a robust one.
 
-    Raises PlantError where the model is no plant at θ.
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence
+        θ in SI, in the order of `problem.names`.
 
+    Returns
+    -------
+    ScaledPlant
+        What `synthesise` takes.
+
+    Raises
+    ------
+    PlantError
+        The model is no plant at θ.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd
     >>> plant = ccd.scaled_plant(ccd.problem_of(ccd.load_case(ccd.TWO_MASS)), (60.0, 60.0))
     >>> round(float(plant.natural[-1]) / ccd.HZ, 1), plant.A.shape

@@ -40,6 +40,15 @@ class TrueQuantities(VectorCallback):
     keep a reference to it as long as anything built on it is in use. A design that is not certified
     is NaN, on which IPOPT shortens its step.
 
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        The problem.
+    kept : callable, optional
+        (x, compute) -> Sensitivities: a store of what was computed.
+
+    Examples
+    --------
     >>> import ccd_casadi as ccd
     >>> import numpy as np
     >>> quantities = ccd.TrueQuantities(ccd.problem_of(ccd.load_case(ccd.TWO_MASS)))

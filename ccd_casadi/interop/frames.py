@@ -23,7 +23,22 @@ def samples_frame(run: FinishedRun) -> "pandas.DataFrame":
     `certified` and `reason` say which rows are designs. Of a fixed structure a row is the best
     design at its θ.
 
-    Raises MissingPackage without pandas, UserError where the folder has no usable samples.sqlite.
+    Parameters
+    ----------
+    run : FinishedRun
+        As `read_run` gives it.
+
+    Returns
+    -------
+    pandas.DataFrame
+        The table.
+
+    Raises
+    ------
+    MissingPackage
+        pandas is not installed.
+    UserError
+        The folder has no usable samples.sqlite.
     """
     pandas = require("pandas", "notebook")
     with SampleStore(run.folder / "samples.sqlite") as store:

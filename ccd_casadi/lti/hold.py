@@ -18,7 +18,13 @@ INSTANT = 1e-9  # share of a period that counts as none
 
 @dataclass(frozen=True)
 class Sampling:
-    """How the loop runs: rate in Hz, delay from measurement to force in µs."""
+    """How the loop runs.
+
+    Parameters
+    ----------
+    rate_hz, delay_us : float
+        Of K, Hz; from measurement to force beside the hold, µs.
+    """
 
     rate_hz: float
     delay_us: float = 0.0

@@ -19,7 +19,17 @@ REACH = 1e5  # size of the zeros, over the unit given, from which on they count 
 
 @dataclass(frozen=True)
 class StateSpace:
-    """ẋ = A x + B v, z = C x + D v; with a `period` T > 0 in s x_{k+1} = A x_k + B v_k."""
+    """A linear system, in continuous or in discrete time.
+
+        ẋ = A x + B v,   z = C x + D v;   with a period   x_{k+1} = A x_k + B v_k
+
+    Parameters
+    ----------
+    A, B, C, D : array (n, n), (n, m), (p, n), (p, m)
+        Its matrices.
+    period : float
+        s; 0: continuous.
+    """
 
     A: Array
     B: Array

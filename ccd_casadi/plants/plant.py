@@ -60,16 +60,33 @@ def to_first_order(system: Mechanics, step: Array) -> Mechanics:
 class Plant:
     """A plant model bound to its parameters, as the design loop uses it.
 
-    `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
-    `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
-    plant modelled more closely, by name, without derivatives: a design is certified on them again,
-    not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
-    reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
-    known. `nearby` makes, of θ that are known, a cheaper `evaluate` that is true there and nearly
-    so beside them. `doubt` says what is wrong with the derivatives at θ, empty where nothing is.
-    Without `exact_hessian` second derivatives of `hardware` cost too much to be asked
-    for. `shapes` are so many of the lowest flexible modes at θ as pictures need them, `drawing` is
-    of several θ by name; None where the plant has no such picture.
+        M(θ) q̈ + D(θ) q̇ + K(θ) q = B(θ) u,   y = C(θ) q
+
+    Parameters
+    ----------
+    names, constraint_names : tuple of str
+        Of θ (n,) and of λ (m,).
+    evaluate : callable
+        θ in SI -> M, D, K, B, C with derivatives, from CasADi or from finite elements.
+    hardware : casadi.Function
+        θ -> f, λ.
+    outputs, inputs : int
+        Rows of C, columns of B.
+    references : mapping
+        The same plant modelled more closely, by name, without derivatives: a design is certified on
+        them again, not optimised.
+    exact_hessian : bool
+        Whether second derivatives of `hardware` are cheap enough to be taken.
+    values : callable, optional
+        `evaluate` without derivatives where that is cheaper.
+    notes, doubt : callable
+        θ -> what a reader of a result there must know; what is wrong with the derivatives, else "".
+    domain : tuple of two arrays (n,), optional
+        Bounds of θ beyond which the plant is not known.
+    nearby : callable, optional
+        Known θ -> a cheaper `evaluate`, true there and nearly so beside them.
+    shapes, drawing : callable, optional
+        (θ, count) -> the lowest flexible modes for pictures; several θ by name -> a drawing.
     """
 
     names: tuple[str, ...]
@@ -99,8 +116,27 @@ class Plant:
 def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str, Any]) -> Plant:
     """Trace `model` once with CasADi symbols and check what it returns.
 
-    Raises PlantError with a remedy where a key is missing or unknown, or a shape is wrong.
+    Parameters
+    ----------
+    model : callable
+        model(theta, **options) gives mass, stiffness, input, output and hardware_cost, in SI.
+    names : sequence of str
+        The parameters θ, in order.
+    options : mapping
+        Further keyword arguments of the model.
 
+    Returns
+    -------
+    Plant
+        What a problem takes.
+
+    Raises
+    ------
+    PlantError
+        A key is missing or unknown, or a shape is wrong; the sentence has a remedy.
+
+    Examples
+    --------
     >>> from ccd_casadi.plants.two_mass import two_mass
     >>> plant = build_plant(two_mass, ["m1", "m2"], {"zeta": 0.01})
     >>> mechanics(plant, (60.0, 50.0)).M.diagonal().tolist(), hardware_cost(plant, (60.0, 50.0))

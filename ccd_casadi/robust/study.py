@@ -77,8 +77,22 @@ def robustness(
     quiet: bool = True,
     workers: Pool | None = None,
 ) -> Study:
-    """Study a run's controller on all demands; nothing is designed. `workers`
-    share what they can."""
+    """Study a run's controller on all demands; nothing is designed.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        As `read_run` gives it.
+    demands : Demands, optional
+        Shifts, tolerances, noise and move; left out, the defaults.
+    seed, quiet, workers : int, bool, Pool
+        Of random hardware; whether without progress on stderr; processes.
+
+    Returns
+    -------
+    Study
+        The content of robustness.json.
+    """
     d = demands or Demands()
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
     sampled = loop.sampling is not None

@@ -67,11 +67,23 @@ class Comparison:
 def compare(
     case: Case, problem: CoDesignProblem, folder: Path, workers: Pool, *, seed: int, quiet: bool
 ) -> Comparison:
-    """Run every method, each with a store and a count of its own.
+    """Run every method, each with its own store and count.
 
     With a controller of fixed structure the descents and the sequential designs climb from the
     anchors of the best formulation, and its search is not counted as theirs; the descent with K
     held fixed sweeps weights, which sections do not have, and is left out.
+
+    Parameters
+    ----------
+    case, problem : Case, CoDesignProblem
+        What is solved.
+    folder, workers, seed, quiet : path, Pool, int, bool
+        Of the stores; processes; of every random choice; whether without progress on stderr.
+
+    Returns
+    -------
+    Comparison
+        The methods with their figures.
     """
     began = perf_counter()
     methods = [

@@ -95,10 +95,29 @@ def from_control(system: Any) -> tuple[StateSpace, float]:
 
 
 def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
-    """A plant in SI, force to displacement, ready for synthesis with weights of this M_K (N/m).
+    """A plant of python-control, ready for synthesis.
 
-    Raises UserError where it is in discrete time, PlantError where it cannot be a plant.
+    Parameters
+    ----------
+    system : control.StateSpace or control.TransferFunction
+        In continuous time, force (N) to displacement (m).
+    M_K : float
+        Of the weights, N/m.
 
+    Returns
+    -------
+    ScaledPlant
+        What `synthesise` takes.
+
+    Raises
+    ------
+    UserError
+        The system is in discrete time.
+    PlantError
+        It cannot be a plant.
+
+    Examples
+    --------
     >>> import control
     >>> plant = plant_from_control(control.tf([1.0], [2.0, 40.0, 8e4]), M_K=1e5)
     >>> round(float(plant.natural[0]), 6), plant.A.shape  # rad/s

@@ -36,18 +36,6 @@ def test_importing_it_loads_nothing_that_can_wait(module: str, heavy: tuple[str,
     assert json.loads(found.stdout) == []
 
 
-# whose docstrings are prose still
-PROSE = {
-    "Bounds", "CoDesignProblem", "Errors", "Extrapolation", "GaussianProcess", "Hyperparameters",
-    "Plant", "Quality", "Samples", "Sampling", "SectionsDesign", "Solution", "StateSpace",
-    "Structure", "SurrogateRegressor", "TrueQuantities", "Tuned", "build_plant", "certify",
-    "checked", "compare", "condition", "corners", "deploy", "design", "errors", "extrapolation",
-    "fit_outputs", "grid", "latin_hypercube", "load", "loo_errors", "plant_from_control",
-    "quality_of", "read_frequency_response", "read_run", "robustness", "samples_frame", "save",
-    "scaled_plant", "sobol", "synthesise_sections", "tune", "verify",
-}  # fmt: skip
-
-
 def documented(module: ModuleType) -> list[tuple[str, object]]:
     """What of a package takes parameters: no enumerations and errors."""
     found = ((name, getattr(module, name)) for name in module.__all__)
@@ -67,8 +55,7 @@ def test_sections_of_a_docstring_name_what_the_signature_does(module: ModuleType
             wrong[name] = f"{named} instead of {sorted(signature.parameters)}"
         elif inspect.isfunction(each) and signature.return_annotation is not None:
             wrong |= {} if "returns" in sections else {name: "no returns"}
-    assert {name: wrong[name] for name in wrong if name not in PROSE} == {}
-    assert all(name in wrong for name in PROSE & set(module.__all__))
+    assert wrong == {}
 
 
 @pytest.mark.parametrize("name", NAMES)
