@@ -107,9 +107,16 @@ def together(
         if tell is not None:
             tell(f"J {J:.6g} and {found.gain:.2g} less to be had near by")
         promised = found.gain > SETTLED * abs(J) and reach > LEAST
-        settled = not (members or promised)
-        if settled:
-            break
+        if not (members or promised):
+            best = finished(asked, best)
+            own = uncertain_plant(problem, best.theta)
+            kappa, omega_b = np.array(best.kappa), best.bandwidth
+            members = worse_members(problem, own, kappa, omega_b, TURNS + turn, tell)[1]
+            settled = not members
+            if settled:
+                break
+            asked = with_members(asked, members)
+            problem = asked.problem
         if not promised:
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
@@ -122,8 +129,7 @@ def together(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    make_end = partial(finished, problem, best)
-    best = asked.kept("finished", (*best.theta, best.bandwidth), Place, make_end)
+    best = best if settled else finished(asked, best)
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.climbed(best.theta, best.kappa)
@@ -132,14 +138,16 @@ def together(
     return sampler, first, True
 
 
-def finished(problem: CoDesignProblem, best: Place) -> Place:
+def finished(sampler: Sampler, start: Place) -> Place:
     """The joint optimum near by, on the plants themselves to first order around each end before: so
     near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
-    lower, upper = box(problem)
-    models, reach = nearby(problem, (), best.theta), CLOSE
-    best, J = JointModel(problem, models, best, reach).adapted()
-    for _ in range(ENDINGS):
-        end = proposed(problem, models, best, reach, LAST_GAIN).end
+    problem, (lower, upper) = sampler.problem, box(sampler.problem)
+    models, reach = nearby(problem, (), start.theta), CLOSE
+    best, J = JointModel(problem, models, start, reach).adapted()
+    for number in range(ENDINGS):
+        make = partial(proposed, problem, models, best, reach, LAST_GAIN)
+        at = (*start.theta, start.bandwidth, number)
+        end = sampler.kept("finished", at, Proposal, make).end
         away = float(np.abs((np.array(end.theta) - best.theta) / (upper - lower)).max())
         others = nearby(problem, (), end.theta)
         end, there = JointModel(problem, others, end, reach).adapted()
