@@ -138,20 +138,16 @@ def together(
     return sampler, first, True
 
 
-def finished(sampler: Sampler, best: Place) -> Place:
-    """`_finished`, from the store if it is there."""
-    make = partial(_finished, sampler.problem, best)
-    return sampler.kept("finished", (*best.theta, best.bandwidth), Place, make)
-
-
-def _finished(problem: CoDesignProblem, best: Place) -> Place:
+def finished(sampler: Sampler, start: Place) -> Place:
     """The joint optimum near by, on the plants themselves to first order around each end before: so
     near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
-    lower, upper = box(problem)
-    models, reach = nearby(problem, (), best.theta), CLOSE
-    best, J = JointModel(problem, models, best, reach).adapted()
-    for _ in range(ENDINGS):
-        end = proposed(problem, models, best, reach, LAST_GAIN).end
+    problem, (lower, upper) = sampler.problem, box(sampler.problem)
+    models, reach = nearby(problem, (), start.theta), CLOSE
+    best, J = JointModel(problem, models, start, reach).adapted()
+    for number in range(ENDINGS):
+        make = partial(proposed, problem, models, best, reach, LAST_GAIN)
+        at = (*start.theta, start.bandwidth, number)
+        end = sampler.kept("finished", at, Proposal, make).end
         away = float(np.abs((np.array(end.theta) - best.theta) / (upper - lower)).max())
         others = nearby(problem, (), end.theta)
         end, there = JointModel(problem, others, end, reach).adapted()

@@ -27,7 +27,7 @@ SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
 SLACK_OF_MANY = 0.05  # of several channels or many parameters
 FEW_PARAMETERS = 4
 MOST_BOXES = 500_000  # some twenty seconds
-MOST_OF_MANY = 250_000  # of each option
+MOST_OF_MANY = 250_000  # of each option, at most
 AT_ONCE = 20_000
 ABOVE = 3.0  # times ω_b and the fastest pole: from there on frequencies are counted by 1/ω
 DECADES = 6.0  # of frequency cells at the start, downwards; below is one cell to 0
@@ -154,7 +154,7 @@ def prove(
         ))  # fmt: skip
     share = (most_boxes or MOST_BOXES) // len(models)
     if many and most_boxes is None:
-        share = MOST_OF_MANY
+        share = min(share, MOST_OF_MANY)
     whole = divide(families, uncertain.box, slack, share, workers)
     bare = replace(bounds, weighted_level=None, compliance_max=None)
     if not several or bare == bounds or whole.proven or whole.refuted:

@@ -157,7 +157,8 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),
         ("Over the box", "passed" if robust["passed"] else "FAILED",
-         f"{robust['words']}, the worst searched by {-100 * robust['worst_excess']:.2g} %; "
+         f"{robust['words']}, the worst plant that a search found at "
+         f"{100.0 + 100.0 * robust['worst_excess']:.6g} % of a bound; "
          f"{r['proof']['words']}"),
         ("Optimality (KKT residual)", number(kkt, 2),
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
