@@ -130,6 +130,8 @@ def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list
     """J and what it counts, true and predicted; `of`: which bandwidth it is, in words."""
     figure, guess = problem.figure, r["surrogate_bandwidth_hz"]
     value = ("Predicted bandwidth", f"{number(guess, 6)} Hz")
+    known = r.get("verdict", {}).get("predicted", {}).get("left_out") is not None
+    error = f"relative error {number(r['verification_error'], 2)}"
     v, words, entry = figure.symbol, figure.words, figure.entry
     if f"{entry}_of_set" in r and not figure.larger_is_better:
         e, guess = (figure.shown(r[key], 6) for key in (f"{entry}_of_set", f"surrogate_{entry}"))
@@ -139,7 +141,7 @@ def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list
         ("Objective J", number(r["objective"], 7), J),
         ("Hardware cost f(θ)", cost_words(r, 6), ""),
         ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", of),
-        (*value, f"relative error {number(r['verification_error'], 2)}"),
+        (*value, "a sample of the surrogate, which it repeats" if known else error),
     ]
 
 
