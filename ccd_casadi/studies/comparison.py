@@ -83,7 +83,6 @@ def compare(
     Returns
     -------
     Comparison
-        The methods with their figures.
     """
     began = perf_counter()
     methods = [
