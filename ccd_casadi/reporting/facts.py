@@ -7,27 +7,39 @@ import numpy as np
 
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, counted, number, shown_unit
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
-    """One sentence with the key numbers."""
+    """One sentence with the key numbers, for every kind of controller."""
     if result["status"] == "infeasible":
         return f"No feasible design: {result['reason']}"
+    verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
+    begins = f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}"
+    hz = f"{number(result['bandwidth_hz'])} Hz"
+    cost = f"a hardware cost of {cost_words(result)} (J = {number(result['objective'], 6)})"
+    if "race" in result:  # sections
+        order = f"a controller of order {result['controller']['order']}"
+        return f"{begins}: {order} with a bandwidth of {hz} on {_plants(result)}, at {cost}."
     certificate = result["certificate"]
     proof = (
         f"certified stable with ‖[W_S S; W_KS KS; W_T T]‖∞ ≤ {number(certificate['norm_bound'])}"
         if certificate["passed"]
         else "NOT certified"
     )
-    verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
     return (
-        f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}, with a "
-        f"closed-loop bandwidth of {number(result['bandwidth_hz'])} Hz at a hardware cost of "
-        f"{cost_words(result)} (J = {number(result['objective'], 6)}), "
-        f"{proof}. It took {result['syntheses']} true syntheses and "
-        f"{number(result['seconds'], 2)} s.{_prediction(result)}"
+        f"{begins}, with a closed-loop bandwidth of {hz} at {cost}, {proof}. It took "
+        f"{result['syntheses']} true syntheses and {number(result['seconds'], 2)} s."
+        f"{_prediction(result)}"
     )
+
+
+def _plants(result: Mapping[str, Any]) -> str:
+    designed, judged = (result[name]["plants"] for name in ("certificate", "robust"))
+    if designed == judged == 1:
+        return "the model, the only plant of its set"
+    again = counted(judged, "plant")
+    return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
 
 
 def _prediction(result: Mapping[str, Any]) -> str:
