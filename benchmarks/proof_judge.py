@@ -1,6 +1,6 @@
 """The proof for the rib stage's controller, and what other code says of it.
 
-    python benchmarks/proof_judge.py [--draws N] [--climbs N] [--option I] [--mutants]
+    python benchmarks/proof_judge.py [--draws N] [--climbs N] [--option I] [--mutants] [--most N]
 
 benchmarks/rib_stage_design/sections.json has the sections of an earlier design, at THETA. `prove`
 is asked for stability and |S|, |KS|, |T| and |GS| within 1.05 of their bounds on the box of every
@@ -135,6 +135,7 @@ def main() -> None:
     parser.add_argument("--climbs", type=int, default=5)
     parser.add_argument("--option", type=int)
     parser.add_argument("--mutants", action="store_true")
+    parser.add_argument("--most", type=int, default=MOST, help="enclosures for each option")
     given = parser.parse_args()
     problem = problem_of(load_case(CASE))
     whole = uncertain_plant(problem, THETA)
@@ -152,9 +153,13 @@ def main() -> None:
                 print(f"option {option}, {name}: {proof.outcome.value}", flush=True)
             continue
         began = process_time()
-        proof = prove(one, structure, kappa, bandwidth, bounds, sampling, most_boxes=MOST)
+        proof = prove(one, structure, kappa, bandwidth, bounds, sampling, most_boxes=given.most)
         print(f"option {option}: {proof.words}; {len(proof.parameters)} parameters, "
-              f"{process_time() - began:.0f} s of a processor", flush=True)  # fmt: skip
+              f"{process_time() - began:.0f} s of a processor; "
+              f"{ {name: round(value, 4) for name, value in proof.levels.items()} }",
+              flush=True)  # fmt: skip
+        if not given.draws:
+            continue
         judge, top = Judge(one, bounds), []
         for _ in range(0, given.draws, 50):
             points = judge.drawn(50, rng)

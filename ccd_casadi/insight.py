@@ -1,8 +1,8 @@
 """`python -m ccd_casadi.insight RUN_DIR`: the trade-off around a design, and what it answers to.
 
 Writes insight.json and insight.html into the run folder: the front of hardware cost against
-bandwidth with every point verified, the derivatives of the optimum to what the case gives, what
-limits the bandwidth, and the rule of thumb against what was achieved.
+bandwidth, error or move time with every point verified, the derivatives of the optimum to what the
+case gives, what limits the bandwidth, and the rule of thumb against what was achieved.
 """
 
 import argparse
@@ -21,7 +21,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.insight import insight_dict
     from ccd_casadi.codesign.pareto import pareto_front
     from ccd_casadi.codesign.run import outer_of
-    from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
@@ -29,7 +28,6 @@ def command(options: argparse.Namespace) -> ExitCode:
 
     began = perf_counter()
     done = read_run(options.run)
-    require_bandwidth(done.problem, "insight")
     folder = run_folder(options.run, options.out or options.run)
     with (
         pool(options.scheduler, options.workers, PATIENCE) as workers,

@@ -161,7 +161,6 @@ def condition(
     Returns
     -------
     GaussianProcess
-        The process.
 
     Raises
     ------

@@ -41,7 +41,6 @@ def errors(residuals: ArrayLike, Y: ArrayLike) -> Errors:
     Returns
     -------
     Errors
-        rms, largest and Q².
 
     Examples
     --------

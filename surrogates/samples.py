@@ -86,7 +86,6 @@ def checked(
     Returns
     -------
     Samples
-        Arrays of float64.
 
     Raises
     ------

@@ -33,7 +33,6 @@ def grid(lower: ArrayLike, upper: ArrayLike, points_per_axis: int | list[int]) -
     Returns
     -------
     array (N, d)
-        The product of the axes.
 
     Raises
     ------
@@ -68,7 +67,6 @@ def corners(lower: ArrayLike, upper: ArrayLike) -> Array:
     Returns
     -------
     array (2^d, d)
-        The corners.
     """
     return grid(lower, upper, 2)
 
@@ -88,7 +86,6 @@ def sobol(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
     Returns
     -------
     array (n, d)
-        The points.
 
     Raises
     ------
@@ -118,7 +115,6 @@ def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Ar
     Returns
     -------
     array (n, d)
-        The points.
 
     Raises
     ------
@@ -151,7 +147,6 @@ def design(
     Returns
     -------
     array (N, d)
-        The points.
 
     Raises
     ------

@@ -74,7 +74,6 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[GaussianProcess, ...], dic
     Returns
     -------
     tuple of GaussianProcess, dict
-        The surrogates and `extra`.
 
     Raises
     ------

@@ -57,7 +57,6 @@ def load_case(path: str | Path) -> Case:
     Returns
     -------
     Case
-        Its tables, checked.
 
     Raises
     ------
@@ -118,7 +117,6 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     Returns
     -------
     Case
-        The tables, checked.
 
     Raises
     ------

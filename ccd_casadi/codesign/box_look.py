@@ -1,21 +1,13 @@
 """A look at the whole box: is anything better than what a formulation found?
 
 The true inner problem is solved at θ spread over the box (Sobol, seeded), those that the
-formulation solved itself counted in. With surrogates over (θ, ω_S, ω_T) a θ is passed over where
-even their optimistic values (if left-out samples say that they are to be trusted, and no local
-maximum of S is near -3 dB),
-
-    ω_b + k σ   over   ln‖S‖∞ - k σ <= ln S_max,  ln|S(jω_low)| - k σ <= ln S_low,   k = 4,
-
-do not reach the J at hand. The `CHECKED` most promising of those are solved all the same, and all
-of them where one is better than the surrogates' optimism allowed. What is better than its
-neighbours, and after that the best of the rest, start local solves on the true problem
-(`kinked.descend`), none of which goes on near a stationary point that is known; the best end wins.
-A basin is often entered by points that are no better than their neighbours: with these alone one
-random problem of six ended above its optimum. At last each parameter is brought to the ends of its
-range, the others as at the optimum, and these start local solves too (but for what the surrogates
-rule out): one of 60 random problems had a better optimum there that no spread θ led to. What this
-excludes is a better optimum whose basin one of the starts lies in, and no more.
+formulation solved itself counted in. What is better than its neighbours, and after that the best of
+the rest, start local solves on the true problem (`kinked.descend`), none of which goes on near a
+stationary point that is known; the best end wins. A basin is often entered by points that are no
+better than their neighbours: with these alone one random problem of six ended above its optimum. At
+last each parameter is brought to the ends of its range, the others as at the optimum, and these
+start local solves too: one of 60 random problems had a better optimum there that no spread θ led
+to. What this excludes is a better optimum whose basin one of the starts lies in, and no more.
 """
 
 from collections.abc import Sequence
@@ -24,14 +16,13 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import BoxLook
 from ccd_casadi.codesign.outer import End, Outer, Place
-from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.objective import objective, objective_of
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
-from surrogates import GaussianProcess, design
+from surrogates import design
 
 POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
 FEW = 8  # points at most where each takes a search over the controller, seconds or more
@@ -39,25 +30,18 @@ BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
 TRIES = 4
-OPTIMISM = 4.0  # deviations of the surrogates by which a θ must miss to be passed over
-CHECKED = 4  # of those passed over that are solved nevertheless
-COARSE = 1.02  # what the best between the points of the mesh may be above the best on it
-MESH = 13  # points a side over (ω_S, ω_T) for the optimistic values
 
 
-def look_over_box(
-    outer: Outer, end: End, points: int, seed: int, processes: tuple[GaussianProcess, ...] = ()
-) -> BoxLook:
+def look_over_box(outer: Outer, end: End, points: int, seed: int) -> BoxLook:
     """Look at `points` θ over the box for a J lower than that of an end.
 
-    `processes`: the formulation's surrogates, where there are any. What the run has solved itself
-    counts among the points; where these are dear no more than `FEW` are made up.
+    What the run has solved itself counts among the points; where these are dear no more than `FEW`
+    are made up.
     """
     problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
     if not outer.look_is_cheap:
         points = min(points, FEW)
-    processes = outer.excluding(processes, end.x, seed) if points else ()
-    samples, passed_over = _spread(outer.sampler, J, points, seed, processes) if points else ([], 0)
+    samples = _spread(outer.sampler, points, seed) if points else []
     able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
     values = np.array([objective_of(problem, sample) for sample in able])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
@@ -79,15 +63,12 @@ def look_over_box(
     starts = [*lowest, *others] if outer.look_is_cheap else lowest
     solve_from(starts[: -(-points // POINTS_A_START)])
     ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
-    if len(ends) and processes:
-        ends = ends[_optimistic_objective(problem, processes, ends) < best]
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
         found = outer.sampler.bandwidths(ends, "search from the ends of each parameter")
         least = np.inf if outer.look_is_cheap else best
         solve_from([sample for sample in found if objective_of(problem, sample) < least])
     return BoxLook(
-        points=len(samples) + passed_over,
-        solved=len(samples),
+        points=len(samples),
         feasible=len(able),
         better=int((values < J - margin).sum()),
         starts=begun,
@@ -124,63 +105,18 @@ def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
     return found
 
 
-def _spread(
-    sampler: Sampler, J: float, points: int, seed: int, processes: tuple[GaussianProcess, ...]
-) -> tuple[list[BandwidthSample], int]:
-    """The inner problems that the run has solved, and as many more as make up `points`.
-
-    Second, how many of these were passed over for their surrogates.
-    """
+def _spread(sampler: Sampler, points: int, seed: int) -> list[BandwidthSample]:
+    """The inner problems that the run has solved, and as many more as make up `points`."""
     lower, upper = box(sampler.problem)
     solved = list(sampler.solved.values())
     apart = _apart(np.array([s.theta for s in solved]).reshape(-1, lower.size), upper - lower)
     known = [sample for sample, keep in zip(solved, apart, strict=True) if keep]
-    passed_over = 0
     if len(known) < points:
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
         more = [theta for theta in spread if not unmet(sampler.problem, theta)]
-        solve: list[Array] = list(more)
-        if more and processes:
-            hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
-            order = np.argsort(hopes)
-            keep = [int(i) for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
-            first = sampler.bandwidths(np.array([more[i] for i in keep]), "global check")
-            refuted = any(
-                sample.feasible
-                and objective(sampler.problem, sample.theta, sample.value) < hopes[i]
-                for i, sample in zip(keep, first, strict=True)
-            )
-            known = [*known, *first]
-            solve = [more[i] for i in range(len(more)) if i not in keep] if refuted else []
-            passed_over = len(more) - len(keep) - len(solve)
-        if solve:
-            known = [*known, *sampler.bandwidths(np.array(solve), "global check")]
-    return known, passed_over
-
-
-def _optimistic_objective(
-    problem: CoDesignProblem, processes: tuple[GaussianProcess, ...], thetas: Array
-) -> Array:
-    """The least J (n,) that the surrogates do not rule out at each θ (n, n_θ); see the module."""
-    lower, upper = lifted_bounds(problem)
-    axes = [np.linspace(lower[k], upper[k], MESH) for k in (-2, -1)]
-    mesh = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    levels = problem.inner.levels
-    out = np.empty(len(thetas))
-    for i, theta in enumerate(thetas):
-        X = np.hstack([np.tile(theta, (len(mesh), 1)), mesh])
-        bandwidth, *bounded = (process.predict(X, return_std=True) for process in processes)
-        allowed = np.all(
-            [
-                mean - OPTIMISM * std <= level
-                for (mean, std), level in zip(bounded, levels, strict=True)
-            ],
-            axis=0,
-        )
-        hope = COARSE * (bandwidth[0] + OPTIMISM * bandwidth[1])
-        best = float(hope[allowed].max()) if allowed.any() else -np.inf
-        out[i] = objective(problem, theta, best)
-    return out
+        if more:
+            known = [*known, *sampler.bandwidths(np.array(more), "global check")]
+    return known
 
 
 def _apart(thetas: Array, width: Array) -> list[bool]:

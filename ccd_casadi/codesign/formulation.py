@@ -44,15 +44,13 @@ class FormulationResult:
 
 @dataclass(frozen=True)
 class BoxLook:
-    """What was looked at: `points` θ, `solved` by true inner problems, `feasible` of these with a
-    design; the others were passed over, their optimistic surrogates being worse.
+    """What was looked at: true inner problems at `points` θ, `feasible` of these with a design.
 
     `better`: how many of them beat the J that the formulation came `before` with; `starts` local
     solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
     """
 
     points: int
-    solved: int
     feasible: int
     better: int
     starts: int

@@ -31,6 +31,7 @@ def insight_dict(run: FinishedRun, front: Front, responses: PostOptimal) -> dict
         {
             "theta": dict(zip(names, point.theta, strict=True)),
             "hardware_cost": point.hardware_cost,
+            run.problem.figure.entry: point.value,
             "bandwidth_hz": point.bandwidth / HZ,
             "omega_S_hz": point.omega_S / HZ,  # NaN with sections
             "omega_T_hz": point.omega_T / HZ,

@@ -22,13 +22,13 @@ from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Solution, Verified
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import counted
-from surrogates import GaussianProcess, design
+from surrogates import design
 
 BASIN = 1e-2  # of the box: ends of local solves on the truth that are closer are of one optimum
 
@@ -62,11 +62,15 @@ class End:
         return bool(np.isfinite(self.objective))
 
 
+def dear(problem: CoDesignProblem) -> bool:
+    """Whether the elements of another θ take as long as a search there."""
+    return plant_of(problem).nearby is not None
+
+
 class Outer(ABC):
     """The outer problem of one kind of inner problem, on a sampler's store and workers."""
 
     kkt_level: float  # residual up to which an end counts as stationary
-    look_is_cheap: bool  # whether local solves may start from points that are no better
     learns_from_others: bool  # whether surrogates of other problems can begin a formulation
     beside_theta: tuple[str, ...] = ()  # what else x holds, logarithms
 
@@ -81,6 +85,11 @@ class Outer(ABC):
     def theta_of(self, x: Array) -> Array:
         """θ of a point."""
         return np.asarray(x, float)[: len(self.problem.names)]
+
+    @property
+    def look_is_cheap(self) -> bool:
+        """Whether local solves may start from points that are no better."""
+        return not dear(self.problem)
 
     @property
     def may_try_again(self) -> bool:
@@ -170,12 +179,6 @@ class Outer(ABC):
 
         `settled`: relative change of J at which it ends.
         """
-
-    def excluding(
-        self, processes: tuple[GaussianProcess, ...], x: Array, seed: int
-    ) -> tuple[GaussianProcess, ...]:
-        """Those of the surrogates that may rule out parts of the box; none where none may."""
-        return ()
 
     def explained(self, found: Solution, share: float | None) -> str:
         """Why a solution is not verified; `share` of a robust set that was held on the way."""

@@ -21,7 +21,6 @@ from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
 from ccd_casadi.codesign.stored import Surrogates
@@ -38,16 +37,12 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import Sensitivities
-from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design
-from surrogates import GaussianProcess, design, quality_of
+from surrogates import design
 
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
 BASIN = 1e-4  # residual of an end whose basin is not searched again
-# Of left-out samples, for surrogates to rule anything out: Q², and within their 95 % bands.
-EXPLAINED, COVERAGE = 0.99, 0.8
-NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
 
 
 @dataclass(frozen=True)
@@ -61,7 +56,6 @@ class MixedOuter(Outer):
     """See the module."""
 
     kkt_level = VerifiedDesign.kkt_level
-    look_is_cheap = True
     learns_from_others = True
     beside_theta = ("omega_S", "omega_T")
 
@@ -140,30 +134,6 @@ class MixedOuter(Outer):
                 stationary = kkt_certificate(problem, x, made).stationarity <= BASIN
                 return Place(x, true_objective(problem, x, made), stationary)
         return None
-
-    def excluding(
-        self, processes: tuple[GaussianProcess, ...], x: Array, seed: int
-    ) -> tuple[GaussianProcess, ...]:
-        """Where ω_b jumps (a peak below it reaches -3 dB) a smooth surrogate is sure of what is not
-        so; elsewhere where left-out samples lie within their bands."""
-        if len(processes) < 2 or self._may_jump(x):
-            return ()
-        middle = 0.5 * (processes[0].lower + processes[0].upper)
-        found = [quality_of(process, middle) for process in processes]
-        sound = all(q.loo.q2 >= EXPLAINED and q.coverage >= COVERAGE for q in found)
-        return processes if sound else ()
-
-    def _may_jump(self, x: Array) -> bool:
-        """Whether a local maximum of S at x is near -3 dB."""
-        problem, made = self.problem, self.sampler.truth.at(x)
-        peaks = local_peaks_with_gradients(
-            scaled_plant(problem, tuple(self.theta_of(x))),
-            problem.weights.at(made.figures.omega_S, made.figures.omega_T),
-            made,
-            gamma_backoff=problem.inner.gamma_backoff,
-            least=float(np.exp(HALF_POWER - NEAR_SHELF)),
-        )
-        return any(abs(p.ln_gain - HALF_POWER) <= NEAR_SHELF for p in peaks if p.member == 0)
 
     def explained(self, found: Solution, share: float | None) -> str:
         return failure_words(self.sampler, found, share)

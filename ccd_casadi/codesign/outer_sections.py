@@ -19,7 +19,7 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
-from ccd_casadi.codesign.outer import End
+from ccd_casadi.codesign.outer import End, dear
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
@@ -289,11 +289,6 @@ class SectionsOuter(ThetaOuter):
 
 def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: SectionsValue) -> float:
     return problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
-
-
-def dear(problem: CoDesignProblem) -> bool:
-    """Whether the elements of another θ take as long as a search there."""
-    return plant_of(problem).nearby is not None
 
 
 def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:

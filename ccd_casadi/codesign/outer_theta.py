@@ -28,9 +28,12 @@ from ccd_casadi.support.errors import UserError
 class ThetaOuter(Outer, ABC):
     """See the module; `words` say why its kind has nothing to begin with, where it has not."""
 
-    look_is_cheap = False
     learns_from_others = False
     words = ""
+
+    @property
+    def look_is_cheap(self) -> bool:
+        return False
 
     def fitted(
         self, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None

@@ -1,12 +1,12 @@
-"""The trade-off of hardware cost against bandwidth: the optima that J has as its weights change.
+"""The trade-off of hardware cost against what J counts beside it: its optima for other weights.
 
-    min  a f(θ) - b ω_b*(θ)   s.t.  θ_min <= θ <= θ_max,  λ(θ) <= 0,     a, b > 0
+    min  a f(θ) ∓ b v(θ)   s.t.  θ_min <= θ <= θ_max,  λ(θ) <= 0,     a, b > 0
 
-From the lightest and the fastest design on, the weights for which two neighbours are as good as
-each other are solved next, from both of them: a better design goes between them. So the points lie
-on the convex hull of all that can be reached; where a front is hollow no weights lead there, and
-none is shown. Every point is a local solve on the truth. Source: Aneja and Nair, Bicriteria
-transportation problem, Management Science 25 (1979).
+v is ω_b*, or an error or a time, of which less is better. From the lightest and the best design on,
+the weights for which two neighbours are as good as each other are solved next, from both of them: a
+better design goes between them. So the points lie on the convex hull of all that can be reached;
+where a front is hollow no weights lead there, and none is shown. Every point is a local solve on
+the truth. Source: Aneja and Nair, Bicriteria transportation problem, Management Science 25 (1979).
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +34,8 @@ GAIN = 1e-3  # of the triangle between two neighbours: a lesser one is none
 
 @dataclass(frozen=True)
 class FrontPoint:
-    """A design that is the best for some weights; `bandwidth` is the true ω_b*(θ) in rad/s.
+    """A design that is the best for some weights; `bandwidth` is that of its controller in rad/s,
+    `worth` the true v(θ) in SI, and -v where less is better.
 
     `verified`: the inner problem at θ has a certified design, and the solve ended at a stationary
     point of its J.
@@ -43,10 +44,16 @@ class FrontPoint:
     theta: tuple[float, ...]
     hardware_cost: float
     bandwidth: float
+    worth: float
     omega_S: float
     omega_T: float
     active: tuple[str, ...]
     verified: bool
+
+    @property
+    def value(self) -> float:
+        """v(θ): ω_b* in rad/s, the RMS error in m or the time of a move in s."""
+        return abs(self.worth)
 
 
 @dataclass(frozen=True)
@@ -82,11 +89,11 @@ def pareto_front(
     if not begun[0].feasible:
         raise UserError(f"the run's design is not certified: {begun[0].shortfall}")
     begun = [sample for sample in begun if sample.feasible]
-    omega = begun[0].bandwidth
+    size, sign = begun[0].value, 1.0 if problem.figure.larger_is_better else -1.0
 
     def solved(a: float, b: float, begin: Sequence[BandwidthSample]) -> FrontPoint | None:
         """The best design for these weights, of local solves from some designs."""
-        outer = outer_of(sampler.of(replace(problem, w1=a, w2=-b), traced=False, quiet=True))
+        outer = outer_of(sampler.of(replace(problem, w1=a, w2=-sign * b), traced=False, quiet=True))
         places = [outer.solved_from(sample, ()) for sample in begin]
         found = [place for place in places if place is not None]
         if not found:
@@ -96,7 +103,7 @@ def pareto_front(
 
     straight: set[tuple[FrontPoint, FrontPoint]] = set()
     with Progress(points, "points of the front", quiet=sampler.quiet) as progress:
-        ends = [solved(w / f_range, EXTREME / w / omega, begun) for w in (1.0, EXTREME)]
+        ends = [solved(w / f_range, EXTREME / w / size, begun) for w in (1.0, EXTREME)]
         kept = hull([_point(sampler, own, True), *(end for end in ends if end is not None)])
         while True:
             progress.advance(len(kept) - progress.done)
@@ -104,10 +111,9 @@ def pareto_front(
             if not pairs or len(kept) >= points:
                 return Front(tuple(kept), not pairs, sampler.syntheses)
             steps = [
-                (two.bandwidth - one.bandwidth, two.hardware_cost - one.hardware_cost)
-                for one, two in pairs
+                (two.worth - one.worth, two.hardware_cost - one.hardware_cost) for one, two in pairs
             ]
-            widest = int(np.argmax([np.hypot(up / omega, along / f_range) for up, along in steps]))
+            widest = int(np.argmax([np.hypot(up / size, along / f_range) for up, along in steps]))
             (light, fast), (a, b) = pairs[widest], steps[widest]
             new = solved(a, b, sampler.bandwidths(np.array([light.theta, fast.theta])))
             if new is None or _gain(light, new, a, b) <= GAIN:
@@ -119,15 +125,17 @@ def pareto_front(
 def _gain(light: FrontPoint, new: FrontPoint, a: float, b: float) -> float:
     """How far a point lies beyond the line from `light` that has this slope, as a share of both."""
     lighter = (light.hardware_cost - new.hardware_cost) / b
-    return lighter + (new.bandwidth - light.bandwidth) / a
+    return lighter + (new.worth - light.worth) / a
 
 
 def _point(sampler: Sampler, theta: Sequence[float] | np.ndarray, stationary: bool) -> FrontPoint:
+    up = sampler.problem.figure.larger_is_better
     sample = sampler.bandwidths(np.asarray(theta, float), "verifying")[0]
     return FrontPoint(
         theta=sample.theta,
         hardware_cost=hardware_cost(plant_of(sampler.problem), sample.theta),
         bandwidth=sample.bandwidth,
+        worth=sample.value if up else -sample.value,
         omega_S=sample.omega_S,
         omega_T=sample.omega_T,
         active=tuple(bound_words(sample.active)) if sample.kappa else sample.active,
@@ -138,8 +146,8 @@ def _point(sampler: Sampler, theta: Sequence[float] | np.ndarray, stationary: bo
 def hull(points: Sequence[FrontPoint]) -> list[FrontPoint]:
     """In order of cost, the points that are the best of all for some weights."""
     kept: list[FrontPoint] = []
-    for point in sorted(points, key=lambda point: (point.hardware_cost, -point.bandwidth)):
-        if not np.isfinite(point.bandwidth) or (kept and point.bandwidth <= kept[-1].bandwidth):
+    for point in sorted(points, key=lambda point: (point.hardware_cost, -point.worth)):
+        if not np.isfinite(point.worth) or (kept and point.worth <= kept[-1].worth):
             continue
         while len(kept) > 1 and _slope(kept[-2], kept[-1]) <= _slope(kept[-1], point):
             kept.pop()
@@ -148,4 +156,4 @@ def hull(points: Sequence[FrontPoint]) -> list[FrontPoint]:
 
 
 def _slope(light: FrontPoint, fast: FrontPoint) -> float:
-    return (fast.bandwidth - light.bandwidth) / (fast.hardware_cost - light.hardware_cost)
+    return (fast.worth - light.worth) / (fast.hardware_cost - light.hardware_cost)

@@ -24,6 +24,7 @@ from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
@@ -175,6 +176,8 @@ def sections_responses(
 
         dJ*/dp = ∂L/∂p,   with the bounds on the loop dω_b*/dp = ω_b μ/p
 
+    Of an error or a move time those to the bounds on the loop, and how ω_b moves, are not known.
+
     How θ and ω_b move is given where the bounds on θ and λ alone determine θ (a vertex); elsewhere
     it takes second derivatives of ω_b*, which are not known. At a kink of ω_b* the multipliers μ
     are those of θ and controller together.
@@ -204,9 +207,10 @@ def sections_responses(
 
     answers = [
         response("w1", problem.w1, hardware_cost(plant, theta), 0.0),
-        response("w2", problem.w2, sample.bandwidth, 0.0),
+        response("w2", problem.w2, sample.value, 0.0),
     ]
-    for name, value, mu in _loop_bounds(problem, loop):
+    known = problem.figure is BANDWIDTH
+    for name, value, mu in _loop_bounds(problem, loop) if known else ():
         rate = sample.bandwidth * mu / value
         answers.append(response(name, value, problem.w2 * rate, rate))
     for name in plant.constraint_names:
@@ -217,6 +221,7 @@ def sections_responses(
             label = f"{name} {end}"
             mu = kkt.multipliers.get(label, 0.0)
             rate, which = (sample.gradient[i], i) if label in strong else (0.0, None)
+            rate = rate if known or which is None else np.nan
             answers.append(response(label, value, sign * mu / width[i], rate, which))
     weak = tuple(name for name in kkt.active if name not in strong)
     return PostOptimal(tuple(answers), kkt, weak, vertex)

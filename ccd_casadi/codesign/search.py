@@ -71,7 +71,7 @@ def _looked(found: Searched, formulation: Formulation, seed: int) -> Searched:
     outer, outcome, end = found.outer, found.outcome, found.end
     assert end is not None
     with outer.sampler.spent.on("box_look"):
-        look = look_over_box(outer, end, formulation.box_points, seed, outcome.surrogates)
+        look = look_over_box(outer, end, formulation.box_points, seed)
     if look.x is not None:
         end = best_end([end, outer.ended(look.x)], outer.kkt_level, formulation.tolerance)
     residual = end.kkt.stationarity

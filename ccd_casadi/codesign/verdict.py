@@ -143,7 +143,6 @@ def look_words(
         return ", ".join(part for part in words if part), figures
     figures |= {
         "box_points": look.points,
-        "box_solved": look.solved,
         "box_feasible": look.feasible,
         "box_better": look.better,
         "box_starts": look.starts,
@@ -151,8 +150,6 @@ def look_words(
         "objective_before": look.before,
     }
     how = f"{look.points} spread theta"
-    if look.solved < look.points:
-        how += f" ({look.solved} solved, the rest ruled out by the surrogates)"
     said = f"none better at {how}"
     if look.moved:
         said = f"moved by the global check at {how}: the formulation ended at J = {look.before:.6g}"

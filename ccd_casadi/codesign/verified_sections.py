@@ -205,7 +205,8 @@ class VerifiedSections(Verified):
             "proven": proof.levels,
         }
         where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
-        words = f"within every bound on {where}, the worst searched by {-100.0 * excess:.2g} %"
+        share = f"{100.0 + 100.0 * excess:.6g} % of a bound"
+        words = f"within every bound on {where}, the worst that a search found at {share}"
         robust: bool | None = self.kept
         if not self.wide.passed:
             words = f"on {where}: {self.wide.words}"

@@ -63,7 +63,6 @@ def deploy(
     Returns
     -------
     Deployment
-        The sampled controller with its figures.
 
     Raises
     ------

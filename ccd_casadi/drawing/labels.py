@@ -28,6 +28,18 @@ def inside(axes: "Axes") -> Box:
     return scale * box.x0, scale * box.y0, scale * box.x1, scale * box.y1
 
 
+def scales_of(axes: "Axes", log_x: bool = False, log_y: bool = False) -> list[list[float]]:
+    """Of both axes: their ends, whether logarithmic, and where these are in pt from the top left,
+    for the page's scripts."""
+    box, tall = inside(axes), 72.0 * axes.figure.bbox.height / axes.figure.dpi
+    ends = (
+        (axes.get_xlim(), log_x, box[0], box[2]),
+        (axes.get_ylim(), log_y, tall - box[1], tall - box[3]),
+    )
+    return [[*map(float, limits), int(log), round(a, 3), round(b, 3)]
+            for limits, log, a, b in ends]  # fmt: skip
+
+
 def in_points(axes: "Axes", x: Any, y: Any) -> np.ndarray:
     """Points (k, 2) of the data in pt, from the lower left corner of the figure."""
     return axes.transData.transform(np.column_stack([x, y])) * 72.0 / axes.figure.dpi

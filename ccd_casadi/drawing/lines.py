@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
-from ccd_casadi.drawing.labels import APART, Labels, in_points, inside
+from ccd_casadi.drawing.labels import APART, Labels, in_points, inside, scales_of
 from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
 from ccd_casadi.drawing.turntable import modes_html
@@ -69,15 +69,9 @@ def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
         for i, curve in enumerate(panel.curves)
         if curve.line and len(curve.x) >= LEAST_POINTS and (np.diff(curve.x) >= 0.0).all()
     }
-    box, tall = inside(axes), 72.0 * height
-    ends = (
-        (axes.get_xlim(), panel.log_x, box[0], box[2]),
-        (axes.get_ylim(), panel.log_y, tall - box[1], tall - box[3]),
-    )
-    scales = [[*map(float, limits), int(log), round(a, 3), round(b, 3)]
-              for limits, log, a, b in ends]  # fmt: skip
+    scales = scales_of(axes, panel.log_x, panel.log_y)
     found = {"x": panel.x_label, "y": panel.y_label, "scales": scales, "names": names}
-    found |= {"locus": points} if (points := _locus(axes, panel, tall)) else {}
+    found |= {"locus": points} if (points := _locus(axes, panel, 72.0 * height)) else {}
     return json.dumps(found, separators=(",", ":"), ensure_ascii=False)
 
 

@@ -1,10 +1,12 @@
 """The map over two parameters: the landscape of ω_b*(θ)."""
 
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ccd_casadi.drawing.content import Landscape
+from ccd_casadi.drawing.labels import scales_of
 from ccd_casadi.drawing.svg import (
     BLACK,
     COLOUR_MAP,
@@ -45,35 +47,36 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
         shown = land.bandwidth_hz if land.bandwidth_hz.size else truths[:, 2]
         filled, norm = _contours(axes, land.first, land.second, land.bandwidth_hz, shown)
         if land.outside.any():
-            pale = np.where(land.outside, 1.0, np.nan)
-            axes.pcolormesh(land.first, land.second, pale.T, cmap="gray", vmin=0.0, vmax=1.0,
-                            alpha=0.72, shading="nearest", rasterized=True)  # fmt: skip
+            axes.contourf(land.first, land.second, land.outside.T.astype(float), levels=[0.5, 1.5],
+                          colors=["white"], alpha=0.72).set_gid("area-outside")  # fmt: skip
         if land.forbidden is not None and land.forbidden.any():
             _shade(axes, land.first, land.second, land.forbidden.astype(float) - 0.5)
         if len(land.designs):
             axes.plot(*land.designs.T, ".", color=RING, markersize=5.0, markeredgecolor=GROUND,
-                      markeredgewidth=0.6, label="sampled designs", linestyle="none")  # fmt: skip
+                      markeredgewidth=0.6, label="sampled designs", linestyle="none",
+                      gid="mark-designs")  # fmt: skip
         if len(truths):
             known = truths[np.isfinite(truths[:, 2])]
             dots = _dots(axes, known, norm, land.truth_label)
             filled = filled or dots
             lost = truths[~np.isfinite(truths[:, 2])]
             if len(lost):
-                axes.plot(lost[:, 0], lost[:, 1], "x", color=GREY, label="infeasible θ")
+                axes.plot(lost[:, 0], lost[:, 1], "x", color=GREY, label="infeasible θ",
+                          gid="mark-lost")  # fmt: skip
         if land.region is not None:
             a, b, c, d = land.region
             axes.add_patch(Rectangle((a, c), b - a, d - c, fill=False, edgecolor=BLACK,
                                      linestyle=(0, (4, 3)), linewidth=0.8, clip_on=False,
-                                     label="last trust region"))  # fmt: skip
+                                     label="last trust region", gid="level-region"))  # fmt: skip
         for i, path in enumerate(land.paths):
             axes.plot(*path.theta.T, "-o", color=CYCLE[(i + 1) % len(CYCLE)], linewidth=1.2,
                       markersize=6, clip_on=False, markerfacecolor="white", markeredgewidth=1.3,
-                      label=path.label, zorder=5)  # fmt: skip
+                      label=path.label, zorder=5, gid=f"curve{i}")  # fmt: skip
         if land.optimum is not None:
             a, b = land.optimum
             axes.plot([a], [b], "*", color=ORANGE, markersize=15, clip_on=False, zorder=7,
                       markeredgecolor=RING, markeredgewidth=0.9, linestyle="none",
-                      label="verified optimum")  # fmt: skip
+                      label="verified optimum", gid="mark-optimum")  # fmt: skip
         axes.set_xlim(land.first[0], land.first[-1])
         axes.set_ylim(land.second[0], land.second[-1])
         axes.set_xlabel(axis_label(land.names[0], land.units[0]))
@@ -82,7 +85,7 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
         _colour_bar(figure, filled, axis_label(which, "Hz"))
         _legend(figure, axes)
         title = "Landscape of the largest bandwidth over the two parameters"
-        return to_svg(figure, key, title, share=_share(width))
+        return to_svg(figure, key, title, json.dumps({"scales": scales_of(axes)}), _share(width))
 
 
 def _share(width: float) -> float:
@@ -92,10 +95,11 @@ def _share(width: float) -> float:
 
 def _dots(axes: "Axes", rows: Array, norm: Any, label: str) -> Any:
     """Dots (x, y, value) in the map's colours; light and dark rings tell them from any colour."""
-    axes.scatter(rows[:, 0], rows[:, 1], s=62, color=GROUND, zorder=2.9, clip_on=False)
+    axes.scatter(rows[:, 0], rows[:, 1], s=62, color=GROUND, zorder=2.9, clip_on=False,
+                 gid="mark-grounds")  # fmt: skip
     return axes.scatter(rows[:, 0], rows[:, 1], c=rows[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
                         edgecolors=RING, linewidths=1.1, label=label, zorder=3,
-                        clip_on=False)  # fmt: skip
+                        clip_on=False, gid="mark-truths")  # fmt: skip
 
 
 def _map_axes(width: float) -> tuple["Figure", "Axes"]:
@@ -119,7 +123,9 @@ def _contours(axes: "Axes", x: Array, y: Array, field: Array, shown: Array) -> t
     if not field.size or not np.isfinite(field).any():
         return None, norm
     filled = axes.contourf(x, y, field.T, levels=levels, cmap=COLOUR_MAP, norm=norm)
-    axes.contour(x, y, field.T, levels=levels, colors="white", linewidths=0.35)
+    filled.set_gid("area-field")
+    lines = axes.contour(x, y, field.T, levels=levels, colors="white", linewidths=0.35)
+    lines.set_gid("level-field")
     return filled, norm
 
 
@@ -129,6 +135,7 @@ def _shade(axes: "Axes", x: Array, y: Array, excess: Array) -> None:
         return
     veil = axes.contourf(x, y, excess.T, levels=[0.0, np.inf], colors=["white"], alpha=0.55,
                          hatches=["////"])  # fmt: skip
+    veil.set_gid("area-forbidden")
     veil.set_edgecolor("#777777")
     veil.set_linewidth(0.0)
     axes.fill([], [], facecolor="white", edgecolor="#777777", hatch="////", linewidth=0.5,
@@ -147,6 +154,11 @@ def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
 
 
 def _legend(figure: "Figure", axes: "Axes") -> None:
+    from matplotlib.collections import PathCollection
+
     handles, labels = axes.get_legend_handles_labels()
     columns = 2 if figure.get_figwidth() == NARROW else 3 if len(labels) > 4 else 4
-    figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
+    made = figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
+    for handle in made.legend_handles:
+        if isinstance(handle, PathCollection):  # its light ring is not seen on paper
+            handle.set_edgecolor(GROUND)

@@ -124,7 +124,7 @@ def designed(
     if short:
         outcome = SectionsOutcome.BOUND_NOT_MET
         missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
-        words = f"the nearest controller misses {missed}"
+        words = f"none found from {starts} starts: the nearest controller misses {missed}"
     elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
         outcome = SectionsOutcome.NOT_CERTIFIED
         words = f"judged {judged.bandwidth:.6g} rad/s, searched {bandwidth:.6g}: {judged.words}"

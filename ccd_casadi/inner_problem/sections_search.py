@@ -29,6 +29,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
 MOST_ANCHORS = 3
+ENOUGH = 12  # starts before a search may say that it found no controller within the bounds
 DISTINCT = 0.1  # relative: local optima further below the best are no anchors
 ROUNDS, ROUNDS_OF_ERROR = 6, 4  # of a design on the set and a search for plants that are worse
 SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
@@ -41,11 +42,17 @@ def race(
     workers: Pool | None = None,
     only_anchors: bool = False,
 ) -> SectionsDesign:
-    """A multi-start search at θ: the problem's starts, and its anchors beside them or alone."""
-    sections = sections_of_problem(problem)
+    """A multi-start search at θ: the problem's starts, and its anchors beside them or alone.
+
+    Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
+    """
+    sections, plants = sections_of_problem(problem), plants_of(problem, theta)
     anchors = [np.array(kappa) for kappa in sections.anchors]
     starts = None if only_anchors else sections.starts
-    return searched(problem, plants_of(problem, theta), anchors, starts, progress, workers)
+    made = searched(problem, plants, anchors, starts, progress, workers)
+    if made.certified or starts is None or starts >= ENOUGH:
+        return made
+    return searched(problem, plants, anchors, ENOUGH, progress, workers)
 
 
 def with_range(problem: CoDesignProblem) -> CoDesignProblem:

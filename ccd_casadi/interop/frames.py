@@ -31,7 +31,6 @@ def samples_frame(run: FinishedRun) -> "pandas.DataFrame":
     Returns
     -------
     pandas.DataFrame
-        The table.
 
     Raises
     ------

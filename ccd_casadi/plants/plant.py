@@ -128,7 +128,6 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     Returns
     -------
     Plant
-        What a problem takes.
 
     Raises
     ------

@@ -7,27 +7,39 @@ import numpy as np
 
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, counted, number, shown_unit
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
-    """One sentence with the key numbers."""
+    """One sentence with the key numbers, for every kind of controller."""
     if result["status"] == "infeasible":
         return f"No feasible design: {result['reason']}"
+    verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
+    begins = f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}"
+    hz = f"{number(result['bandwidth_hz'])} Hz"
+    cost = f"a hardware cost of {cost_words(result)} (J = {number(result['objective'], 6)})"
+    if "race" in result:  # sections
+        order = f"a controller of order {result['controller']['order']}"
+        return f"{begins}: {order} with a bandwidth of {hz} on {_plants(result)}, at {cost}."
     certificate = result["certificate"]
     proof = (
         f"certified stable with ‖[W_S S; W_KS KS; W_T T]‖∞ ≤ {number(certificate['norm_bound'])}"
         if certificate["passed"]
         else "NOT certified"
     )
-    verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
     return (
-        f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}, with a "
-        f"closed-loop bandwidth of {number(result['bandwidth_hz'])} Hz at a hardware cost of "
-        f"{cost_words(result)} (J = {number(result['objective'], 6)}), "
-        f"{proof}. It took {result['syntheses']} true syntheses and "
-        f"{number(result['seconds'], 2)} s.{_prediction(result)}"
+        f"{begins}, with a closed-loop bandwidth of {hz} at {cost}, {proof}. It took "
+        f"{result['syntheses']} true syntheses and {number(result['seconds'], 2)} s."
+        f"{_prediction(result)}"
     )
+
+
+def _plants(result: Mapping[str, Any]) -> str:
+    designed, judged = (result[name]["plants"] for name in ("certificate", "robust"))
+    if designed == judged == 1:
+        return "the model, the only plant of its set"
+    again = counted(judged, "plant")
+    return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
 
 
 def _prediction(result: Mapping[str, Any]) -> str:
@@ -130,6 +142,8 @@ def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list
     """J and what it counts, true and predicted; `of`: which bandwidth it is, in words."""
     figure, guess = problem.figure, r["surrogate_bandwidth_hz"]
     value = ("Predicted bandwidth", f"{number(guess, 6)} Hz")
+    known = r.get("verdict", {}).get("predicted", {}).get("left_out") is not None
+    error = f"relative error {number(r['verification_error'], 2)}"
     v, words, entry = figure.symbol, figure.words, figure.entry
     if f"{entry}_of_set" in r and not figure.larger_is_better:
         e, guess = (figure.shown(r[key], 6) for key in (f"{entry}_of_set", f"surrogate_{entry}"))
@@ -139,7 +153,7 @@ def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list
         ("Objective J", number(r["objective"], 7), J),
         ("Hardware cost f(θ)", cost_words(r, 6), ""),
         ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", of),
-        (*value, f"relative error {number(r['verification_error'], 2)}"),
+        (*value, "a sample of the surrogate, which it repeats" if known else error),
     ]
 
 

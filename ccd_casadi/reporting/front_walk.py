@@ -8,7 +8,7 @@ from ccd_casadi.drawing.content import Landscape, Lines, Place, Steps
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.glance import machine
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import number
 
 MOST = 12  # designs that are drawn
 
@@ -49,5 +49,5 @@ def _words(problem: CoDesignProblem, point: FrontPoint) -> str:
     held = f"; at {', '.join(point.active)}" if point.active else ""
     return (
         f"f = {f'{number(point.hardware_cost, 4)} {problem.cost_unit}'.strip()}, {named}: "
-        f"{number(point.bandwidth / HZ, 4)} Hz, {state}{held}."
+        f"{problem.figure.shown(point.value)}, {state}{held}."
     )

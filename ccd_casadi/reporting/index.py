@@ -9,7 +9,7 @@ from urllib.parse import quote
 from ccd_casadi.drawing.content import INDEX, Links, Page, Section
 from ccd_casadi.drawing.paint import painted
 from ccd_casadi.drawing.stored import write_page
-from ccd_casadi.reporting.sections_page import conclusion_of
+from ccd_casadi.reporting.facts import conclusion
 from ccd_casadi.reporting.verdict import refreshed, run_head
 from surrogates.files import write_whole
 
@@ -66,7 +66,7 @@ def write_index(folder: Path) -> None:
     )
     files = tuple((n, n, words) for n, words in FILES.items() if (folder / n).exists())
     name = folder.resolve().name
-    lead = conclusion_of(result)
+    lead = conclusion(result)
     head = run_head(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
     sections = (Section("Pages", (Links(links),)), Section("Files", (Links(files),)))
     write_whole(folder / INDEX, painted(Page(head, sections, index="")))

@@ -23,6 +23,7 @@ from ccd_casadi.drawing.content import (
     Words,
 )
 from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_axes, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
@@ -54,10 +55,12 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
         f"of {cost_words(run.result)}. {rule}",
         run.result, front_answer(problem, front),
     )  # fmt: skip
-    drawn = front_figure(problem, front, (cost, bandwidth_hz, "this run's design"))
+    v = problem.figure
+    own = v.factor * float(run.result.get(f"{v.entry}_of_set", bandwidth_of(run)))
+    drawn = front_figure(problem, front, (cost, own, "this run's design"))
     answers = [Words(text) for text in response_sentences(responses)]
     sections = (
-        Section("Weight against bandwidth", (drawn, *front_walk(run, front))),
+        Section(f"Weight against {v.words}", (drawn, *front_walk(run, front))),
         Section(
             "What each parameter of the case would change",
             (*answers, table_responses(problem, responses)),
@@ -82,21 +85,22 @@ def _limits(run: FinishedRun, rule: str) -> tuple[Block, ...]:
 def front_figure(
     problem: CoDesignProblem, front: Front, design: tuple[float, float, str]
 ) -> Figure:
-    """Bandwidth over hardware cost, and where each θ lies in its bounds along the curve.
+    """What J counts over hardware cost, and where each θ lies in its bounds along the curve.
 
-    `design` is (f, ω_b in Hz, words) of the run's own optimum.
+    `design` is (f, v in its shown unit, words) of the run's own optimum.
     """
+    v = problem.figure
     cost = np.array([point.hardware_cost for point in front.points])
-    hz = np.array([point.bandwidth for point in front.points]) / HZ
+    values = v.factor * np.array([point.value for point in front.points])
     good = np.array([point.verified for point in front.points])
     curves = [
-        Curve(cost, hz, "", GREY, marker="."),
-        Curve(cost[good], hz[good], "the best design for some weights", line="", marker="o"),
+        Curve(cost, values, "", GREY, marker="."),
+        Curve(cost[good], values[good], "the best design for some weights", line="", marker="o"),
     ]
     if not good.all():
-        curves.append(Curve(cost[~good], hz[~good], "not stationary", CYCLE[1], "", "x"))
+        curves.append(Curve(cost[~good], values[~good], "not stationary", CYCLE[1], "", "x"))
     mark = Mark(design[0], design[1], design[2], "+", offset=(8.0, 3.0))
-    top = Panel("", "bandwidth ω_b (Hz)", tuple(curves), marks=(mark,))
+    top = Panel("", f"{v.words} {v.symbol} ({v.unit})", tuple(curves), marks=(mark,))
     low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
     theta = (np.array([point.theta for point in front.points]) - low) / width
     parts = tuple(
@@ -104,7 +108,7 @@ def front_figure(
         for i, name in enumerate(problem.names)
     )
     bottom = Panel(cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
-    title = "Hardware cost against bandwidth as the weights of J change, and the hardware there"
+    title = f"Hardware cost against {v.words} as the weights of J change, and the hardware there"
     lines = Lines(((top,), (bottom,)), title, (3.3, 2.8))
     return Figure(lines, _caption(front), (_table(problem, front),))
 
@@ -127,35 +131,37 @@ def _caption(front: Front) -> str:
 
 
 def front_answer(problem: CoDesignProblem, front: Front) -> str:
-    """What the front says of weight against bandwidth, in one sentence."""
+    """What the front says of weight against what J counts, in one sentence."""
     efficient = [point for point in front.points if point.verified]
-    unit = problem.cost_unit
+    unit, v = problem.cost_unit, problem.figure
     costs = [f"{number(p.hardware_cost)} {unit}".strip() for p in efficient]
-    hz = [f"{number(p.bandwidth / HZ, 4)} Hz" for p in efficient]
+    values = [v.shown(p.value) for p in efficient]
     if not efficient:
         return "No point of the front is verified."
     if len(efficient) == 1:
         words = "There is nothing to trade: the design of least hardware cost"
-        return f"{words}, {costs[0]}, is also the fastest, {hz[0]}."
+        best = "is also the fastest" if v is BANDWIDTH else f"has the least {v.words} too"
+        return f"{words}, {costs[0]}, {best}, {values[0]}."
     light, fast = efficient[0], efficient[-1]
-    rate = (fast.bandwidth - light.bandwidth) / HZ / (fast.hardware_cost - light.hardware_cost)
+    rate = v.factor * (fast.value - light.value) / (fast.hardware_cost - light.hardware_cost)
+    name = f"{v.words[0].upper()}{v.words[1:]}" if v is BANDWIDTH else f"Less {v.words}"
     return (
-        f"Bandwidth costs hardware: from {costs[0]} with {hz[0]} to {costs[-1]} with {hz[-1]}, on "
-        f"average {number(rate, 3)} Hz for every {unit or 'unit of f'}."
+        f"{name} costs hardware: from {costs[0]} with {values[0]} to {costs[-1]} with "
+        f"{values[-1]}, on average {number(rate, 3)} {v.unit} for every {unit or 'unit of f'}."
     )
 
 
 def _table(problem: CoDesignProblem, front: Front) -> Table:
     """One row a point."""
-    axes = theta_axes(problem)
+    axes, v = theta_axes(problem), problem.figure
     rows = tuple(
-        (point.hardware_cost, point.bandwidth / HZ,
+        (point.hardware_cost, v.factor * point.value,
          *(factor * v for (*_, factor), v in zip(axes, point.theta, strict=True)),
          ", ".join(point.active), "verified" if point.verified else "not verified")
         for point in front.points
     )  # fmt: skip
     heads = (axis_label(name, unit) for name, unit, _ in axes)
-    head = ("f", "ω_b (Hz)", *heads, "what binds", "status")
+    head = ("f", f"{v.symbol} ({v.unit})", *heads, "what binds", "status")
     return Table(head, rows)
 
 

@@ -187,6 +187,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
         if curves:
             panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
                                 levels=(end,)))  # fmt: skip
+            end = replace(end, text="")  # said once
     heights = (*[2.6] * len(panels), 2.2)
     panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
     lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
@@ -220,7 +221,9 @@ def shown_until(found: Move) -> float:
 def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
-    when = "does not settle" if np.isinf(settled) else f"settled after {shown(settled, 's')}"
+    when = "does not settle" if np.isinf(settled) else (
+        f"settled after {shown(settled, 's')}" if settled > 0.0 else "never out of its window"
+    )  # fmt: skip
     words = f"{name}: {when}, error of at most {shown(peak, 'm')}"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:

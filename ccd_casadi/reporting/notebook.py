@@ -18,9 +18,9 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.reporting.facts import theta_axes, theta_table
+from ccd_casadi.reporting.facts import conclusion, theta_axes, theta_table
 from ccd_casadi.reporting.loops import gains, run_view, view_of
-from ccd_casadi.reporting.sections_page import conclusion_of, controller_blocks
+from ccd_casadi.reporting.sections_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -126,7 +126,7 @@ def _(item: SectionsDesign) -> str:
 
 
 def _result_head(result: Mapping[str, Any]) -> Head:
-    return run_head("Co-design", result, "", conclusion_of(result))
+    return run_head("Co-design", result, "", conclusion(result))
 
 
 def _design_parts(

@@ -6,7 +6,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Facts, Heading, Page, Section, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
-from ccd_casadi.reporting.moves import ways_figure
+from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
@@ -112,15 +112,10 @@ def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
 
 def _moved(found: Study, i: int) -> str:
     move = found.moves[i]
-    settled = (
-        f"settles {shown(move.settling, 's')} after its end"
-        if np.isfinite(move.settling)
-        else "does not settle while it is watched"
-    )
+    told = way_words(move.words, [move])
     return (
-        f"Move of {metres(found.demands.limits.stroke)} in {1e3 * move.duration:.4g} ms "
-        f"{move.words}: {settled} (±{metres(move.window)}), RMS error {metres(move.rms_error)}, "
-        f"peak {metres(move.peak_error)}, peak force {max(move.peak_force):.4g} N."
+        f"Move of {metres(found.demands.limits.stroke)} in {1e3 * move.duration:.4g} ms {told} "
+        f"(±{metres(move.window)}), peak force {max(move.peak_force):.4g} N."
     )
 
 

@@ -10,42 +10,12 @@ from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_words import SectionWords
-from ccd_casadi.reporting.facts import (
-    Fact,
-    binding,
-    conclusion,
-    cost_words,
-    loop_facts,
-    sensitivity_facts,
-    theta_words,
-    value_facts,
-)
+from ccd_casadi.reporting.facts import Fact, binding, loop_facts, sensitivity_facts, value_facts
 from ccd_casadi.support.units import HZ, counted, number, shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing
-
-
-def conclusion_of(result: Mapping[str, Any]) -> str:
-    """One sentence with the key numbers, for every kind of controller."""
-    if "race" not in result:
-        return conclusion(result)
-    verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
-    return (
-        f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}: a "
-        f"controller of order {result['controller']['order']} with a bandwidth of "
-        f"{number(result['bandwidth_hz'])} Hz on {_plants(result)}, at a hardware cost of "
-        f"{cost_words(result)} (J = {number(result['objective'], 6)})."
-    )
-
-
-def _plants(result: Mapping[str, Any]) -> str:
-    designed, judged = (result[name]["plants"] for name in ("certificate", "robust"))
-    if designed == judged == 1:
-        return "the model, the only plant of its set"
-    again = counted(judged, "plant")
-    return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
 
 
 def bandwidths_table(verified: VerifiedSections) -> Table:
@@ -102,13 +72,9 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
 
     loop = "sampled" if sampled else "continuous"
     whole = f"{counted(result['certificate']['plants'], 'plant')} of the set"
+    bound = hz(gap.get("bandwidth_bound_hz"))
     rows = [
-        (
-            "no controller of any order exceeds",
-            "the model alone",
-            loop,
-            hz(gap.get("bandwidth_bound_hz")),
-        ),
+        ("no controller of any order exceeds", "the model alone", loop, bound),
         ("sections", "the model alone", loop, hz(costs["on_model_hz"])),
         *([("sections", whole, "continuous", hz(costs["continuous_hz"]))] if sampled else []),
         ("sections: the design", whole, loop, hz(result["bandwidth_hz"])),
@@ -157,7 +123,8 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),
         ("Over the box", "passed" if robust["passed"] else "FAILED",
-         f"{robust['words']}, the worst searched by {-100 * robust['worst_excess']:.2g} %; "
+         f"{robust['words']}, the worst plant that a search found at "
+         f"{100.0 + 100.0 * robust['worst_excess']:.6g} % of a bound; "
          f"{r['proof']['words']}"),
         ("Optimality (KKT residual)", number(kkt, 2),
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "

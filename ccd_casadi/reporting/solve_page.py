@@ -36,7 +36,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_p
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_section import budget_section
-from ccd_casadi.reporting.facts import binding, design_facts, theta_table
+from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table
 from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
@@ -54,7 +54,6 @@ from ccd_casadi.reporting.moves import cycle_section, force_step, move_figure
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
     binding_words,
-    conclusion_of,
     controller_blocks,
     limits_blocks,
     sections_facts,
@@ -123,7 +122,7 @@ def solve_head(case: Case, result: Mapping[str, Any]) -> Head:
     named = case.path.absolute().parent.name if case.path.stem == "case" else case.path.stem
     now = datetime.now().strftime("%Y-%m-%d %H:%M")
     meta = f"{case.path.name} · {result['formulation']} formulation · {now}"
-    return run_head(f"Co-design of {named}", result, meta, conclusion_of(result))
+    return run_head(f"Co-design of {named}", result, meta, conclusion(result))
 
 
 def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> list[Part]:

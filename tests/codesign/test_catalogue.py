@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,10 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign import outer_sections
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted
 from ccd_casadi.codesign.direct import Direct
@@ -30,8 +28,6 @@ from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
 from ccd_casadi.codesign.run_files import write_run
 from ccd_casadi.codesign.search import searched
-from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.compare import main as compare
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
@@ -39,7 +35,6 @@ from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import Spent
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.plain_values import plain
 from ccd_casadi.support.process_pool import Workers
 
@@ -327,80 +322,6 @@ def test_a_run_is_of_the_value_that_was_chosen(listed_run: Path) -> None:
     assert result["objective"] == pytest.approx(at_it.result["objective"], rel=1e-6)
     heavier = solve_problem(restricted(alone, {"m1": (61.0,)}), Lifted(points=24, box_points=4))
     assert result["objective"] < heavier.result["objective"]
-
-
-# ---- the case file -------------------------------------------------------------------------------
-
-
-def document(**table: Any) -> dict[str, Any]:
-    found = tomllib.loads(TWO_MASS.read_text())
-    found["theta"]["m1"] = table
-    return found
-
-
-@pytest.mark.parametrize(
-    ("table", "values"),
-    [
-        ({"values": [61, 57.0, 64]}, (57.0, 61.0, 64.0)),
-        ({"lower": 55.2, "upper": 58.9, "integer": True}, (56.0, 57.0, 58.0)),
-        ({"lower": 55.0, "upper": 58.0, "integer": False}, ()),
-    ],
-)
-def test_lists_in_the_case_come_back(
-    table: dict[str, Any], values: tuple[float, ...], tmp_path: Path
-) -> None:
-    case = parse_case(document(**table))
-    assert case.theta[0].values == values
-    path = tmp_path / "case.toml"
-    path.write_text(case_to_toml(case))
-    again = load_case(path)
-    assert (again.theta, again.fixed) == (case.theta, case.fixed)
-    assert problem_of(case).listed == ((("m1", values),) if values else ())
-
-
-def test_a_fixed_parameter_comes_back(tmp_path: Path) -> None:
-    case = parse_case(document(fixed=58, unit="kg"))
-    assert [p.name for p in case.theta] == ["m2"]
-    path = tmp_path / "case.toml"
-    path.write_text(case_to_toml(case))
-    assert load_case(path).fixed == case.fixed
-    assert problem_of(case).source.fixed == (("m1", 58.0, "kg"),)
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"fixed": 58, "lower": 55}, "theta.m1.lower: has no place beside fixed"),
-        ({"values": [57, 58], "upper": 60}, "theta.m1.upper: has no place beside values"),
-        ({"values": [57, 57.0]}, "theta.m1.values: needs two different numbers"),
-        ({"values": "57"}, "theta.m1.values: is '57'; give a list of numbers"),
-        ({"lower": 55.2, "upper": 55.9, "integer": True}, "holds 0 whole numbers"),
-        ({"lower": 0, "upper": 1e6, "integer": True}, "give bounds with 2 to 100"),
-        ({"values": [57, 60], "start": 70}, "70 is outside 57 to 60"),
-    ],
-)
-def test_mistakes_about_lists_are_told(table: dict[str, Any], words: str) -> None:
-    with pytest.raises(CaseError, match=words.replace("(", "\\(")):
-        parse_case(document(**table))
-
-
-def test_something_has_to_be_free() -> None:
-    found = document(fixed=58.0)
-    found["theta"]["m2"] = {"values": [57, 60]}
-    with pytest.raises(CaseError, match="no parameter with a range"):
-        parse_case(found)
-
-
-def test_what_needs_ranges_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "case.toml"
-    path.write_text(case_to_toml(parse_case(document(values=[57, 60]))))
-    assert compare([str(path), "--quiet"]) == 2
-    assert "theta.m1.values: compare needs a range" in capsys.readouterr().err
-    case = load_case(path)
-    with Workers(1) as pool, SampleStore(tmp_path / "samples.sqlite") as store:
-        sampler = Sampler(problem_of(case), store, pool)
-        with pytest.raises(UserError, match="--surrogate"):
-            co_design(sampler, Lifted(), 0, Surrogates((), np.empty((0, 2)), ()))
 
 
 def test_what_sections_spend_is_counted_over_all_nodes(

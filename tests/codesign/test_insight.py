@@ -13,12 +13,18 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.outer import Place
 from ccd_casadi.codesign.pareto import Front, pareto_front
 from ccd_casadi.codesign.post_optimal import post_optimal
 from ccd_casadi.codesign.run import outer_of
+from ccd_casadi.drawing.content import Lines
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.insight import main
+from ccd_casadi.reporting.insight import front_answer, front_figure
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -149,6 +155,53 @@ def test_the_lightest_may_be_the_fastest(truth_of: Callable[[CoDesignProblem], S
     (point,) = front.points
     assert front.whole
     assert point.theta == pytest.approx((55.0, 55.0), abs=1e-6)
+
+
+class ErrorOverMasses:
+    """A sampler and an outer problem in one, by hand: the error falls with both masses."""
+
+    quiet, syntheses = True, 0
+    grid = np.array([[m1, m2] for m1 in range(55, 71) for m2 in range(55, 71)], float)
+
+    def __init__(self, problem: CoDesignProblem) -> None:
+        self.problem = problem
+
+    def of(self, problem: CoDesignProblem, **_: bool) -> "ErrorOverMasses":
+        return ErrorOverMasses(problem)
+
+    def bandwidths(self, thetas: Array, _: str = "") -> list[BandwidthSample]:
+        return [
+            BandwidthSample(tuple(theta), 300.0, (), np.nan, np.nan, (), "", 0.0, 0,
+                            error=float(1e-3 * (55.0 / theta[0] + 2.0 * (55.0 / theta[1]) ** 3)))
+            for theta in np.atleast_2d(thetas)
+        ]  # fmt: skip
+
+    def solved_from(self, *_: object) -> Place:
+        found = [objective_of(self.problem, one) for one in self.bandwidths(self.grid)]
+        return Place(self.grid[int(np.argmin(found))], min(found), True)
+
+    def theta_of(self, x: Array) -> Array:
+        return x
+
+
+def test_a_front_of_an_error_goes_down_with_the_cost() -> None:
+    least = SectionsProblem(minimise="rms_error")
+    problem = replace(problem_of(load_case(TWO_MASS)), controller=least, w2=1.0)
+    front = pareto_front(lambda each: each, ErrorOverMasses(problem), (60.0, 60.0), points=8)
+    cost, error = (np.array([getattr(point, name) for point in front.points])
+                   for name in ("hardware_cost", "value"))  # fmt: skip
+    assert len(front.points) >= 4
+    assert front.points[0].theta == (55.0, 55.0)
+    assert front.points[-1].theta == (70.0, 70.0)
+    slopes = np.diff(error) / np.diff(cost)
+    assert (slopes < 0.0).all()
+    assert (np.diff(slopes) > 0.0).all()
+    drawn = front_figure(problem, front, (cost[0], 1e9 * error[0], "")).drawing
+    assert isinstance(drawn, Lines)
+    panel = drawn.rows[0][0]
+    assert panel.y_label == "RMS error e (nm)"
+    np.testing.assert_allclose(panel.curves[0].y, 1e9 * error)
+    assert "Less RMS error costs hardware" in front_answer(problem, front)
 
 
 def test_a_constant_cost_leaves_nothing_to_trade(

@@ -27,7 +27,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     tolerance_prices,
     worst_members,
 )
-from ccd_casadi.inner_problem.sections_search import prepared, with_range
+from ccd_casadi.inner_problem.sections_search import ENOUGH, prepared, with_range
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
@@ -232,3 +232,11 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
     assert best.value >= first.value * (1.0 - 1e-6)
     assert sum(starts is not None for starts in searches) == 1
     assert len(searches) > 2
+
+
+def test_few_starts_that_miss_are_not_the_last_word() -> None:
+    """No search says that it found nothing from fewer starts than the usual number."""
+    impossible = with_sections(quick(), weighted_level=1e-3, starts=1)
+    made = prepared(impossible)[1]
+    assert not made.certified
+    assert made.words.startswith(f"none found from {ENOUGH} starts")

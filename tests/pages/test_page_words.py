@@ -11,6 +11,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.deployment.words import against
 from ccd_casadi.fixed_structure import ShapeEnd
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.reporting.facts import conclusion, theta_table, theta_words
@@ -138,10 +139,10 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
 
 
 def test_insight_and_compare_begin_with_their_answer() -> None:
-    problem = SimpleNamespace(cost_unit="kg")
+    problem = SimpleNamespace(cost_unit="kg", figure=BANDWIDTH)
 
     def point(cost: float, hz: float) -> SimpleNamespace:
-        return SimpleNamespace(hardware_cost=cost, bandwidth=HZ * hz, verified=True)
+        return SimpleNamespace(hardware_cost=cost, value=HZ * hz, verified=True)
 
     one = SimpleNamespace(points=(point(110.0, 72.0),))
     assert front_answer(problem, one).startswith("There is nothing to trade")

@@ -168,6 +168,28 @@ def test_a_part_of_a_figure_is_enlarged_and_the_whole_shown_again(browser, solve
     assert not heard
 
 
+def test_a_part_of_a_map_is_enlarged(browser, solved):
+    page = browser.new_page(viewport={"width": 1300, "height": 900})
+    heard = complaints(page)
+    page.goto((solved("lifted") / "report.html").as_uri())
+    plot = page.locator(".whole svg[aria-label^=Landscape]")
+    plot.scroll_into_view_if_needed()
+    box = plot.bounding_box()
+    _, _, _, left, right = json.loads(plot.get_attribute("data-axes"))["scales"][0]
+    scale = box["width"] / float(plot.get_attribute("viewBox").split()[2])
+    dots = plot.locator("[id*=-mark-truths] use")
+    before = [float(dot.get_attribute("x")) for dot in dots.all()]
+    start = box["x"] + left * scale
+    page.mouse.move(start + 5.0, box["y"] + 0.2 * box["height"])
+    page.mouse.down()
+    page.mouse.move(start + 0.5 * (right - left) * scale, box["y"] + 0.6 * box["height"], steps=3)
+    page.mouse.up()
+    after = [float(dot.get_attribute("x")) for dot in dots.all()]
+    assert max(after) - min(after) == pytest.approx(2.0 * (max(before) - min(before)), rel=0.1)
+    assert plot.locator(".scale text").count() >= 4
+    assert not heard
+
+
 @pytest.mark.parametrize("width", [390, 1300])
 def test_a_table_that_goes_on_has_a_shadow_there(browser, tmp_path, width):
     place = tmp_path / "page.html"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
-from helpers import HZ, SUSPENSION, random_plant, scaled, two_mass, two_mass_model
+from helpers import HZ, SUSPENSION, random_plant, two_mass_model
 
 from ccd_casadi.fixed_structure import (
     Bounds,
@@ -25,9 +25,8 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
-from ccd_casadi.fixed_structure.race import WITHIN, distinct, run_race, started
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept
 from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
@@ -376,65 +375,3 @@ def test_a_peak_that_the_grid_lost_is_not_confirmed(
     assert not judged.passed
     assert not judged.plants[0].confirmed
     assert judged.plants[0].S_peak == pytest.approx(sought, rel=1e-8)
-
-
-def test_a_redrawn_controller_differs_from_its_end_in_one_section() -> None:
-    structure = Structure(lead=1, biquads=2, roll_off=2)
-    problem = problem_for([plant()], structure, EASY)
-    rng = np.random.default_rng(3)
-    ends = list(at_random(problem, np.array([0.1, 0.3]), rng))
-    names = [" ".join(name.split()[:2]) for name in structure.names]
-    sections = ({"biquad 1"}, {"biquad 2"}, {"lead 1", "roll-off 1"})
-    fresh = redrawn(problem, ends, 60, rng)
-    moved = [
-        {name for name, was, now in zip(names, ends[i % 2], kappa, strict=True) if was != now}
-        for i, kappa in enumerate(fresh)
-    ]
-    assert all(any(change <= section for section in sections) for change in moved)
-    assert {frozenset(change) for change in moved} == set(map(frozenset, sections))
-    assert not len(redrawn(problem_for([plant()], Structure(lead=0, biquads=0, roll_off=0), EASY),
-                           [np.zeros(2)], 5, rng))  # fmt: skip
-
-
-def test_starts_lift_the_loop_at_an_anti_resonance() -> None:
-    """A collocated plant's dip bounds |S|: without such starts a problem of two masses ended at
-    164 Hz, where 214 Hz can be had."""
-    K, B, none = 1e7 * np.array([[1.0, -1.0], [-1.0, 1.0]]), np.eye(2)[:, :1], np.zeros((0, 2, 2))
-    slopes = (none, none, none, none[..., :1], none[:, :1])
-    collocated = Mechanics(np.diag([11.0, 6.0]), 0.0 * K, K, B, B.T, 0.01, slopes)
-    problem = problem_for([scaled(collocated, 1e6)], SMALL, EASY)
-    v = problem.antiresonances[0]
-    dip, below, above = np.abs(problem.first_response(v * np.array([1.0, 0.8, 1.25])))
-    assert dip < min(below, above)
-    rng = np.random.default_rng(0)
-    for starts in (by_rules(problem, np.array([0.3])), at_random(problem, np.full(50, 0.3), rng)):
-        size = np.log(np.abs(response(SMALL, starts.T, 1j * v * np.array([[1.0], [0.5], [2.0]]))))
-        lifted = size[0] - 0.5 * (size[1] + size[2])  # ln; 1.6 by the rule, the rest 0.2 and less
-        assert lifted.max() > 1.0
-
-
-def test_what_is_redrawn_never_loses_what_was_found() -> None:
-    """A search that is given the ends of another ends with the best of both."""
-    problem = problem_for([plant()], Structure(biquads=0), EASY)
-    rng = np.random.default_rng(1)
-    pool = kept(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]
-    first = run_race(problem, pool, lambda words: None)
-    fresh = kept(problem, redrawn(problem, distinct(first, 2), 24, rng))[:3]
-    again = run_race(problem, fresh, lambda words: None, before=first)
-    assert again[0].merit >= first[0].merit
-    assert not any(runner.running for runner in again)
-    assert len(distinct(again, 5)) == len({tuple(kappa) for kappa in distinct(again, 5)})
-
-
-def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
-    """A climb from ω₀/10 left an anchor whose bandwidth is below that, and never came back."""
-    bounds = Bounds(S_max=2.5, S_low=0.9, omega_low=0.2 * HZ, shape=1.5)
-    problem = problem_for([two_mass(60.0, 60.0)], Structure(biquads=0), bounds)
-    inside = 0
-    for kappa in kept(problem, by_rules(problem, np.geomspace(0.01, 0.3, 8))):
-        point = started(problem, kappa)
-        assert np.log(problem.low) <= point.tau <= problem.begin(kappa)
-        lowered = point.tau < problem.begin(kappa)
-        assert not lowered or point.assessment.violation <= WITHIN
-        inside += lowered
-    assert inside

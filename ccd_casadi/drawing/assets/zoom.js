@@ -44,14 +44,17 @@
         group.setAttribute("clip-path", part.getAttribute("clip-path"));
         part.removeAttribute("clip-path");
       }
+    const frame = axes.querySelector("[clip-path]")?.getAttribute("clip-path");
+    const free = groups.filter((group) => !group.hasAttribute("clip-path"));  // markers at an edge
 
     function view(to) {  // of each axis how many times as large, and how far on; null: as drawn
       svg.view = to;
       const [[sx, tx], [sy, ty]] = to ?? [[1, 0], [1, 0]];
+      for (const group of free) set(group, "clip-path", to && frame);
       for (const group of groups)
         for (const part of group.querySelectorAll("path, use")) {
           if (part.closest("defs")) continue;
-          if (part.localName === "use" && !/Collection|-band/.test(group.id)) {
+          if (part.localName === "use" && !/Collection|-(band|area|level)/.test(group.id)) {
             part.at ??= ["x", "y"].map((key) => +part.getAttribute(key));
             part.setAttribute("x", sx * part.at[0] + tx);
             part.setAttribute("y", sy * part.at[1] + ty);
