@@ -5,7 +5,6 @@ filter's densities are integrated too, the two have to agree: `disagreement`.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,14 +17,6 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-
-
-class Variances(NamedTuple):
-    """σ² of error (m²), of its moving average over the window (NaN without one), of force (N²)."""
-
-    error: float
-    average: float
-    force: float
 
 
 @dataclass(frozen=True)
@@ -96,11 +87,6 @@ def evaluate_budget(
     )
 
 
-def variances(loop: Loop, source: Source, window: float | None) -> Variances:
-    """σ² of a shaped source by Lyapunov's equation, exactly; of a stable loop."""
-    return Variances(*map(float, of_filter(loop, source, window, ())[0]))
-
-
 def _figures(loop: Loop, source: Source, window: float | None) -> SourceFigures:
 
     def weight(hz: Array) -> Array:
@@ -108,15 +94,15 @@ def _figures(loop: Loop, source: Source, window: float | None) -> SourceFigures:
 
     whole = integrated(loop, source, weight)
     if source.shaped:
-        found = variances(loop, source, window)
-        ratio = whole.value[0] / found.error if found.error > 0.0 else 1.0
+        error, average, force = map(float, of_filter(loop, source, window, ())[0])
+        ratio = whole.value[0] / error if error > 0.0 else 1.0
         disagreement = abs(float(ratio) - 1.0)
     else:
-        average = np.nan if window is None else float(whole.value[2])
-        found = Variances(float(whole.value[0]), average, float(whole.value[1]))
+        error, force, average = map(float, whole.value)
+        average = np.nan if window is None else average
         disagreement = float((whole.error / np.maximum(whole.value, 1e-300)).max())
     return SourceFigures(
-        source, np.sqrt(found.error), np.sqrt(max(found.average, 0.0)),
-        np.sqrt(max(found.error - found.average, 0.0)), np.sqrt(found.force), disagreement,
+        source, np.sqrt(error), np.sqrt(max(average, 0.0)), np.sqrt(max(error - average, 0.0)),
+        np.sqrt(force), disagreement,
         whole.ends, whole.cumulative()[0],
     )  # fmt: skip

@@ -9,6 +9,7 @@ e = r - y is the error of the true position, not of the measured one. With sever
 has a source of its own, independent of the others, of the same spectrum.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -85,7 +86,7 @@ class ShapedSpectrum:
     def at(self, hz: Array) -> Array:
         """S at frequencies in Hz."""
         s = 2j * np.pi * np.asarray(hz, float)
-        top, bottom = _polynomial(self.zeros, 1.0), _polynomial(self.poles, 1.0)
+        top, bottom = polynomial(self.zeros, 1.0), polynomial(self.poles, 1.0)
         return np.asarray(self.level * np.abs(np.polyval(top, s) / np.polyval(bottom, s)) ** 2)
 
     def rms(self) -> float | None:
@@ -104,10 +105,10 @@ class ShapedSpectrum:
         corners = [corner[0] for corner in self.poles]
         unit = HZ * float(np.exp(np.mean(np.log(corners)))) if corners else 1.0
         top = np.polymul(
-            _polynomial(self.zeros, unit),
+            polynomial(self.zeros, unit),
             np.array(path) * unit ** np.arange(len(path) - 1, -1, -1.0),
         )
-        bottom = _polynomial(self.poles, unit)
+        bottom = polynomial(self.poles, unit)
         top = np.trim_zeros(np.atleast_1d(top), "f") * np.sqrt(self.level)
         if len(top) > len(bottom):
             raise ValueError("a shaping filter needs as many poles as zeros; give more poles")
@@ -119,7 +120,7 @@ class ShapedSpectrum:
         return StateSpace(unit * A, unit * B, C, D)
 
 
-def _polynomial(corners: tuple[Corner, ...], unit: float) -> Array:
+def polynomial(corners: Iterable[Corner], unit: float) -> Array:
     """Π (1 + s/ω) in s over `unit` (rad/s), highest power first."""
     out: Array = np.ones(1)
     for corner in corners:

@@ -243,7 +243,7 @@ class SectionsOuter(ThetaOuter):
         raced = raced_at(asked, best) if end.raced is None else end.raced
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        beside = partial(objectives_beside, problem, best, asked.quiet)
+        beside = partial(objectives_beside, problem, best)
         known = dear(problem) and problem.figure is BANDWIDTH
         kkt = theta_kkt(problem, best, asked, end.found.envelope, beside if known else None)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)

@@ -42,7 +42,6 @@ from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.progress import Progress
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
@@ -169,18 +168,14 @@ def with_members(sampler: Sampler, members: Sequence[Member]) -> Sampler:
     return sampler.of(with_sections(sampler.problem, members=(*known, *members)))
 
 
-def objectives_beside(
-    problem: CoDesignProblem, sample: BandwidthSample, quiet: bool, thetas: Array
-) -> Array:
+def objectives_beside(problem: CoDesignProblem, sample: BandwidthSample, thetas: Array) -> Array:
     """By how much J is larger at θ (n, n_θ) beside a sample, by climbs of its controller on the
     plants to first order there."""
     here, found = Place(sample.theta, sample.kappa, sample.bandwidth), []
     models = nearby(problem, (), here.theta)
-    with Progress(1 + len(thetas), "certificate", quiet=quiet) as bar:
-        for theta in [np.array(here.theta), *thetas]:
-            there = replace(here, theta=tuple(theta.tolist()))
-            found.append(JointModel(problem, models, there, 0.0).adapted(STEPS)[1])
-            bar.advance()
+    for theta in [np.array(here.theta), *thetas]:
+        there = replace(here, theta=tuple(theta.tolist()))
+        found.append(JointModel(problem, models, there, 0.0).adapted(STEPS)[1])
     return np.array(found[1:]) - found[0]
 
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.channels import Channel, split
+from ccd_casadi.deployment.channels import Channel, along, split
 from ccd_casadi.deployment.discretise import Conversion, Target, loop_at
 from ccd_casadi.deployment.outcome import SAMPLED_BANDWIDTH, ChannelOrders
 from ccd_casadi.deployment.rate_choice import ChannelLoops
@@ -63,8 +63,7 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
     found = []
     for i, (own, values) in enumerate(structure.split(kappa)):
         u, v = structure.decoupling.outputs[:, [i]], structure.decoupling.inputs[:, [i]]
-        plant = replace(run.plant, B=run.plant.B @ v, C=u.T @ run.plant.C, channels=())
-        K = state_space(own, values)
+        plant, K = along(run.plant, u, v), state_space(own, values)
         channel = Channel(structure.decoupling.names[i], u, v, plant, K)
         figures = run.measured(plant, K)
         alone = Reduced(len(K.A), Reduction.NONE, K, figures)

@@ -50,12 +50,17 @@ def split(plant: ScaledPlant, controller: StateSpace) -> tuple[Channel, ...]:
     found = []
     for i in range(p):
         u, v = U[:, [i]], V[:, [i]]
-        B, C = np.ascontiguousarray(plant.B @ v), np.ascontiguousarray(u.T @ plant.C)
         part = StateSpace(
             controller.A, controller.B @ u, v.T @ controller.C, v.T @ controller.D @ u
         )
-        found.append(Channel(str(i + 1), u, v, replace(plant, B=B, C=C, channels=()), part))
+        found.append(Channel(str(i + 1), u, v, along(plant, u, v), part))
     return tuple(found)
+
+
+def along(plant: ScaledPlant, u: Array, v: Array) -> ScaledPlant:
+    """uᵀ G v, of directions u of its outputs and v of its inputs."""
+    B, C = np.ascontiguousarray(plant.B @ v), np.ascontiguousarray(u.T @ plant.C)
+    return replace(plant, B=B, C=C, channels=())
 
 
 def _diagonal(response: np.ndarray) -> bool:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.budget.sources import polynomial
 from ccd_casadi.cases.case import read_toml
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.lti.hold import Sampling, tustin
@@ -170,14 +171,8 @@ def _section(v: Mapping[str, float]) -> StateSpace:
     """(b₂s² + b₁s + 1)/(a₂s² + a₁s + 1) of a row."""
     from scipy.signal import tf2ss  # slow to import
 
-    return StateSpace(*tf2ss(_polynomial(v, "zero"), _polynomial(v, "pole")))
-
-
-def _polynomial(v: Mapping[str, float], root: str) -> list[float]:
-    """Coefficients of falling powers of s, from the first that is not zero; 1 without a root."""
-    if f"{root}_hz" not in v:
-        return [1.0]
-    w = HZ * v[f"{root}_hz"]
-    if f"{root}_damping" not in v:
-        return [1.0 / w, 1.0]
-    return [1.0 / w**2, 2.0 * v[f"{root}_damping"] / w, 1.0]
+    zeros, poles = (
+        [tuple(v[key] for key in (f"{root}_hz", f"{root}_damping") if key in v)]
+        for root in ("zero", "pole")
+    )
+    return StateSpace(*tf2ss(*(polynomial(filter(None, roots), 1.0) for roots in (zeros, poles))))

@@ -5,13 +5,13 @@ are the nominal plant's.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.robust_check import DENSE
-from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.channels import Channel, along
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
@@ -41,8 +41,7 @@ class Member:
 
     def seen_by(self, channel: Channel) -> ScaledPlant:
         """Uᵀ G V of a channel of the nominal plant: a perturbation leaves the mode shapes."""
-        B, C = self.plant.B @ channel.inputs, channel.outputs.T @ self.plant.C
-        return replace(self.plant, B=B.copy(), C=C.copy(), channels=())
+        return along(self.plant, channel.outputs, channel.inputs)
 
 
 @dataclass(frozen=True)

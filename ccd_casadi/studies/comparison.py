@@ -1,7 +1,7 @@
 """Every method side by side on one case: the formulations, the descents, the sequential design."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -50,6 +50,21 @@ class Method:
 
 
 @dataclass(frozen=True)
+class _Setting:
+    """What every method is given: stores go to `folder`."""
+
+    case: Case
+    problem: CoDesignProblem
+    folder: Path
+    workers: Pool
+    seed: int
+    quiet: bool
+
+    def store(self, name: str) -> SampleStore:
+        return SampleStore(self.folder / f"samples_{name}.sqlite")
+
+
+@dataclass(frozen=True)
 class Comparison:
     """All methods on one case, and the descents behind the best of each gradient."""
 
@@ -85,15 +100,15 @@ def compare(
     Comparison
     """
     began = perf_counter()
-    methods = [
-        _formulation(case, problem, folder, workers, name, seed, quiet) for name in FORMULATIONS
-    ]
+    given = _Setting(case, problem, folder, workers, seed, quiet)
+    methods = [_formulation(given, name) for name in FORMULATIONS]
     problem = _chosen(problem, methods)
-    descents = _descents(case, problem, workers, seed, quiet)
+    given = replace(given, problem=problem)
+    descents = _descents(given)
     for gradient in baseline_of(problem).gradients:
         methods.append(_best_descent(problem, descents, gradient))
     for name, starts in (("sequential", 0), ("sequential_global", 8)):
-        methods.append(_sequential(case, problem, folder, workers, name, starts, seed))
+        methods.append(_sequential(given, name, starts))
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
 
 
@@ -110,38 +125,28 @@ def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProb
     return min(ends, key=lambda end: end[0])[1] if ends else problem
 
 
-def _formulation(
-    case: Case,
-    problem: CoDesignProblem,
-    folder: Path,
-    workers: Pool,
-    name: str,
-    seed: int,
-    quiet: bool,
-) -> Method:
+def _formulation(given: _Setting, name: str) -> Method:
     began = perf_counter()
-    with SampleStore(folder / f"samples_{name}.sqlite") as store:
-        sampler = Sampler(problem, store, workers, quiet=quiet)
-        solution = co_design(sampler, formulation_of(case, name), seed)
+    with given.store(name) as store:
+        sampler = Sampler(given.problem, store, given.workers, quiet=given.quiet)
+        solution = co_design(sampler, formulation_of(given.case, name), given.seed)
         trace = tuple(sampler.trace)
     figures = solution.result | {"seconds": perf_counter() - began}
     path = tuple(iterate.theta for iterate in solution.outcome.iterates)
     if solution.verified is not None:
         path = (*path, solution.verified.theta)
-        figures["first_resonance_hz"] = _resonance(problem, solution.verified.theta)
+        figures["first_resonance_hz"] = _resonance(given.problem, solution.verified.theta)
     made = None if solution.verified is None else solution.verified.controller
     return Method(name, figures, path, trace, solution=solution, controller=made)
 
 
-def _descents(
-    case: Case, problem: CoDesignProblem, workers: Pool, seed: int, quiet: bool
-) -> list[Descent]:
+def _descents(given: _Setting) -> list[Descent]:
     """Both gradients from every start with every first step."""
-    base = case.baseline
+    base, problem = given.case.baseline, given.problem
     lower, upper = box(problem)
     starts = [problem.start]
     if base.starts > 1:
-        spread = latin_hypercube(lower, upper, base.starts - 1, seed)
+        spread = latin_hypercube(lower, upper, base.starts - 1, given.seed)
         starts += [tuple(float(v) for v in theta) for theta in spread]
     tasks = [
         (problem, start, gradient, step, base.max_iterations)
@@ -150,8 +155,8 @@ def _descents(
         for step in base.steps
     ]
     found = []
-    with Progress(len(tasks), "steepest descent", quiet=quiet) as progress:
-        for descent in workers.map_unordered(_descend, tasks):
+    with Progress(len(tasks), "steepest descent", quiet=given.quiet) as progress:
+        for descent in given.workers.map_unordered(_descend, tasks):
             found.append(descent)
             progress.advance()
     return sorted(found, key=lambda d: (d.gradient, d.start, d.first_step))
@@ -163,7 +168,7 @@ def _descend(task: tuple[CoDesignProblem, tuple[float, ...], Gradient, float, in
     descent = steepest_descent(
         problem, start, gradient=gradient, first_step=step, max_iterations=iterations
     )
-    return Descent(**{**vars(descent), "seconds": perf_counter() - began})
+    return replace(descent, seconds=perf_counter() - began)
 
 
 def _best_descent(
@@ -205,22 +210,14 @@ def _run_dict(descent: Descent) -> dict[str, Any]:
     }
 
 
-def _sequential(
-    case: Case,
-    problem: CoDesignProblem,
-    folder: Path,
-    workers: Pool,
-    name: str,
-    starts: int,
-    seed: int,
-) -> Method:
-    began = perf_counter()
-    resonance = HZ * case.baseline.first_resonance_hz
+def _sequential(given: _Setting, name: str, starts: int) -> Method:
+    began, problem = perf_counter(), given.problem
+    resonance = HZ * given.case.baseline.first_resonance_hz
     hardware: HardwareDesign = design_hardware(
-        problem, resonance, starts=starts, seed=seed, workers=workers
+        problem, resonance, starts=starts, seed=given.seed, workers=given.workers
     )
-    with SampleStore(folder / f"samples_{name}.sqlite") as store:
-        sampler = Sampler(problem, store, workers)
+    with given.store(name) as store:
+        sampler = Sampler(problem, store, given.workers)
         sample = sampler.bandwidths(np.array(hardware.theta))[0]
         trace = tuple(sampler.trace)
         spent = sampler.spent.by_purpose

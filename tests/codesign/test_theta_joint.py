@@ -110,7 +110,7 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         assert other.spent.total == spent
         # Beside it J is told by plants to first order as by true ones, but for their curvature.
         there = np.array(best.theta) + 0.03 * np.array([[1, 0], [0, 1], [1, 1]])
-        told = objectives_beside(problem, best, True, there)
+        told = objectives_beside(problem, best, there)
         true = [objective_of(problem, one) for one in sampler.bandwidths(there)]
         assert told == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
 

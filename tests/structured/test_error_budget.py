@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,8 +19,7 @@ from ccd_casadi.budget import (
     TabulatedSpectrum,
     evaluate_budget,
 )
-from ccd_casadi.budget.derivatives import Change, variance_slopes
-from ccd_casadi.budget.evaluation import variances
+from ccd_casadi.budget.derivatives import Change, of_filter, variance_slopes
 from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.loops import Process, noise_of_a_period, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
@@ -31,6 +31,21 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 WINDOW = 0.02
+
+
+class Variances(NamedTuple):
+    """σ² of error (m²), of its moving average over the window (NaN without one), of force (N²)."""
+
+    error: float
+    average: float
+    force: float
+
+
+def variances(made: Loop, source: Source, window: float | None) -> Variances:
+    """Of a shaped source by Lyapunov's equation."""
+    return Variances(*map(float, of_filter(made, source, window, ())[0]))
+
+
 SHAPED = (
     Source("cable", Kind.FORCE, ShapedSpectrum(1e-4)),
     Source("amplifier", Kind.FORCE, ShapedSpectrum(1e-2, (), ((20.0, 0.3),))),
