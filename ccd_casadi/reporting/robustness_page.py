@@ -187,7 +187,7 @@ def _gains(run: FinishedRun, found: Study) -> Section:
         "(GS), and force by sensor noise (KS).",
     )  # fmt: skip
     white = (Heading("White noise (one-sided density)"), Facts(facts))
-    body = (drawn, Facts(tuple(tops)), Words(found.statics.words), *white)
+    body = (drawn, Facts(tuple(tops)), *white)  # at rest: in short
     return Section("Disturbance and noise", body)
 
 
