@@ -20,10 +20,9 @@ LEAST_BAND = 3.0  # standardised residuals shown at least, either way
 
 def trust_figure(qualities: Sequence[Quality]) -> Figure:
     """A column for each output: predicted without the sample over true, and residuals below."""
-    above = tuple(_predicted(q) for q in qualities)
-    below = tuple(_residuals(q) for q in qualities)
+    rows = tuple(tuple(map(panel, qualities)) for panel in (_predicted, _residuals))
     title = "samples predicted without themselves, and their standardised residuals"
-    return Figure(Lines((above, below), title, (3.3, 2.6)), _caption(qualities), _data(qualities))
+    return Figure(Lines(rows, title, (3.3, 2.6)), _caption(qualities), _data(qualities))
 
 
 def _predicted(q: Quality) -> Panel:
@@ -52,18 +51,12 @@ def _residuals(q: Quality) -> Panel:
 
 
 def _caption(qualities: Sequence[Quality]) -> str:
-    """What is drawn, and the figures to read off it."""
-    n = len(qualities[0].true)
-    parts = [
-        f"{WORDS[q.name]}: rms error {number(q.loo.rms, 2)} {q.unit}, Q² {number(q.loo.q2)}, "
-        f"{100 * q.coverage:.0f} % within their bands"
-        for q in qualities
-    ]
+    """What is drawn; the figures are in the table."""
     return (
-        f"Each of the {n} samples of the last surrogate, predicted from the others (above; on the "
-        "dashed line the prediction is exact) and the difference in units of the predicted "
-        "deviation (below). " + "; ".join(parts) + ". Points far outside the bands, or a curve in "
-        "place of a cloud, are what a smooth surrogate cannot follow."
+        f"Each of the {len(qualities[0].true)} samples of the last surrogate, predicted from the "
+        "others (above; on the dashed line the prediction is exact) and the difference in units of "
+        "the predicted deviation (below). Points far outside the bands, or a curve in place of a "
+        "cloud, are what a smooth surrogate cannot follow."
     )
 
 

@@ -118,7 +118,7 @@ def test_the_figure_shows_every_sample_and_the_bands() -> None:
     svg = block_html(trust_figure(qualities), "trust").replace("\u00a0", " ")
     assert "predicted (Hz)" in svg
     assert svg.count(">95 % band<") == svg.count("<svg")  # of two panels, drawn for two widths
-    assert f"{100 * qualities[0].coverage:.0f} % within" in svg
+    assert f"{100 * qualities[0].coverage:.0f} %" in table_trust(qualities).rows[0]
 
 
 def test_a_run_holds_its_quality(two_mass_run: Path) -> None:
