@@ -117,7 +117,7 @@ def _caption(front: Front) -> str:
     """How many points, how well they are known, and what lies between them."""
     verified = sum(point.verified for point in front.points)
     if len(front.points) == 1:
-        return f"One point, {front.syntheses} true syntheses: the lightest design and the fastest."
+        return f"One point, {front.syntheses} true syntheses: the lightest design and the best."
     between = (
         "Local solves found no weights that lead to a design between two of them."
         if front.whole
@@ -126,7 +126,7 @@ def _caption(front: Front) -> str:
     return (
         f"{verified} of {len(front.points)} points verified by the true inner problem, "
         f"{front.syntheses} true syntheses. Each is the optimum of J for some weights: none found "
-        f"is as light and as fast. {between}"
+        f"is lighter and better. {between}"
     )
 
 
