@@ -3,10 +3,12 @@
     min f(θ)  s.t.  first resonance >= f_1,  θ_min <= θ <= θ_max,  λ(θ) <= 0
 
 with exact eigenvalue derivatives dλ_1 = φᵀ(dK - λ_1 dM)φ, and then the inner problem at that θ.
+Where each θ is a finite-element model, IPOPT runs on what is known near the last end (`nearby`),
+until the elements agree there.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import casadi as ca
 import numpy as np
@@ -15,11 +17,13 @@ from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, so
 from ccd_casadi.inner_problem.constraints import constraint_sizes, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.modal import modal_plant
-from ccd_casadi.plants.plant import hardware_cost, mechanics
+from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.process_pool import Pool, Workers
 from surrogates import design
+
+ROUNDS, AGREED, KNOWN = 8, 1e-6, 3  # of a solve on what is known; relative in ω_1; θ that are known
 
 
 @dataclass(frozen=True)
@@ -32,9 +36,12 @@ class HardwareDesign:
     met: bool
 
 
-def first_resonance(problem: CoDesignProblem, theta: Array) -> tuple[float, Array]:
+def first_resonance(
+    problem: CoDesignProblem, theta: Array, evaluate: Evaluate | None = None
+) -> tuple[float, Array]:
     """ω_1 of the first flexible mode, rad/s, and its gradient to θ; NaN where all is rigid."""
-    modal = modal_plant(mechanics(plant_of(problem), tuple(theta)), problem.suspension)
+    system = (evaluate or partial(mechanics, plant_of(problem)))(tuple(theta))
+    modal = modal_plant(system, problem.suspension)
     flexible = np.flatnonzero(~modal.rigid)
     if flexible.size == 0:
         return np.nan, np.full(len(theta), np.nan)
@@ -72,11 +79,29 @@ def design_hardware(
 
 def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> HardwareDesign:
     problem, resonance, start = task
+    plant = plant_of(problem)
+    known: tuple[tuple[float, ...], ...] = (start,)
+    for _ in range(ROUNDS):
+        evaluate = None if plant.nearby is None else plant.nearby(known)
+        point, predicted = _least_cost(problem, resonance, known[-1], evaluate)
+        omega = predicted if evaluate is None else first_resonance(problem, point)[0]
+        theta = tuple(float(v) for v in point)
+        if abs(predicted / omega - 1.0) <= AGREED or np.isnan(omega):
+            break
+        known = (*known[1 - KNOWN :], theta)
+    met = bool(omega >= resonance * (1.0 - AGREED)) and not unmet(problem, point)
+    return HardwareDesign(theta, hardware_cost(plant, point), omega, met)
+
+
+def _least_cost(
+    problem: CoDesignProblem, resonance: float, start: tuple[float, ...], evaluate: Evaluate | None
+) -> tuple[Array, float]:
+    """θ of the least cost near a start, and ω_1 there, by one way to evaluate the plant."""
     lower, upper = box(problem)
     plant = plant_of(problem)
     theta = ca.MX.sym("theta", len(lower))
     cost, lam = plant.hardware(theta)
-    at = lru_cache(maxsize=None)(lambda point: first_resonance(problem, np.array(point)))
+    at = lru_cache(maxsize=None)(lambda point: first_resonance(problem, np.array(point), evaluate))
     callback = VectorCallback(
         "first_resonance", len(lower), 1,
         lambda x: np.array([np.log(at(tuple(x))[0] / resonance)]),
@@ -94,7 +119,4 @@ def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> Hardw
         point = solve_program(program, np.array([start])).best.x
     except OuterFailure:
         point = np.array(start)
-    omega = at(tuple(point))[0]
-    met = bool(omega >= resonance * (1.0 - 1e-6)) and not unmet(problem, point)
-    value = hardware_cost(plant, point)
-    return HardwareDesign(tuple(float(v) for v in point), value, omega, met)
+    return point, at(tuple(point))[0]
