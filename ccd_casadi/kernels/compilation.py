@@ -156,7 +156,7 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    for name in ("gradients", "loop_curvature"):  # with them all the others
+    for name in ("design", "gradients", "loop_curvature", "loop_rows"):  # with them all the others
         import_module(f"{PACKAGE}.{name}")
     found = {}
     for name, module in list(sys.modules.items()):

@@ -1,5 +1,7 @@
 """Kernels are compiled once, with words, and nothing that a command needs is left out."""
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -143,3 +145,25 @@ def test_a_source_that_changes_meanwhile_is_compiled_again(
     for _ in range(3):
         compilation.ensure_compiled()
     assert len(asked) == 2
+
+
+COUNTED = """
+from importlib import import_module
+from pkgutil import iter_modules
+from ccd_casadi import kernels
+from ccd_casadi.kernels import compilation
+
+counted = set(compilation._kernels())
+for module in iter_modules(kernels.__path__):
+    if module.name != "__main__":
+        import_module(f"{kernels.__name__}.{module.name}")
+print(*sorted(set(compilation._kernels()) - counted))
+"""
+
+
+def test_the_bar_counts_every_kernel_of_the_package() -> None:
+    """In a process of its own: one that only other imports bring would pass here unseen."""
+    done = subprocess.run(
+        [sys.executable, "-c", COUNTED], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == ""
