@@ -104,8 +104,8 @@ def main(samples: int) -> int:
             for i in chosen
         ])  # fmt: skip
         print(f"bandwidth of the choice of least gamma {hz[0]:.2f} Hz, the largest of "
-              f"{len(chosen)}: {np.nanmax(hz):.2f} Hz, median {np.nanmedian(hz):.2f} Hz; rank correlation "
-              f"{spearmanr(gammas[chosen], -hz).statistic:.2f}")  # fmt: skip
+              f"{len(chosen)}: {np.nanmax(hz):.2f} Hz, median {np.nanmedian(hz):.2f} Hz; "
+              f"rank correlation {spearmanr(gammas[chosen], -hz).statistic:.2f}")  # fmt: skip
     return wrong
 
 

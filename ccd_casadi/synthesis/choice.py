@@ -33,18 +33,9 @@ SAME = 1e-7  # relative: a γ_opt² that is lower by less is the same
 
 @dataclass(frozen=True)
 class InputChoice:
-    """The inputs (from 0) of the least γ_opt.
+    """The inputs (from 0, rising) of the least γ_opt, and of how many syntheses it was found.
 
-    Parameters
-    ----------
-    inputs : tuple of int
-        Those chosen, in rising order.
-    gamma_opt : float
-        Of the plant with these inputs.
-    syntheses : int
-        How many were made, for all choices.
-    failed : tuple of tuple of int
-        Choices whose synthesis was not certified; they are left out without a bound.
+    `failed`: choices whose synthesis was not certified, left out without a bound.
     """
 
     inputs: tuple[int, ...]
@@ -61,7 +52,7 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
     Parameters
     ----------
     plant : ScaledPlant
-        With all m inputs, and the masses of all: A does not depend on the choice.
+        With all m inputs; A does not depend on the choice.
     weights : Weights
         W1, W2, W3, without an input disturbance.
     count : int
@@ -70,7 +61,7 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
     Returns
     -------
     InputChoice
-        No choice has a lower γ_opt, but for those that failed.
+        No other choice has a lower γ_opt, but for those that failed.
 
     Raises
     ------
@@ -83,56 +74,44 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
     if weights.delta or plant.family is not None:
         words = "of the model alone, without an input disturbance"
         raise UserError(f"inputs are chosen by the mixed sensitivity {words}; leave these out")
-    cuts: list[Array] = []  # (∇, -1): z and g with g >= every cut
-    limits: list[float] = []
-    best, chosen, failed, made = np.inf, None, [], 0
-    z = np.full(m, count / m)
+    squared: dict[tuple[int, ...], float] = {}
+    rows, most, least = [np.append(np.ones(m), 0.0)], [float(count)], np.inf
+    free = Bounds(np.zeros(m + 1), np.append(np.ones(m), np.inf))  # of (z, γ²)
+    z = np.full(m, count / m)  # in equal parts, for a first bound
     while True:
-        made += 1
-        value, slope = _squared(plant, weights, np.maximum(z, ABSENT))
-        whole = made > 1
+        at = np.maximum(z, ABSENT)
+        value, slope = _squared(plant, weights, at)
         if np.isfinite(value):
-            cuts.append(np.append(slope, -1.0))
-            limits.append(float(slope @ np.maximum(z, ABSENT)) - value)
-            if whole and value < best:
-                best, chosen = value, z
-        if whole:  # this choice is known
-            cuts.append(np.append(z, 0.0))
-            limits.append(count - 0.5)
-            failed += [] if np.isfinite(value) else [tuple(np.flatnonzero(z).tolist())]
+            rows.append(np.append(slope, -1.0))
+            most.append(float(slope @ at) - value)
+        if z.max() == 1.0:
+            squared[tuple(np.flatnonzero(z).tolist())] = value
+            rows.append(np.append(z, 0.0))  # and no more of this choice
+            most.append(count - 0.5)
+            least = np.nanmin([least, value])
+        low = np.where(np.arange(len(rows)) == 0, count, -np.inf)
         found = milp(
-            np.append(np.zeros(m), 1.0),
-            integrality=np.append(np.ones(m), 0.0),
-            bounds=Bounds(np.zeros(m + 1), np.append(np.ones(m), np.inf)),
-            constraints=[
-                LinearConstraint(np.append(np.ones(m), 0.0), count, count),
-                *([LinearConstraint(np.array(cuts), -np.inf, limits)] if cuts else []),
-            ],
-            options={"mip_rel_gap": 0.0},
-        )
-        if found.x is None or found.fun >= best * (1.0 - SAME):
+            np.append(np.zeros(m), 1.0), integrality=free.ub < np.inf, bounds=free,
+            constraints=LinearConstraint(np.array(rows), low, most), options={"mip_rel_gap": 0.0},
+        )  # fmt: skip
+        if found.x is None or found.fun >= least * (1.0 - SAME):
             break
         z = np.round(found.x[:m])
-    if chosen is None:
+    failed = tuple(inputs for inputs, value in squared.items() if np.isnan(value))
+    if least == np.inf:
         raise UserError(f"no {count} of {m} inputs have a certified design with these weights")
-    inputs = tuple(np.flatnonzero(chosen).tolist())
-    return InputChoice(inputs, float(np.sqrt(best)), made, tuple(failed))
+    best = min(squared, key=lambda inputs: np.nan_to_num(squared[inputs], nan=np.inf))
+    return InputChoice(best, float(np.sqrt(least)), len(squared) + (count < m), failed)
 
 
 def _squared(plant: ScaledPlant, weights: Weights, z: Array) -> tuple[float, Array]:
     """γ_opt² and its gradient to z; NaN where the synthesis is not certified."""
-    root, m = np.sqrt(z), len(z)
-    dB = np.einsum("ni,ki->kni", plant.B, np.diag(0.5 / root))
-    B = plant.B * root
+    m, B = len(z), plant.B * np.sqrt(z)
     there = replace(
-        plant,
-        B=B,
-        gain=plant_gain(plant.A, B, plant.C, plant.grid),
-        dA=np.zeros((m, *plant.A.shape)),
-        dB=dB,
+        plant, B=B, gain=plant_gain(plant.A, B, plant.C, plant.grid), channels=(),
+        dA=np.zeros((m, *plant.A.shape)), dB=np.eye(m)[:, None] * (0.5 * B / z),
         dC=np.zeros((m, *plant.C.shape)),
-        channels=(),
-    )
+    )  # fmt: skip
     found = sensitivities(there, weights, omega_low=plant.omega_0)
     gamma = found.figures.gamma_opt if found.figures.certified else np.nan
     return gamma**2, 2.0 * gamma * found.to_theta[-1]
