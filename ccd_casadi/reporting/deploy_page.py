@@ -34,7 +34,6 @@ from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_pan
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.sections_page import sections_table
-from ccd_casadi.reporting.tables import over_frequency, over_time
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number, shown
 
@@ -95,25 +94,20 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
         how = "continuous" if loop.sampling is None else f"at {number(found.rate_hz)} Hz"
         label = f"{name}{',' if loop.sampling is None else ''} {how}"
         curves.append(Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
-        drawn.append(Curve(hz, largest(K), "", colour, line))
-    gains, controllers = ([curve.y for curve in each] for each in (curves, drawn))
+        drawn.append(Curve(hz, largest(K), name, colour, line))
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
     crossing = bandwidth_level(bandwidth, text=", continuous")
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named(run, 'S')} (–)")
-    bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist))
+    bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist), legend=None)
     title = "Sensitivity and controller: full, reduced and sampled, over frequency"
-    table = over_frequency(
-        ("Hz", "|S| full", "reduced", "sampled", "|K| full N/m", "reduced N/m", "sampled N/m"),
-        hz, *gains, *controllers,
-    )  # fmt: skip
-    ends = [shown(each[-1], "N/m") for each in controllers]
+    ends = [shown(each.y[-1], "N/m") for each in drawn]
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
         f"up to half the sampling rate. There the controller's gain, which sensor noise and "
         f"unmodelled resonances meet, is {ends[2]} (reduced: {ends[1]}, full: {ends[0]})."
     )
-    return Figure(Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption, (table,))
+    return Figure(Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption)
 
 
 def _facts(run: FinishedRun, found: Deployment) -> tuple[Block, ...]:
@@ -137,9 +131,8 @@ def _step(run: FinishedRun, found: Deployment) -> Figure:
         curves.append(Curve(1e3 * t, y, label, colour, line))
     where = "" if len(direction) == 1 else f", channel {found.orders[0].channel.name}"
     panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves))
-    table = over_time(("ms", "y"), 1e3 * t, y)
     caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
-    return Figure(Lines(((panel,),), "Step of the reference", (3.0,)), caption, (table,))
+    return Figure(Lines(((panel,),), "Step of the reference", (3.0,)), caption)
 
 
 def _rates(found: Deployment) -> Words:

@@ -27,7 +27,6 @@ from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.sections_page import controller_blocks
-from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.reporting.verdict import advice
 from ccd_casadi.support.units import HZ, number, shown
 
@@ -74,8 +73,8 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
         if not one.modelled:  # of a model ‖S‖∞ is known
             reach = between(one, joint, K)  # drawn at the middle of two lines
             curves["at most"].append(Curve(np.sqrt(hz[1:] * hz[:-1]),
-                                           np.where(reach < np.inf, reach, np.nan), colour=GREY,
-                                           width=0.9))  # fmt: skip
+                                           np.where(reach < np.inf, reach, np.nan),
+                                           "between lines, at most", GREY, width=0.9))  # fmt: skip
         gains = {"G": one.matrix, "S": S, "KS": K @ S, "T": joint @ S}
         for name, M in gains.items():
             curves[name].append(Curve(hz, largest(M), colour=colour))
@@ -90,7 +89,7 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
     rows = (
         (sensitivity_panel(
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",
-            y_range=(0.5 * float(size.min()), top),
+            legend=None, y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
          nyquist_panel(hz, shown, bounds.S_max, HEIGHT, ("the first", "the others"))),
         (over_hz("|G| (m/N)", curves["G"], ends),
@@ -104,14 +103,8 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
             " Grey: what |S| may reach between two lines, if GK bends there as around them. A "
             "resonance that fits between two lines is not seen."
         )
-    table = over_frequency(
-        ("Hz", "|G| m/N", "|S|", "Re L", "Im L", "|KS| N/m", "|T|"),
-        hz, curves["G"][0].y, size, loci[0].real, loci[0].imag, curves["KS"][0].y,
-        curves["T"][0].y,
-        special=[answer["bandwidth_hz"], answer["sensitivity_peak_hz"]],
-    )  # fmt: skip
     lines = Lines(rows, "The loop on the measured lines", (HEIGHT, 2.6, 2.6))
-    return Figure(lines, words, (table,))
+    return Figure(lines, words)
 
 
 def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:

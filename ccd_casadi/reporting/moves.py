@@ -23,6 +23,7 @@ from ccd_casadi.drawing.content import (
     Table,
     Words,
 )
+from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
 from ccd_casadi.inner_problem.move_figures import motion_of
@@ -32,7 +33,6 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import of_plants
-from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import counted, number, shown, shown_unit
 
@@ -125,9 +125,8 @@ def cycle_section(
         f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
         f"{settling}."
     )
-    table = over_time(("ms", "N", "W"), ms, force[:, 0], heat)
     lines = Lines((tuple(panels),), "A cycle of the motor", (3.0,))
-    return [Section("The motor", (Figure(lines, words, (table,)),))]
+    return [Section("The motor", (Figure(lines, words),))]
 
 
 def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
@@ -139,18 +138,12 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     y = 1e6 * np.array([step[1] for step in steps])
     curves, bands = of_plants(1e3 * t, y)
     panel = Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
-    head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
     on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
         "the stage, until it rests"
     )  # fmt: skip
     words = f"A force of 1 N at the actuator moves {on}."
     lines = Lines(((panel,),), "A step of force", (3.2,))
-    return Figure(lines, words, (over_time(head, 1e3 * t, *_columns(y)),))
-
-
-def _columns(values: Array) -> list[Array]:
-    found = [values[0]]
-    return [*found, values.min(axis=0), values.max(axis=0)] if len(values) > 1 else found
+    return Figure(lines, words)
 
 
 def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
@@ -171,7 +164,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
             if way[2] < 1e3 * peaks[0]]  # fmt: skip
     top = max(peak for _, _, peak, _ in kept)
     time = np.linspace(0.0, until, DRAWN)
-    ms, numbers = 1e3 * time, {}
+    ms = 1e3 * time
     panels, force = [], []
     for large in (True, False):  # those that are flat beside the large ones by themselves
         same = [way for way in kept if (FLAT * way[2] > top) == large]
@@ -181,7 +174,6 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
             error = scale * np.array([_over(time, e, _error(e)) for e in each])
             curves.append(Curve(ms, error[0], name, colour))
             force.append(Curve(ms, _over(time, each[0], each[0].force[:, 0]), "", colour))
-            numbers[f"{unit}, {name}"] = error[0]
             if len(each) > 1:
                 bands.append(Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
         if curves:
@@ -199,8 +191,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
         f"{shown(first.window, 'm')}. {words}"
     )
-    table = over_time(("ms", *numbers), ms, *numbers.values())
-    return Figure(lines, caption, (Table(("way", *FIGURES), rows), table))
+    return Figure(lines, caption, (Table(("way", *FIGURES), rows), *tables_of(lines)))
 
 
 def _over(time: Array, m: Move, values: Array) -> Array:

@@ -45,7 +45,6 @@ from ccd_casadi.reporting.landscape import (
     caption_disagreement,
     caption_landscape,
     landscape_data,
-    tables_landscape,
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
@@ -211,7 +210,7 @@ def _theta(
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
         paths = (ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
-        figure = Figure(land, caption_landscape(land, best) + extra, tables_landscape(land))
+        figure = Figure(land, caption_landscape(land, best) + extra)
         return Section("Bandwidth over the hardware", (figure,))
     slices = slices_figure(problem, process, truths, verified.theta, best, extra)
     words = "There is no surrogate, and no design near the optimum to show in its place."

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.drawing.content import Section
+from ccd_casadi.drawing.content import Figure, Section
+from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.paint import blocks_html
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.reporting.start import start_section
@@ -46,10 +47,13 @@ def test_both_sides_are_the_true_inner_problems() -> None:
 def test_poles_are_shown_once_a_pair_and_all_damped() -> None:
     case = problem()
     (section,) = start_section(case, best_at(case, (55.0, 60.0)))
-    rows = re.findall(r"<td>optimum</td>.*?>([-\d.e]+)</td>.*?>([-\d.e]+)</td>", html(section))
+    figure, _ = section.body
+    assert isinstance(figure, Figure)
+    heads = ("|pole| (Hz)", "damping ratio of the loop's poles (–), optimum")
+    (rows,) = (table.rows for table in tables_of(figure.drawing) if table.head == heads)
     assert rows
-    assert all(0.0 < float(zeta) <= 1.0 for _, zeta in rows)
-    assert np.all(np.diff([float(hz) for hz, _ in rows]) >= 0.0)
+    assert all(0.0 < zeta <= 1.0 for _, zeta in rows)
+    assert np.all(np.diff([hz for hz, _ in rows]) >= 0.0)
 
 
 def test_a_start_that_is_the_optimum_or_has_no_loop_is_said() -> None:
