@@ -53,7 +53,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     if kind_of(finished.problem).as_designed:
         channels = 0
     steps = channels + 2 + (options.saturation is not None)
-    with Progress(steps, "deploying", options.quiet) as bar:
+    with Progress(steps, "deploying") as bar:
         found = deploy(
             finished, timing, saturation=options.saturation,
             progress=lambda words: bar.advance(note=words),

@@ -76,22 +76,18 @@ ORDER = (
 Part = Callable[[], list[Section]]
 
 
-def write_report(
-    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
-) -> Path:
+def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
-    publish(folder, path, solve_page(folder, case, problem, solution, quiet=quiet))
+    publish(folder, path, solve_page(folder, case, problem, solution))
     return path
 
 
-def solve_page(
-    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
-) -> Page:
+def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Page:
     """What the report shows; the bar counts its sections."""
     parts = _parts(folder, case, problem, solution)
     sections: list[Section] = []
-    with Progress(len(parts), "drawing the report", quiet) as bar:
+    with Progress(len(parts), "drawing the report") as bar:
         for part in parts:
             sections += part()
             bar.advance()

@@ -71,11 +71,7 @@ class Study:
 
 
 def robustness(
-    run: FinishedRun,
-    demands: Demands | None = None,
-    seed: int = 0,
-    quiet: bool = True,
-    workers: Pool | None = None,
+    run: FinishedRun, demands: Demands | None = None, seed: int = 0, workers: Pool | None = None
 ) -> Study:
     """Study a run's controller on all demands; nothing is designed.
 
@@ -85,8 +81,8 @@ def robustness(
         As `read_run` gives it.
     demands : Demands, optional
         Shifts, tolerances, noise and move; left out, the defaults.
-    seed, quiet, workers : int, bool, Pool
-        Of random hardware; whether without progress on stderr; processes.
+    seed, workers : int, Pool
+        Of random hardware; processes.
 
     Returns
     -------
@@ -118,11 +114,11 @@ def robustness(
             omega_low=run.problem.inner.omega_low,
             period=0.0 if run.sampling is None else run.sampling.period,
         ),
-        shift=shift_line(run, system, d.shift, quiet=quiet),
-        damping=damping_line(run, system, *d.damping, quiet=quiet),
+        shift=shift_line(run, system, d.shift),
+        damping=damping_line(run, system, *d.damping),
         modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping, quiet),
-        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
+        box=worst_in_box(run, system, d.shift, d.damping),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, workers),
         structured=None
         if sampled
         else structured_bound(
