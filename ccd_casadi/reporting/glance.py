@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.drawing.content import Figure, Lines, Modes, Picture, Place, Section, Table
+from ccd_casadi.drawing.content import Chapter, Figure, Lines, Modes, Picture, Place, Table
 from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
@@ -20,7 +20,7 @@ HEIGHT = 3.0  # inches of a row
 
 def glance(
     problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: Figure
-) -> Section:
+) -> Chapter:
     """Of a design on the plants that it is made for."""
     assert isinstance(move.drawing, Lines)
     S_max, several = problem.inner.S_max, len(view.open) > 1
@@ -41,7 +41,7 @@ def glance(
         f"from -1 in the Nyquist plot.{margin_words(view)} {move.caption}"
     )
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
-    return Section("At a glance", (Figure(lines, words, (*tables_of(lines), move.tables[0])),))
+    return Chapter("At a glance", (Figure(lines, words, (*tables_of(lines), move.tables[0])),))
 
 
 def loci(view: LoopView) -> list[np.ndarray]:
