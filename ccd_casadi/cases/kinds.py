@@ -1,12 +1,13 @@
 """Kinds of inner problem in a case file: which keys go with which, and the structured problem."""
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.budget import Kind
+from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable, LoopTable
 from ccd_casadi.cases.tables import Case, InnerTable, RobustTable, WeightsTable
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
@@ -38,7 +39,7 @@ _OF_H_INFINITY = {
 }
 
 
-def check_kind(tables: Mapping[str, Any], fail: Callable[[str, str], Exception]) -> None:
+def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     """Raise where a key is given that has no effect on the chosen kind of inner problem."""
     controller, loop = tables["controller"], tables["loop"]
     structured = controller.structure == "sections"
@@ -136,19 +137,13 @@ def structure_of(controller: ControllerTable) -> Structure:
 
 def weights_of(weights: WeightsTable, inner: InnerTable, disturbance: float) -> Weights:
     """The weights, in SI, with ω_S and ω_T at the lower ends of their ranges."""
-    w = weights
-    return Weights(
-        M_S=w.M_S,
-        A_S=w.A_S,
-        omega_S=HZ * inner.omega_S_hz[0],
-        c_K=w.c_K,
-        omega_K=HZ * w.omega_K_hz,
-        M_K=w.M_K,
-        A_l=w.A_l,
-        A_u=w.A_u,
-        omega_T=HZ * inner.omega_T_hz[0],
-        disturbance=disturbance,
-    )
+    values = {name: value for name, value in vars(weights).items() if name != "omega_K_hz"} | {
+        "disturbance": disturbance,
+        "omega_K": HZ * weights.omega_K_hz,
+        "omega_S": HZ * inner.omega_S_hz[0],
+        "omega_T": HZ * inner.omega_T_hz[0],
+    }
+    return Weights(**values)
 
 
 def read_options(path: Path) -> dict[str, Any]:

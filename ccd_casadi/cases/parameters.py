@@ -1,10 +1,10 @@
 """[theta.NAME]: the hardware parameters of a case: free within bounds, one of a list, or fixed."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from ccd_casadi.cases.checks import ANY, Check, closest, flag, listed, shown, text
+from ccd_casadi.cases.checks import ANY, Check, Fail, flag, listed, require_good, shown, text
 from ccd_casadi.cases.tables import Parameter
 
 MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
@@ -24,7 +24,6 @@ KEYS: dict[str, tuple[Check, str]] = {
         "a stroke does; `start` is the model",
     ),
 }
-Fail = Callable[[str, str], Exception]
 
 
 def parameters_of(
@@ -50,12 +49,7 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
         raise fail(place, "is not an identifier; use letters, digits and _")
     if not isinstance(entry, Mapping):
         raise fail(place, f"is {shown(entry)}; write a table [theta.{name}]")
-    for key, value in entry.items():
-        if key not in KEYS:
-            raise fail(f"{place}.{key}", f"unknown key{closest(key, KEYS)}")
-        wrong = KEYS[key][0](value)
-        if wrong is not None:
-            raise fail(f"{place}.{key}", wrong)
+    require_good(place, entry, {key: check for key, (check, _) in KEYS.items()}, fail)
     unit = entry.get("unit", "")
     for key, others in (("fixed", ("values", "lower", "upper", "start", "integer", "varies")),
                         ("values", ("lower", "upper", "integer", "varies")),

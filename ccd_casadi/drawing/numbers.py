@@ -56,9 +56,9 @@ def _dots(found: dict[str, tuple[Array, Array]]) -> list[Array]:
 def _thinned(
     axis: str, found: dict[str, tuple[Array, Array]], panels: list[Panel]
 ) -> Iterator[Array]:
-    """Points spread along the axis and those next to marked places; of curves over another grid
-    what lies between their points."""
-    x = next(iter(found.values()))[0]
+    """Points spread along the axis, those next to marked places, and where a curve is largest; of
+    curves over another grid what lies between their points."""
+    x = max((over for over, _ in found.values()), key=len)
     own = [panel for panel in panels if panel.x_label == axis]
     marked = [m.x for p in own for m in p.marks]
     marked += [level.value for p in own for level in p.levels if level.vertical]
@@ -66,6 +66,7 @@ def _thinned(
         marked += np.geomspace(x[0], x[-1], ROWS).tolist()
     else:
         marked += x[np.linspace(0, len(x) - 1, ROWS).astype(int)].tolist()
+    marked += [float(over[np.nan_to_num(y, nan=-np.inf).argmax()]) for over, y in found.values()]
     rows = sorted({int(np.abs(x - value).argmin()) for value in marked})
     yield x[rows]
     for over, y in found.values():
