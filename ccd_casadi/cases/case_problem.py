@@ -4,6 +4,7 @@ from typing import Any
 
 from ccd_casadi.cases.budget import error_budget
 from ccd_casadi.cases.case import CaseError, options_in
+from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import disturbance_of, structured_problem, weights_of
@@ -130,11 +131,7 @@ def _option_sets(case: Case) -> tuple[tuple[tuple[str, object], ...], ...]:
     """The plant options of every file that [robust] names, data files by their absolute path."""
     found = []
     for file in case.robust.plants:
-
-        def fail(key: str, words: str) -> CaseError:
-            return CaseError(one_line(f"{case.path}: {key}: {words}"))
-
-        options = options_in(file, file, fail)
+        options = options_in(file, file, Fail(case.path))
         data = data_option(case.plant.model)
         if data in options:
             options[data] = str((case.path.parent / options[data]).resolve())
