@@ -9,6 +9,7 @@ unit = "N^2/Hz"
 psd = [[1.0, 1e-3], [100.0, 1e-6]]      # [Hz, density]; or file = "cables.csv"
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -152,18 +153,15 @@ def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
         reason = getattr(error, "strerror", None) or "it is not text"
         raise fail(f"{place}.file", f"{shown(path.name)} cannot be read: {reason}") from None
     found: list[list[float]] = []
-    for number_, line in enumerate(lines, 1):
-        line = line.split("#")[0].strip()
-        if not line or (not found and line[0].isalpha()):
+    for i, line in enumerate((re.split(r"[,;\t]", one.split("#")[0].strip()) for one in lines), 1):
+        if line == [""] or (not found and line[0].strip()[:1].isalpha()):
             continue
         try:
-            row = [float(part) for part in line.replace(";", ",").replace("\t", ",").split(",")]
+            hz, density = map(float, line)
         except ValueError:
-            row = []
-        if len(row) != 2:
-            words = f"line {number_} of {shown(path.name)} is not a pair Hz, density; correct it"
-            raise fail(f"{place}.file", words)
-        found.append(row)
+            words = f"line {i} of {shown(path.name)} is not a pair Hz, density; correct it"
+            raise fail(f"{place}.file", words) from None
+        found.append([hz, density])
     if len(found) > MOST_ROWS:
         raise fail(f"{place}.file", f"has more than {MOST_ROWS} rows; thin it out")
     return found

@@ -13,7 +13,7 @@ from typing import Any
 from ccd_casadi.cases.budget import checked_budget
 from ccd_casadi.cases.checks import CaseError, Fail, Test, check_of, closest, require_good, shown
 from ccd_casadi.cases.controller_tables import ChannelTable
-from ccd_casadi.cases.kinds import check_kind, read_options
+from ccd_casadi.cases.kinds import check_kind
 from ccd_casadi.cases.motion import check_motion
 from ccd_casadi.cases.places import checked_places, place_names
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
@@ -157,8 +157,8 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     plant = plant_table(data["plant"], path, fail)
     files = tables["robust"].plants
     absolute = tuple(str((path.parent / file).resolve()) for file in files)
-    for file, place in zip(files, absolute, strict=True):
-        plant_table(dict(data["plant"]) | options_in(file, place, fail), path, fail)
+    for place in absolute:
+        plant_table(dict(data["plant"]) | options_in(place, fail), path, fail)
     tables["robust"] = replace(tables["robust"], plants=absolute)
     of_case = (*place_names(tables["places"]), *filter(None, [tables["motor"].size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
@@ -199,12 +199,16 @@ def _number_of_the_whole(check: Test, value: Any) -> str | None:
     return f"is {shown(value)}; {_PER_CHANNEL}" if isinstance(value, list) else check(value)
 
 
-def options_in(file: str, place: str, fail: Fail) -> dict[str, Any]:
+def options_in(place: str, fail: Fail) -> dict[str, Any]:
     """The plant options in a file that [robust] names. Raises CaseError where it has none."""
     try:
-        return read_options(Path(place))
-    except ValueError as error:
-        raise fail("robust.plants", f"{shown(file)}: {error}") from None
+        found = read_toml(Path(place))
+    except CaseError as error:
+        raise fail("robust.plants", str(error)) from None
+    for key in ("model", "function"):
+        if key in found:
+            raise fail("robust.plants", f"{place}: {key} is not an option of a plant; drop it")
+    return found
 
 
 def parse_theta(case: Case, text: str) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ from ccd_casadi.cases.kinds import disturbance_of, structured_problem, weights_o
 from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.tables import Case, RobustTable
-from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
+from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, Options, RobustSet
 from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -92,14 +92,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
         robust=None if structured else _robust(case.robust),
-        controller=structured_problem(
-            case.controller,
-            case.loop,
-            case.robust,
-            inner,
-            _option_sets(case),
-            tuple((p.name, p.lower, p.upper) for p in case.fixed if p.varies),
-        )
+        controller=structured_problem(case, _option_sets(case))
         if structured
         else MixedSensitivityProblem(),
         budget=error_budget(case.budget),
@@ -127,11 +120,11 @@ def problem_of(case: Case) -> CoDesignProblem:
     return problem
 
 
-def _option_sets(case: Case) -> tuple[tuple[tuple[str, object], ...], ...]:
+def _option_sets(case: Case) -> tuple[Options, ...]:
     """The plant options of every file that [robust] names, data files by their absolute path."""
     found = []
     for file in case.robust.plants:
-        options = options_in(file, file, Fail(case.path))
+        options = options_in(file, Fail(case.path))
         data = data_option(case.plant.model)
         if data in options:
             options[data] = str((case.path.parent / options[data]).resolve())

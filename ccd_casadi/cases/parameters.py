@@ -33,14 +33,11 @@ def parameters_of(
     if not table:
         raise fail("theta", "names no parameter; add a table [theta.NAME]")
     found = [_parameter(name, entry, fail) for name, entry in table.items()]
-    if not any(not (parameter.values or parameter.varies) for parameter in found):
+    if all(parameter.values or parameter.varies for parameter in found):
         words = "has no parameter with a range: give one lower and upper, or ask inner for each"
         raise fail("theta", words)
-    kept = [len(parameter.values) != 1 and not parameter.varies for parameter in found]
-    return (
-        tuple(parameter for parameter, free in zip(found, kept, strict=True) if free),
-        tuple(parameter for parameter, free in zip(found, kept, strict=True) if not free),
-    )
+    free = tuple(p for p in found if len(p.values) != 1 and not p.varies)
+    return free, tuple(p for p in found if p not in free)
 
 
 def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:

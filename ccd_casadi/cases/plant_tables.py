@@ -109,18 +109,14 @@ def theta_tables(
     """
     searched, fixed = parameters_of(table, fail)
     known = model_named(model)
-    needed = None if known is None else known.theta
-    for name in of_case:
+    own = None if known is None else known.theta
+    needed = (*(own or ()), *of_case)
+    for name in () if own is None else table:
+        if name not in needed:
+            raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
+    for name in needed:
         if name not in table:
-            words = f"is missing; add a table [theta.{name}], which [places] or [motor] names"
+            which = "[places] or [motor] names" if name in of_case else f"{model} needs"
+            words = f"is missing; add a table [theta.{name}], which {which}"
             raise fail(f"theta.{name}", words)
-    if needed is not None:
-        needed = (*needed, *of_case)
-        for name in table:
-            if name not in needed:
-                raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
-        for name in needed:
-            if name not in table:
-                words = f"is missing; add a table [theta.{name}], which {model} needs"
-                raise fail(f"theta.{name}", words)
     return searched, fixed
