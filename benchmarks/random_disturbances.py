@@ -141,7 +141,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     options = parser.parse_args()
     rows = []
-    with Runner() as runner, Progress(options.plants, "plants", quiet=False) as bar:
+    with Runner() as runner, Progress(options.plants, "plants") as bar:
         for index in range(options.plants):
             rows.append(one(options.seed, index, runner))
             bar.advance()

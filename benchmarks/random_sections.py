@@ -274,7 +274,7 @@ def main() -> int:
     with (
         Runner() as runner,
         options.rows.open("a") as kept_file,
-        Progress(len(seeds), "random problems", quiet=False) as progress,
+        Progress(len(seeds), "random problems") as progress,
     ):
         for seed in seeds:
             row = {"seed": seed, "kind": "climb" if seed % WHOLE else "whole"}

@@ -50,7 +50,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         axis=options.axis - 1,
     )
     with Workers(options.workers, PATIENCE) as workers:
-        found = robustness(finished, demands, options.seed, workers)
+        found = robustness(finished, demands, options.seed, options.quiet, workers)
     answer = study_dict(finished, found)
     answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
     write_json(folder / "robustness.json", answer)

@@ -136,7 +136,7 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
     folder, began, workers = _folder(kernels), time.time(), []
     # not -m, with which the package would import all that its commands need
     start = [sys.executable, "-c", f"from {PACKAGE} import compilation as c; c.work()"]
-    with Progress(len(kernels), "compiling kernels", quiet=False) as bar:
+    with Progress(len(kernels), "compiling kernels") as bar:
         try:
             for first in range(count):
                 command = [*start, *PARTS[first::count]]

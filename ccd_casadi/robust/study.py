@@ -31,6 +31,7 @@ from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import progress_shown
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics, statics
 
@@ -71,7 +72,11 @@ class Study:
 
 
 def robustness(
-    run: FinishedRun, demands: Demands | None = None, seed: int = 0, workers: Pool | None = None
+    run: FinishedRun,
+    demands: Demands | None = None,
+    seed: int = 0,
+    quiet: bool = True,
+    workers: Pool | None = None,
 ) -> Study:
     """Study a run's controller on all demands; nothing is designed.
 
@@ -81,15 +86,19 @@ def robustness(
         As `read_run` gives it.
     demands : Demands, optional
         Shifts, tolerances, noise and move; left out, the defaults.
-    seed, workers : int, Pool
-        Of random hardware; processes.
+    seed, quiet, workers : int, bool, Pool
+        Of random hardware; whether without progress on stderr; processes.
 
     Returns
     -------
     Study
         The content of robustness.json.
     """
-    d = demands or Demands()
+    with progress_shown(not quiet):
+        return _study(run, demands or Demands(), seed, workers)
+
+
+def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
     sampled = loop.sampling is not None
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)

@@ -18,12 +18,12 @@ from ccd_casadi.support.terminal import columns
 
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
-_shown: ContextVar[bool] = ContextVar("progress_shown", default=False)
+_shown: ContextVar[bool] = ContextVar("progress_shown", default=True)
 
 
 @contextmanager
-def progress_shown(yes: bool = True) -> Iterator[None]:
-    """Within the block bars are shown, or (--quiet) not; outside of any they are not."""
+def progress_shown(yes: bool) -> Iterator[None]:
+    """Within the block bars are shown, or (--quiet) not; outside of any they are."""
     token = _shown.set(yes)
     try:
         yield

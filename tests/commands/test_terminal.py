@@ -62,8 +62,8 @@ def test_the_state_of_a_line_has_its_colour(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_work_that_ends_early_ends_its_bar(capsys: pytest.CaptureFixture[str]) -> None:
-    with Progress(126, "worst hardware", quiet=False) as bar:
+    with Progress(126, "worst hardware") as bar:
         bar.advance(9)
-    with Progress(1, "verifying", quiet=False) as bar:
+    with Progress(1, "verifying") as bar:
         bar.advance()
     assert "9/9" in capsys.readouterr().err.splitlines()[-1]

@@ -164,7 +164,7 @@ def test_progress_in_a_cell_is_one_line_on_stdout(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "ipykernel", sys)
     cell = OutStream()
     monkeypatch.setattr(sys, "stdout", cell)
-    with Progress(3, "sampling", quiet=False) as bar:
+    with Progress(3, "sampling") as bar:
         bar.interval = 0.0
         bar.advance(note="a long note that has to go away again")
         bar.advance(2)
