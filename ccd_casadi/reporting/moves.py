@@ -12,17 +12,7 @@ from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
-from ccd_casadi.drawing.content import (
-    Band,
-    Chapter,
-    Curve,
-    Figure,
-    Level,
-    Lines,
-    Panel,
-    Table,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
@@ -55,7 +45,7 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
 def move_figure(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
     loops: Sequence[Loop], bandwidth_hz: float,
-) -> Figure:  # fmt: skip
+) -> c.Figure:  # fmt: skip
     """The case's move, or the default one of `robustness`, on the plants of `loops`, their rigid
     bodies free: without and with feedforward."""
     if problem.source.motion is not None:
@@ -86,7 +76,7 @@ def move_figure(
 
 def cycle_chapter(
     problem: CoDesignProblem, theta: Sequence[float], result: Mapping[str, Any]
-) -> list[Chapter]:
+) -> list[c.Chapter]:
     """Force and heat over a cycle of the case's move, what limits it, and its time over the heat
     that is allowed; nothing for a case without a motor."""
     own, told = problem.source.motion, result.get("move")
@@ -98,20 +88,20 @@ def cycle_chapter(
     time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
     force = np.outer(profile.at(time)[2], forces)
     heat = R / k**2 * (force**2).sum(axis=1)
-    end = Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
-    mean = Level(told["power"], "mean")
+    end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
+    mean = c.Level(told["power"], "mean")
     ms = 1e3 * time
     panels = [
-        Panel("time (ms)", "force of a motor (N)", (Curve(ms, force[:, 0]),), levels=(end,)),
-        Panel("time (ms)", "heat (W)", (Curve(ms, heat),), levels=(mean,)),
+        c.Panel("time (ms)", "force of a motor (N)", (c.Curve(ms, force[:, 0]),), levels=(end,)),
+        c.Panel("time (ms)", "heat (W)", (c.Curve(ms, heat),), levels=(mean,)),
     ]
     if not own.required:
         watts = told["power"] * np.linspace(0.1, 2.0, 39)
         limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
         times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
         late = 0.0 if settled is None else settled - profile.duration
-        curve = Curve(watts, 1e3 * (np.array(times) + late))
-        panels.append(Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
+        curve = c.Curve(watts, 1e3 * (np.array(times) + late))
+        panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
     share = f"{number(100.0 * told['heat_share'], 3)} % of the heat"
     if motor.peak_current[0] < UNLIMITED:
         share += f" and {number(100.0 * told['peak_share'], 3)} % of the peak force"
@@ -125,11 +115,11 @@ def cycle_chapter(
         f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
         f"{settling}."
     )
-    lines = Lines((tuple(panels),), "A cycle of the motor", (3.0,))
-    return [Chapter("The motor", (Figure(lines, words),))]
+    lines = c.Lines((tuple(panels),), "A cycle of the motor", (3.0,))
+    return [c.Chapter("The motor", (c.Figure(lines, words),))]
 
 
-def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
+def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> c.Figure:
     """The position of every plant after a step of force at the actuator."""
     slow = min(float(-loop.poles.real.max()) for loop in loops)
     times = np.geomspace(0.02 / (2.0 * np.pi * bandwidth_hz), SETTLED / slow, STEPS)
@@ -137,28 +127,28 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
     curves, bands = of_plants(1e3 * t, y)
-    panel = Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
+    panel = c.Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
     on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
         "the stage, until it rests"
     )  # fmt: skip
     words = f"A force of 1 N at the actuator moves {on}."
-    lines = Lines(((panel,),), "A step of force", (3.2,))
-    return Figure(lines, words)
+    lines = c.Lines(((panel,),), "A step of force", (3.2,))
+    return c.Figure(lines, words)
 
 
-def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
+def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     ways = {way.words: [way.move] for way in found.ways}
     words = "The plant has its soft suspension, hold and delay are exact."
-    return ways_figure(ways, words), Words(_limit_words(found))
+    return ways_figure(ways, words), c.Words(_limit_words(found))
 
 
-def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
+def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     """Error and first force of one move made in several ways, each on one plant or on several, the
     model first, and a table of the largest; `words` end the caption."""
     made = list(ways.values())
     first, until = made[0][0], max(shown_until(m) for each in made for m in each)
-    end = Level(1e3 * first.duration, "setpoint ends", vertical=True)
+    end = c.Level(1e3 * first.duration, "setpoint ends", vertical=True)
     peaks = [max(m.peak_error for m in each) for each in made]
     kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False)
             if way[2] < 1e3 * peaks[0]]  # fmt: skip
@@ -172,17 +162,17 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
         curves, bands = [], []
         for name, each, _, colour in same:
             error = scale * np.array([_over(time, e, _error(e)) for e in each])
-            curves.append(Curve(ms, error[0], name, colour))
-            force.append(Curve(ms, _over(time, each[0], each[0].force[:, 0]), "", colour))
+            curves.append(c.Curve(ms, error[0], name, colour))
+            force.append(c.Curve(ms, _over(time, each[0], each[0].force[:, 0]), "", colour))
             if len(each) > 1:
-                bands.append(Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
+                bands.append(c.Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
         if curves:
-            panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
+            panels.append(c.Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
                                 levels=(end,)))  # fmt: skip
             end = replace(end, text="")  # said once
     heights = (*[2.6] * len(panels), 2.2)
-    panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
-    lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
+    panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
+    lines = c.Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
     rows = tuple(
         (name, *(max(map(read, each)) for read in FIGURES.values())) for name, each in ways.items()
     )
@@ -191,7 +181,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
         f"{shown(first.window, 'm')}. {words}"
     )
-    return Figure(lines, caption, (Table(("way", *FIGURES), rows), *tables_of(lines)))
+    return c.Figure(lines, caption, (c.Table(("way", *FIGURES), rows), *tables_of(lines)))
 
 
 def _over(time: Array, m: Move, values: Array) -> Array:

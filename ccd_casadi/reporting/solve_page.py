@@ -18,19 +18,7 @@ from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.deployment.channels import split
-from ccd_casadi.drawing.content import (
-    Bullets,
-    Chapter,
-    Facts,
-    Figure,
-    Head,
-    Heading,
-    Page,
-    Source,
-    Table,
-    ThetaPath,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.design_loops import design_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
@@ -73,7 +61,7 @@ ORDER = (
 )  # fmt: skip
 
 
-Part = Callable[[], list[Chapter]]
+Part = Callable[[], list[c.Chapter]]
 
 
 def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Path:
@@ -83,18 +71,18 @@ def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "
     return path
 
 
-def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Page:
+def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> c.Page:
     """What the report shows; the bar counts its sections."""
     parts = _parts(folder, case, problem, solution)
-    chapters: list[Chapter] = []
+    chapters: list[c.Chapter] = []
     with Progress(len(parts), "drawing the report") as bar:
         for part in parts:
             chapters += part()
             bar.advance()
-    return Page(solve_head(case, solution.result), (*chapters, provenance(case, solution.result)))
+    return c.Page(solve_head(case, solution.result), (*chapters, provenance(case, solution.result)))
 
 
-def page_of_run(run: FinishedRun) -> Page:
+def page_of_run(run: FinishedRun) -> c.Page:
     """The report of a run that kept none, as far as its folder holds it: the design by itself."""
     view = cache(partial(run_view, run))
     parts = design_parts(run.problem, run.problem, run.theta, run.controller, view, run.result)
@@ -107,11 +95,11 @@ def page_of_run(run: FinishedRun) -> Page:
         "not kept."
     )
     head = solve_head(run.case, run.result)
-    note = Chapter("About this page", (Words(words),))
-    return Page(head, (*chapters, note, provenance(run.case, run.result)))
+    note = c.Chapter("About this page", (c.Words(words),))
+    return c.Page(head, (*chapters, note, provenance(run.case, run.result)))
 
 
-def solve_head(case: Case, result: Mapping[str, Any]) -> Head:
+def solve_head(case: Case, result: Mapping[str, Any]) -> c.Head:
     """Of the report, drawn now."""
     # what `ccd new` makes is named by its folder
     named = case.path.absolute().parent.name if case.path.stem == "case" else case.path.stem
@@ -154,15 +142,17 @@ def design_parts(
     loops = cache(lambda: design_loops(own, theta, K))
 
     @cache
-    def move() -> Figure:
+    def move() -> c.Figure:
         return move_figure(own, theta, K, loops(), view().bandwidth_hz)
 
     parts: dict[str, Part] = {
         "glance": lambda: [glance(own, theta, view(), move())],
         "design": lambda: [design_chapter(problem, result)],
-        "move": lambda: [Chapter("A move", (move(),))],
+        "move": lambda: [c.Chapter("A move", (move(),))],
         "motor": lambda: cycle_chapter(own, theta, result),
-        "force": lambda: [Chapter("A step of force", (force_step(loops(), view().bandwidth_hz),))],
+        "force": lambda: [
+            c.Chapter("A step of force", (force_step(loops(), view().bandwidth_hz),))
+        ],
         "stage": lambda: stage_chapters(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_chapter(own, theta, K),
     }
@@ -170,16 +160,16 @@ def design_parts(
     if "proof" not in result:  # of mixed sensitivity
         return parts
     return parts | {
-        "controller": lambda: [Chapter("The controller", controller_blocks(result))],
+        "controller": lambda: [c.Chapter("The controller", controller_blocks(result))],
         "limits": lambda: (
-            [Chapter("What limits the bandwidth", limits_blocks(problem, result))]
+            [c.Chapter("What limits the bandwidth", limits_blocks(problem, result))]
             if "costs" in result
             else []
         ),
     }
 
 
-def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> Chapter:
+def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
     words, facts = (
         (binding_words, structured_facts) if "proof" in result else (binding, design_facts)
@@ -187,17 +177,17 @@ def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> Chapt
     binds = words(problem, result)
     body = (
         theta_table(problem, result),
-        Facts(tuple(facts(problem, result))),
-        Heading("What binds"),
-        Bullets(tuple(binds)) if binds else Words("Nothing binds: an interior optimum."),
-        *(Words(f"Note: {words}.") for words in result.get("notes", ())),
+        c.Facts(tuple(facts(problem, result))),
+        c.Heading("What binds"),
+        c.Bullets(tuple(binds)) if binds else c.Words("Nothing binds: an interior optimum."),
+        *(c.Words(f"Note: {words}.") for words in result.get("notes", ())),
     )
-    return Chapter("The design", body)
+    return c.Chapter("The design", body)
 
 
 def _theta(
     problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign", truths: Truths
-) -> Chapter:
+) -> c.Chapter:
     iterates = solution.outcome.iterates
     process = bandwidth_process(solution.outcome.surrogates)
     best = float(solution.result["bandwidth_hz"])
@@ -206,46 +196,46 @@ def _theta(
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, process, truths, radius, verified.theta)
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
-        paths = (ThetaPath("iterates", path),) if len(path) else ()
+        paths = (c.ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
-        figure = Figure(land, caption_landscape(land, best) + extra)
-        return Chapter("Bandwidth over the hardware", (figure,))
+        figure = c.Figure(land, caption_landscape(land, best) + extra)
+        return c.Chapter("Bandwidth over the hardware", (figure,))
     slices = slices_figure(problem, process, truths, verified.theta, best, extra)
     words = "There is no surrogate, and no design near the optimum to show in its place."
-    return Chapter("Bandwidth over the hardware", (slices or Words(words),))
+    return c.Chapter("Bandwidth over the hardware", (slices or c.Words(words),))
 
 
 def stage_chapters(
     problem: CoDesignProblem, thetas: Mapping[str, Sequence[float]]
-) -> list[Chapter]:
+) -> list[c.Chapter]:
     """The plant's drawing and its mode shapes at the last of `thetas`, where it has them."""
     plant, found = plant_of(problem), []
     if plant.drawing is not None and thetas:
-        found.append(Chapter("The stage, before and after", (plant.drawing(thetas),)))
+        found.append(c.Chapter("The stage, before and after", (plant.drawing(thetas),)))
     if plant.shapes is not None and thetas:
         name, theta = list(thetas.items())[-1]
         figure = mode_shape_figure(plant.shapes(theta, SHOWN))
-        found.append(Chapter(f"Mode shapes: {name}", (figure,)))
+        found.append(c.Chapter(f"Mode shapes: {name}", (figure,)))
     return found
 
 
 def _loop(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView, *more: Table
-) -> list[Chapter]:
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView, *more: c.Table
+) -> list[c.Chapter]:
     channels = split(scaled_plant(problem, theta), K)
-    plots = Chapter("Loop, plant and controller", (bode(loop, channels),))
+    plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),))
     if loop.bounded.asked:  # of a fixed structure
-        return [Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
+        return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
-        Chapter("Closed loop: S, KS and T against their bounds", (gains(loop),)),
-        Chapter("What limits the bandwidth", limit_blocks(loop)),
+        c.Chapter("Closed loop: S, KS and T against their bounds", (gains(loop),)),
+        c.Chapter("What limits the bandwidth", limit_blocks(loop)),
         plots,
     ]
 
 
 def _history(
     case: Case, problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign"
-) -> Chapter:
+) -> c.Chapter:
     heading = "Prediction against truth"
     outcome, result = solution.outcome, solution.result
     if not outcome.iterates:
@@ -254,30 +244,30 @@ def _history(
             + ("IPOPT worked on the true quantities, nothing was predicted."
                if result["formulation"] == "direct" else (result["reason"] or "none was run."))
         )  # fmt: skip
-        return Chapter(heading, (Words(words),))
+        return c.Chapter(heading, (c.Words(words),))
     blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
         lifted=len(outcome.surrogates) > 1,
     )  # fmt: skip
-    return Chapter(heading, blocks)
+    return c.Chapter(heading, blocks)
 
 
-def _trust(solution: "Solution") -> list[Chapter]:
+def _trust(solution: "Solution") -> list[c.Chapter]:
     """Nothing where nothing was predicted."""
     qualities = solution.quality
     if not qualities:
         return []
-    body = (Words(recommendation(qualities)), table_trust(qualities), trust_figure(qualities))
-    return [Chapter("Can the surrogate be trusted?", body)]
+    body = (c.Words(recommendation(qualities)), table_trust(qualities), trust_figure(qualities))
+    return [c.Chapter("Can the surrogate be trusted?", body)]
 
 
-def provenance(case: Case, result: Mapping[str, Any]) -> Chapter:
+def provenance(case: Case, result: Mapping[str, Any]) -> c.Chapter:
     """Seed, versions, and the case file."""
     rows = [("seed", str(result["seed"])), *result["versions"].items()]
     body = (
-        Heading("Seed and versions"),
-        Table(("what", "version"), tuple((a, str(b)) for a, b in rows)),
-        Heading("The resolved case file"),
-        Source(case_to_toml(case)),
+        c.Heading("Seed and versions"),
+        c.Table(("what", "version"), tuple((a, str(b)) for a, b in rows)),
+        c.Heading("The resolved case file"),
+        c.Source(case_to_toml(case)),
     )
-    return Chapter("Provenance", body, own_page=True)
+    return c.Chapter("Provenance", body, own_page=True)
