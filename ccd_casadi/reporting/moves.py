@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis import loop_figures
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.analysis.motor import UNLIMITED, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
@@ -18,13 +19,11 @@ from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
 from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import counted, number, shown, shown_unit
+from ccd_casadi.support.units import HZ, counted, number, shown, shown_unit
 
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
@@ -42,12 +41,10 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
 }
 
 
-def move_figure(
-    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
-    loops: Sequence[Loop], bandwidth_hz: float,
-) -> c.Figure:  # fmt: skip
-    """The case's move, or the default one of `robustness`, on the plants of `loops`, their rigid
+def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
+    """The case's move, or the default one of `robustness`, on all plants of a design, their rigid
     bodies free: without and with feedforward."""
+    loops = view.loops
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
         profile, window = motion.cycle.profile, motion.motion.window
@@ -59,9 +56,9 @@ def move_figure(
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
         other = "for other moves [move] of the case, or the options of robustness"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
-    free = free_loops(problem, theta, controller)
+    free = free_loops(problem, theta, view.loop.controller)
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
-                  bandwidth_hz=bandwidth_hz)  # fmt: skip
+                  bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
     several = " on every plant of the set (band; words and numbers are of the worst)"
     words = (
@@ -119,10 +116,11 @@ def cycle_chapter(
     return [c.Chapter("The motor", (c.Figure(lines, words),))]
 
 
-def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> c.Figure:
+def force_step(view: LoopView) -> c.Figure:
     """The position of every plant after a step of force at the actuator."""
+    loops = view.loops
     slow = min(float(-loop.poles.real.max()) for loop in loops)
-    times = np.geomspace(0.02 / (2.0 * np.pi * bandwidth_hz), SETTLED / slow, STEPS)
+    times = np.geomspace(0.02 / (HZ * view.bandwidth_hz), SETTLED / slow, STEPS)
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])

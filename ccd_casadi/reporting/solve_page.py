@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +19,7 @@ from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.drawing import content as c
-from ccd_casadi.inner_problem.design_loops import design_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_chapter import budget_chapter
 from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table
@@ -84,8 +82,7 @@ def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "So
 
 def page_of_run(run: FinishedRun) -> c.Page:
     """The report of a run that kept none, as far as its folder holds it: the design by itself."""
-    view = cache(partial(run_view, run))
-    parts = design_parts(run.problem, run.problem, run.theta, run.controller, view, run.result)
+    parts = design_parts(run.problem, run.problem, run.theta, run_view(run), run.result)
     chapters = []
     for name in (name for name in ORDER if name in parts):
         with suppress(KeyError):  # a result.json of an earlier version knows less
@@ -113,12 +110,11 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
     verified, result = solution.verified, solution.result
     if verified is None:
         return []
-    own, theta, K = verified.problem, verified.theta, verified.controller
-    view = cache(partial(view_of, verified))
-    parts = design_parts(problem, own, theta, K, view, result)
+    own, theta, view = verified.problem, verified.theta, view_of(verified)
+    parts = design_parts(problem, own, theta, view, result)
     if isinstance(verified, VerifiedStructured):
         table = bandwidths_table(verified)
-        parts["loop"] = lambda: _loop(own, theta, K, view(), table)
+        parts["loop"] = lambda: _loop(own, theta, view, table)
     elif isinstance(verified, VerifiedDesign):
         truths = read_truths(folder / "samples.sqlite", problem)
         parts |= {
@@ -131,42 +127,27 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
 
 
 def design_parts(
-    problem: CoDesignProblem,
-    own: CoDesignProblem,
-    theta: Sequence[float],
-    K: StateSpace,
-    view: Callable[[], LoopView],
+    problem: CoDesignProblem, own: CoDesignProblem, theta: Sequence[float], view: LoopView,
     result: Mapping[str, Any],
-) -> dict[str, Part]:
-    """The sections about a design by itself; `own`: the problem with its design plant chosen."""
-    loops = cache(lambda: design_loops(own, theta, K))
-
-    @cache
-    def move() -> c.Figure:
-        return move_figure(own, theta, K, loops(), view().bandwidth_hz)
-
+) -> dict[str, Part]:  # fmt: skip
+    """The chapters about a design by itself; `own`: the problem with its design plant chosen."""
+    move = cache(lambda: move_figure(own, theta, view))
     parts: dict[str, Part] = {
-        "glance": lambda: [glance(own, theta, view(), move())],
+        "glance": lambda: [glance(own, theta, view, move())],
         "design": lambda: [design_chapter(problem, result)],
         "move": lambda: [c.Chapter("A move", (move(),))],
         "motor": lambda: cycle_chapter(own, theta, result),
-        "force": lambda: [
-            c.Chapter("A step of force", (force_step(loops(), view().bandwidth_hz),))
-        ],
+        "force": lambda: [c.Chapter("A step of force", (force_step(view),))],
         "stage": lambda: stage_chapters(problem, {"start": problem.start, "optimum": theta}),
-        "budget": lambda: budget_chapter(own, theta, K),
+        "budget": lambda: budget_chapter(own, theta, view.loop.controller),
+        "loop": lambda: _loop(own, theta, view),
     }
-    parts["loop"] = lambda: _loop(own, theta, K, view())
-    if "proof" not in result:  # of mixed sensitivity
-        return parts
-    return parts | {
-        "controller": lambda: [c.Chapter("The controller", controller_blocks(result))],
-        "limits": lambda: (
-            [c.Chapter("What limits the bandwidth", limits_blocks(problem, result))]
-            if "costs" in result
-            else []
-        ),
-    }
+    if "proof" in result:  # of a fixed structure
+        parts["controller"] = lambda: [c.Chapter("The controller", controller_blocks(result))]
+    if "costs" in result:
+        limits = "What limits the bandwidth"
+        parts["limits"] = lambda: [c.Chapter(limits, limits_blocks(problem, result))]
+    return parts
 
 
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
@@ -220,9 +201,9 @@ def stage_chapters(
 
 
 def _loop(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView, *more: c.Table
+    problem: CoDesignProblem, theta: Sequence[float], loop: LoopView, *more: c.Table
 ) -> list[c.Chapter]:
-    channels = split(scaled_plant(problem, theta), K)
+    channels = split(scaled_plant(problem, theta), loop.loop.controller)
     plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),))
     if loop.bounded.asked:  # of a fixed structure
         return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
