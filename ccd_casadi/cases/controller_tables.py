@@ -111,10 +111,7 @@ class LoopTable:
 
 @dataclass(frozen=True)
 class SamplingTable:
-    """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
-
-    `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
-    """
+    """[sampling]: the plan over θ."""
 
     design: str = key("sampling plan over θ", "grid", check=choice("grid", "sobol", "lhs"))
     points: int = key(
@@ -127,12 +124,7 @@ class SamplingTable:
 
 @dataclass(frozen=True)
 class OuterTable:
-    """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
-
-    `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
-    that predicts left-out samples best. `box_points`: true inner problems spread over the box of θ
-    that a solve ends with a look at, those that it has solved already among them; 0: none.
-    """
+    """[outer]: starts, agreement of prediction and truth, rounds of refinement, global check."""
 
     starts: int = key("starts of IPOPT on the surrogates", 16, check=count(1))
     direct_starts: int = key("local solves on the true problem", 4, check=count(1))
@@ -152,11 +144,7 @@ class OuterTable:
 
 @dataclass(frozen=True)
 class BaselineTable:
-    """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
-
-    `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
-    and a Latin hypercube.
-    """
+    """[baseline]: the sequential design's first resonance, and the descents' steps and starts."""
 
     first_resonance_hz: float = key("least first resonance of the sequential design", 250.0)
     steps: tuple[float, ...] = key(

@@ -99,11 +99,7 @@ class ObjectiveTable:
 
 @dataclass(frozen=True)
 class WeightsTable:
-    """[weights] of the paper's Table 1; M_K in force over displacement.
-
-    `disturbance` W_d, of the same unit, with "h_infinity_disturbance": so much force weighs as
-    much as a reference of one unit of length. Default: ten times M_K.
-    """
+    """[weights] of the paper's Table 1; M_K in force over displacement."""
 
     M_S: float = key("W_S at high frequency is 1/M_S: the peak of S that the weight allows")
     A_S: float = key(
@@ -127,11 +123,7 @@ class WeightsTable:
 
 @dataclass(frozen=True)
 class InnerTable:
-    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched.
-
-    With sections: `minimise` what, "bandwidth" (its negative), the "rms_error" of [budget] or the
-    "move_time" of [move], these at a bandwidth of `bandwidth_least_hz` or more.
-    """
+    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched."""
 
     S_max: float = key(
         "bound of the peak of S, as a ratio: 2 is 6 dB",
