@@ -88,7 +88,7 @@ def test_a_mat_file_is_the_same_plant(tmp_path: Path) -> None:
     [
         ("stage.csv", "none.csv", "plant.file.*No such file"),
         ('file = "stage.csv"', "", "plant.file: is missing"),
-        ('file = "stage.csv"', 'file = "stage.csv"\nzeta = 0.1', "plant.zeta: is not an option"),
+        ('file = "stage.csv"', 'file = "stage.csv"\nzeta = 0.1', "plant.zeta: unknown key"),
         ('file = "stage.csv"', 'file = "stage.csv"\nunstable_poles = -1', "unstable_poles"),
         ("biquads = 0", "[theta.m]\nlower = 1.0\nupper = 2.0", "theta: has no effect"),
         ('structure = "sections"', "", "controller.structure: needs"),
