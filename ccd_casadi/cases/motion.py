@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from ccd_casadi.analysis.motor import UNLIMITED, Motion, Motor
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, key, one_or_more
 
 Numbers = float | tuple[float, ...] | None
@@ -93,7 +93,7 @@ def motion_problem(move: MoveTable, motor: MotorTable, rate_hz: float | None) ->
         return None
     given = {item.name: getattr(move, item.name) for item in fields(move)}
     shortest = SHORTEST if rate_hz is None else 1.0 / rate_hz
-    limits = Limits(
+    limits = MoveLimits(
         given["distance"], given["velocity"], move.acceleration or float("inf"), given["jerk"],
         move.snap or given["jerk"] / shortest,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import schur, solve_sylvester
 
-from ccd_casadi.deployment.channels import Channel, assemble
+from ccd_casadi.deployment.channels import LoopChannel, assemble
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -43,7 +43,9 @@ class Realisation:
 
 
 def realise(
-    channels: Sequence[Channel], controllers: Sequence[StateSpace], saturation: float | None = None
+    channels: Sequence[LoopChannel],
+    controllers: Sequence[StateSpace],
+    saturation: float | None = None,
 ) -> Realisation:
     """The controllers of all channels as one block-diagonal system from e to u."""
     parts, blocks = [], []

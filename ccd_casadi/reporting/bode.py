@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccd_casadi.analysis.loop_view import LoopView, phase_deg
-from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY
 from ccd_casadi.reporting.loops import bandwidth_level, margin_words, of_plants, over_hz
@@ -21,7 +21,7 @@ TURNS = np.arange(-1980.0, 1981.0, 360.0)  # phases of -1
 Parts = Mapping[str, tuple[np.ndarray, ...]]  # g, k and their product of a channel, by its name
 
 
-def bode(loop: LoopView, channels: Sequence[Channel] = ()) -> Figure:
+def bode(loop: LoopView, channels: Sequence[LoopChannel] = ()) -> Figure:
     """The Bode plot of one design with its words and numbers.
 
     L, then plant and controller, of every one of several scalar channels; of a loop that does not
@@ -134,7 +134,7 @@ def _curves(loop: LoopView, values: Mapping[str, Array]) -> list[Curve]:
     ]
 
 
-def scalar_parts(loop: LoopView, channels: Sequence[Channel]) -> Parts:
+def scalar_parts(loop: LoopView, channels: Sequence[LoopChannel]) -> Parts:
     """g, k and their product of every scalar channel, by a name that says which outputs it moves.
 
     Empty where the loop is no scalar one and does not fall apart into such channels.
@@ -171,7 +171,7 @@ def _marks(loop: LoopView, gains: Array) -> list[Mark]:
     return found
 
 
-def _caption(loop: LoopView, channels: Sequence[Channel]) -> str:
+def _caption(loop: LoopView, channels: Sequence[LoopChannel]) -> str:
     scalar = loop.plant.shape[1:] == (1, 1)
     what = "" if scalar else (
         "Every channel by itself; the signs are those of the outputs that it moves together. "
