@@ -60,8 +60,8 @@ def mixed_sensitivity(plant: ScaledPlant, weights: Weights) -> StandardPlant:
     p, m = len(plant.C), plant.B.shape[1]
     given = (plant.A, plant.B, plant.C, weights.scaled(plant.omega_0))
     if weights.delta:
-        parts = four_block_plant(*given, weights.delta)
-        return StandardPlant(*parts, np.eye(p, p + m), np.zeros((p, m)))
+        A, B1, B2, C1, C2, D11, D12 = four_block_plant(*given, weights.delta)
+        return StandardPlant(A, B1, B2, C1, C2, D11, D12, np.eye(p, p + m), np.zeros((p, m)))
     A, B1, B2, C1, C2, d1, d2 = generalized_plant(*given)
     D11, D12 = np.zeros((2 * p + m, p)), np.zeros((2 * p + m, m))
     D11[:p], D12[p : p + m] = d1 * np.eye(p), d2 * np.eye(m)
