@@ -11,7 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import OMEGA_LOW, PAPER, flexible_case, mechanics, problem, scaled, two_mass_model
+from helpers import (
+    OMEGA_LOW,
+    PAPER,
+    flexible_case,
+    mechanics,
+    problem,
+    responses,
+    scaled,
+    two_mass_model,
+)
 from sampled_simulation import measure_set
 from scipy.linalg import block_diag
 
@@ -24,7 +33,7 @@ from ccd_casadi.deployment.reduction import LoopLimits, Reduction, reductions, s
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import measure, responses
+from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, synthesise
 
