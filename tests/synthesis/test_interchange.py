@@ -94,7 +94,8 @@ def test_a_foreign_file_with_the_matrices_alone(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "x.mat", {"G": parts, "other": 3.0})
     found = read_mat(tmp_path / "x.mat").systems
     assert list(found) == ["G"]
-    assert (found["G"].inputs, found["G"].outputs, found["G"].system.period) == (("u1",), ("y1",), 0.0)
+    G = found["G"]
+    assert (G.inputs, G.outputs, G.system.period) == (("u1",), ("y1",), 0.0)
 
 
 @pytest.mark.parametrize(
