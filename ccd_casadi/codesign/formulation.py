@@ -1,6 +1,7 @@
 """What a formulation leaves behind: its iterates, its surrogate, and the design it ends with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
@@ -40,6 +41,17 @@ class FormulationResult:
     outer: OuterSolution | None = None
     agreed: bool = False
     message: str = ""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """By which formulation, to what relative tolerance and from which seed a run goes; `began` on
+    the clock of `perf_counter`."""
+
+    formulation: str
+    tolerance: float
+    seed: int
+    began: float = field(default_factory=perf_counter)
 
 
 @dataclass(frozen=True)

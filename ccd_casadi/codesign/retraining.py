@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, Terms
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
@@ -98,16 +97,15 @@ class Job:
         known = self._ended_before(mark)
         if known is not None:
             return known
-        began, outer, sampler = perf_counter(), self.outer, self.outer.sampler
+        outer, sampler = self.outer, self.outer.sampler
+        terms = Terms(self.formulation, mark["tolerance"], self.seed)
         words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
         outcome = FormulationResult(message=words)
         if not words:
-            outcome = self._trained(mark["tolerance"])
+            outcome = self._trained(terms.tolerance)
             if outcome.x is None:
                 outcome = outer.rescued(outcome, self.seed)
-        solution = concluded_at(
-            outer, outcome, self.formulation, mark["tolerance"], self.seed, began
-        )
+        solution = concluded_at(outer, outcome, terms)
         version = self._kept(outcome)
         reason = "converged" if outcome.agreed else "budget" if self.left <= 0 else "rounds"
         retraining = mark | {"version": version, "samples": self.spent, "reason": reason}

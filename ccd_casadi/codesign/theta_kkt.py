@@ -32,6 +32,7 @@ from ccd_casadi.inner_problem.objective import hardware_at, objective, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import (
     STEP,
+    FirstOrder,
     Kink,
     KktCertificate,
     active_set,
@@ -67,10 +68,11 @@ def theta_kkt(
     width = upper - lower
     theta, sizes = np.array(sample.theta), constraint_sizes(problem)
     own = hardware_at(problem, theta)
-    at = active_set(
-        (theta - lower) / width, objective_gradient(problem, sample), own.constraints * sizes,
-        own.slopes * sizes[:, None], sizes, plant_of(problem).constraint_names, problem.names,
+    here = FirstOrder(
+        objective_gradient(problem, sample), own.constraints, own.slopes, sizes,
+        plant_of(problem).constraint_names,
     )  # fmt: skip
+    at = active_set((theta - lower) / width, here, problem.names)
     if not np.isfinite(at.gradient).all():
         return at.certificate(np.zeros(len(at.labels)), np.inf, None)
     nu = at.multipliers()
