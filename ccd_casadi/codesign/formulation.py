@@ -5,6 +5,7 @@ from time import perf_counter
 from typing import Any
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
 
@@ -41,6 +42,14 @@ class FormulationResult:
     outer: OuterSolution | None = None
     agreed: bool = False
     message: str = ""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a formulation may begin with in place of its own plan: θ (n, n_θ), designs there."""
+
+    thetas: Array
+    samples: tuple[QuantitySample, ...]
 
 
 @dataclass(frozen=True)

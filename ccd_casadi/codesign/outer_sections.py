@@ -21,7 +21,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End, dear
 from ccd_casadi.codesign.outer_theta import ThetaOuter
-from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
+from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import pieces_from
@@ -284,7 +284,7 @@ class SectionsOuter(ThetaOuter):
 
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.bandwidths(x, "the run's own design")[0]
-        return sections_responses(self.problem, sample, value_at(self.sampler, sample))
+        return structured_responses(self.problem, sample, value_at(self.sampler, sample))
 
 
 def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: SectionsValue) -> float:

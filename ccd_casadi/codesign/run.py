@@ -18,7 +18,6 @@ from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.outer_sections import SectionsOuter
 from ccd_casadi.codesign.search import concluded, concluded_at, searched
 from ccd_casadi.codesign.sections_lists import ListedSections
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -88,11 +87,7 @@ def solve(
 
 
 def co_design(
-    sampler: Sampler,
-    formulation: Formulation,
-    seed: int,
-    given: Surrogates | None = None,
-    known: Array | None = None,
+    sampler: Sampler, formulation: Formulation, seed: int, known: Array | None = None
 ) -> Solution:
     """Run one formulation on a sampler, verify and polish its design on the truth.
 
@@ -101,19 +96,15 @@ def co_design(
     that is known already, in place of the formulation.
     """
     if sampler.problem.listed:
-        if given is not None:
-            raise UserError("--surrogate: cannot start a solve with lists of values; leave it out")
         return _of_lists(sampler, formulation, seed)
     terms = Terms(type(formulation).__name__.lower(), formulation.tolerance, seed)
     require_solvable(sampler.problem)
-    if given is not None and not outer_of(sampler).learns_from_others:
-        raise UserError("--surrogate: cannot start a solve of this kind; solve the case without it")
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
         return concluded_at(outer_of(sampler), FormulationResult(message=forbidden), terms)
 
     def solved(outer: Outer) -> Solution:
-        return concluded(searched(outer, formulation, seed, given, known), terms)
+        return concluded(searched(outer, formulation, seed, known), terms)
 
     return best_over_design_plants(sampler, outer_of, solved, terms)
 

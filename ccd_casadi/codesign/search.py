@@ -16,7 +16,6 @@ from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
 from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.arrays import Array
 
@@ -35,11 +34,7 @@ class Searched:
 
 
 def searched(
-    outer: Outer,
-    formulation: Formulation,
-    seed: int,
-    given: Surrogates | None = None,
-    known: Array | None = None,
+    outer: Outer, formulation: Formulation, seed: int, known: Array | None = None
 ) -> Searched:
     """Formulation and polish, again with what the inner problem at the end has found better.
 
@@ -50,7 +45,7 @@ def searched(
     while True:
         rounds += 1
         if known is None:
-            outcome = outer.formulated(formulation, seed, given)
+            outcome = outer.formulated(formulation, seed)
         else:
             outcome = FormulationResult(known, agreed=True)
         if outcome.x is None:

@@ -219,21 +219,6 @@ def test_a_plant_too_large_for_memory_is_refused(trap: Path, matrices: str, word
 # ---- names that lead out of the folder -----------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", ["../x", "/etc/passwd", "..", "", ".", "0001/../../x", "0001.json", "\x00", "x" * 5000]
-)
-def test_a_surrogates_name_is_no_path(
-    two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
-    shutil.copy(folder / "surrogate.json", tmp_path / "x.json")
-    case = str(folder / "case.toml")
-    assert solve([case, "--out", str(folder), "--surrogate", name, "--quiet"]) == 2
-    errors = capsys.readouterr().err
-    assert len(errors.splitlines()) == 1
-    assert errors.startswith("--surrogate ")
-
-
 def test_a_surrogate_file_of_another_kind_is_not_built(tmp_path: Path) -> None:
     for kind in ("os.system", "__class__", "Surrogate", ["gaussian_process"], None):
         path = tmp_path / "s.json"

@@ -15,7 +15,7 @@ from helpers import problem
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.post_optimal import sections_responses
+from ccd_casadi.codesign.post_optimal import structured_responses
 from ccd_casadi.compare import main as compare_main
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
@@ -235,7 +235,7 @@ def test_responses_against_differences(folder: Path) -> None:
     sample = BandwidthSample(
         run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1
     )
-    found = sections_responses(run.problem, sample, made)
+    found = structured_responses(run.problem, sample, made)
     by_name = {item.parameter: item for item in found.responses}
     h = 1e-3
     ends = []

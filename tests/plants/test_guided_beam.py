@@ -11,7 +11,7 @@ from scipy.signal import tf2ss
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.outer_sections import polish_sections
-from ccd_casadi.codesign.post_optimal import sections_responses
+from ccd_casadi.codesign.post_optimal import structured_responses
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
@@ -106,7 +106,7 @@ def test_the_co_design_ends_on_a_kink_that_is_an_optimum(
     ((one, other),) = certificate.kink.slopes
     assert min(one, other) > 0.1
     # what the optimum answers to: S_max moves the kink, and J with it
-    answers = sections_responses(anchored, best, found)
+    answers = structured_responses(anchored, best, found)
     told = {item.parameter: item.objective for item in answers.responses}["S_max"]
     ends = []
     for sign in (1.0, -1.0):
