@@ -13,8 +13,8 @@ from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.support.units import HZ
 
 BINDS = {
