@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, pl
 from ccd_casadi.inner_problem.sweep import missed_bounds
 from ccd_casadi.plants.plant import theta_words
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.spent import spent_entry, was_moved
+from ccd_casadi.sampling.spent import with_all_spent
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -83,10 +83,8 @@ def best_over_design_plants(
                     found[i] = min(found[i], there, key=order)
     violation = [np.inf if each.nearest is None else each.nearest.violation for each in samplers]
     best = min(range(len(found)), key=lambda i: (*order(found[i]), violation[i]))
-    result = found[best].result | {
-        "seconds": perf_counter() - terms.began,
-        **spent_entry(sampler.spent.by_purpose, was_moved(found[best].result)),
-    }
+    result = with_all_spent(found[best].result, sampler.spent.by_purpose)
+    result["seconds"] = perf_counter() - terms.began
     if problem.robust is not None:
         names = [_at(choice) for choice in choices]
         told = [{key: item.result[key] for key in TOLD if key in item.result} for item in found]
