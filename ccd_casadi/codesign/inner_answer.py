@@ -24,7 +24,6 @@ from ccd_casadi.codesign.structured_entries import (
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import controller_response
-from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -35,10 +34,9 @@ from ccd_casadi.inner_problem.problem import (
     true_design,
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.inner_problem.structured_bandwidth import too_slow
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import judged_widely, proof_of, worst_members
-from ccd_casadi.inner_problem.structured_search import least_value_at, prepared, with_range
+from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.closed_loop import open_alone
@@ -226,16 +224,12 @@ def structured_answer(
         anchors = (sections_kappa(begin_at, structure_of(asked)),)
         asked = replace(asked, controller=replace(structured_of(asked), anchors=anchors))
     asked, made = prepared(asked, progress, workers, begin_at is not None)
+    fastest = made.bandwidth
+    asked, made, least = least_from(asked, theta, made, progress)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
-    if problem.figure is not BANDWIDTH:
-        slow = too_slow(asked, made)
-        if not slow.certified:
-            return InnerAnswer("infeasible", head | {"reason": slow.words, "syntheses": 1})
-        fastest = made.bandwidth
-        asked, least = least_value_at(asked, theta, made, progress)
-        made = least.design
+    if least is not None:
         value = least.value if problem.w2 > 0.0 else made.bandwidth
         entry = problem.figure.entry
         head["least_error" if entry == "error_rms" else f"least_{entry}"] = {
