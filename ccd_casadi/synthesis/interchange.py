@@ -166,7 +166,8 @@ def mat_variables(path: Path) -> dict[str, Any]:
         words = "is a MATLAB 7.3 file; write it with save(…, '-v7')"
         raise UserError(f"{path}: {words}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
-        raise UserError(f"{path}: is not a readable .mat file: {_one_line(error)}") from None
+        words = " ".join(str(error).split())[:120]
+        raise UserError(f"{path}: is not a readable .mat file: {words}") from None
 
 
 def read_mat(path: Path) -> DesignFile:
@@ -256,7 +257,3 @@ def _strings(value: Any) -> tuple[str, ...]:
 
 def _names(letter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{letter}{i + 1}" for i in range(count))
-
-
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:120]
