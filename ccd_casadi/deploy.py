@@ -89,7 +89,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.moves import way_words
 
     if moved is not None and not options.quiet:
-        say(f"{'a move':13s} {way_words(moved.ways[-1].words, [moved.ways[-1].move])}")
+        last = list(moved.ways)[-1]
+        say(f"{'a move':13s} {way_words(last, [moved.ways[last]])}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)

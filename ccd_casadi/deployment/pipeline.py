@@ -17,7 +17,7 @@ from ccd_casadi.deployment.outcome import (
     ChannelOrders,
     Deployment,
 )
-from ccd_casadi.deployment.rate_choice import ChannelLoops, choose
+from ccd_casadi.deployment.rate_choice import choose
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing
@@ -78,7 +78,9 @@ def deploy(
         orders, channels, small = designed_channels(run), whole(run.plant, K), [K]
         reduced, figures = K, full
     else:
-        _require_fast(timing, full.bandwidth / HZ)
+        if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * full.bandwidth / HZ:
+            words = f"is less than {LEAST_RATE:g} times the bandwidth, {full.bandwidth / HZ:.4g} Hz"
+            raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
         remedy = SHORTEN_IT
         limits = LoopLimits(
             REDUCED_PEAK * inner.S_max, inner.S_low * (1.0 + STRICT), REDUCED_NORM * full.gamma,
@@ -95,9 +97,11 @@ def deploy(
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing)
         way |= {"needed_hz": own_hz, "target": target}
         return judged(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
-    loops = ChannelLoops(channels, small, target)
+    loops = list(zip(channels, small, strict=True))
     for attempt in range(1 + ADDED):
-        conversion, needed, rate = choose(run, timing, loops, family, progress, attempt, remedy)
+        conversion, needed, rate = choose(
+            run, timing, loops, target, family, progress, attempt, remedy
+        )
         way |= {"needed_hz": needed, "target": target}
         found = judged(run, dense, orders, conversion, rate, timing.delay_at(rate), saturation, way)
         outside = max((m for m in found.members if not target.held(m.figures)),
@@ -107,12 +111,6 @@ def deploy(
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
     return found
-
-
-def _require_fast(timing: Timing, bandwidth_hz: float) -> None:
-    if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:
-        words = f"is less than {LEAST_RATE:g} times the bandwidth, {bandwidth_hz:.4g} Hz"
-        raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
 
 
 def _orders(

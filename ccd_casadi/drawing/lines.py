@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
+from ccd_casadi.drawing.content import Lines, Modes, Panel, Picture, Place, Table
 from ccd_casadi.drawing.labels import APART, Labels, in_points, inside, scales_of
 from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
@@ -92,12 +92,13 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         )  # fmt: skip
     for i, area in enumerate(panel.forbidden):
         axes.fill(area.x, area.y, color=area.colour, alpha=0.2, linewidth=0.0, gid=f"area{i}")
+    top = np.inf if panel.y_range is None else panel.y_range[1]
     for i, curve in enumerate(panel.curves):
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",
             marker=curve.marker or None, linewidth=curve.width, label=curve.label or None,
             markerfacecolor="white" if curve.line else curve.colour,
-            clip_on=not curve.marker or _leaves(panel, curve),
+            clip_on=not curve.marker or bool(np.nanmax(curve.y, initial=0.0) > top),
             gid=f"curve{i}",
         )  # fmt: skip
     for i, mark in enumerate(panel.marks):
@@ -135,11 +136,6 @@ def _labels(axes: "Axes", panel: Panel) -> Labels:
     for mark in panel.marks:
         labels.avoid(mark.x, mark.y)
     return labels
-
-
-def _leaves(panel: Panel, curve: Curve) -> bool:
-    """Whether a curve goes on beyond the top of its panel."""
-    return panel.y_range is not None and bool(np.nanmax(curve.y, initial=0.0) > panel.y_range[1])
 
 
 def _ranges(axes: "Axes", panel: Panel) -> None:

@@ -136,7 +136,7 @@ def force_step(view: LoopView) -> c.Figure:
 
 def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    ways = {way.words: [way.move] for way in found.ways}
+    ways = {words: [move] for words, move in found.ways.items()}
     words = "The plant has its soft suspension, hold and delay are exact."
     return ways_figure(ways, words), c.Words(_limit_words(found))
 
@@ -219,7 +219,7 @@ def _limit_words(found: OnHardware) -> str:
             "The unlimited move itself does not end in its window within the time watched: ask for "
             "more stiffness at low frequencies (compliance_max, S_low), or widen the window."
         )
-    peak = max(float(way.move.peak_force.max()) for way in found.ways[:2])
+    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
     if found.least_limit == 1.0:
         return (
             words + "Of the limits tried none below the peak force lets the move end in its window."

@@ -24,12 +24,15 @@ def robustness_page(
     `own`: of the run's own controller, so that the run's decision and verdict stand on it.
     """
     lead, *others = conclusion(run, found)
+    given = "This controller is stable on every plant that was tried."
+    if not found.survives:
+        given = "Do not use this controller: it is not stable on every plant that was tried."
     head = head_of(
         f"Robustness: {run.case.path.parent.name}", found.survives,
         "stable on all plants" if found.survives else "not stable on all plants",
         "that were tried; others were not examined",
         f"{theta_words(run.result)} · seed {seed}", lead, run.result if own else {},
-        "" if own else given_decision(found),
+        "" if own else given,
     )  # fmt: skip
     chapters = (
         Chapter("In short", tuple(map(Words, others))),
@@ -41,13 +44,6 @@ def robustness_page(
         *([_move(found)] if found.moves else []),
     )
     return Page(head, chapters, index)
-
-
-def given_decision(found: Study) -> str:
-    """Whether to use a controller that is not the run's own."""
-    if found.survives:
-        return "This controller is stable on every plant that was tried."
-    return "Do not use this controller: it is not stable on every plant that was tried."
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
