@@ -23,6 +23,7 @@ from ccd_casadi.cases.checks import (
     POSITIVE,
     Check,
     Fail,
+    every,
     require_good,
     rows,
     shown,
@@ -43,18 +44,16 @@ MOST_ROWS = 20_000  # of a table
 PATH = ("mass", "damping", "stiffness")
 
 
-def _corners(value: Any) -> str | None:
-    remedy = "give a list of Hz, or of [Hz, damping ratio], all above 0"
-    if not isinstance(value, list | tuple):
-        return f"is {shown(value)}; {remedy}"
-    for item in value:
-        parts = item if isinstance(item, list | tuple) else [item]
-        if len(parts) not in (1, 2) or any(POSITIVE(part) is not None for part in parts):
-            return f"is {shown(value)}; {remedy}"
-    return None
+def _corner(value: Any) -> str | None:
+    parts = value if isinstance(value, list | tuple) else [value]
+    good = len(parts) in (1, 2) and all(POSITIVE(part) is None for part in parts)
+    return None if good else "is none"
 
 
-CORNERS = Check(_corners, {"type": "array"})
+CORNERS = every(
+    Check(_corner, {"type": ["number", "array"]}),
+    "give a list of Hz, or of [Hz, damping ratio], all above 0",
+)
 TABLE_CHECKS: dict[str, Check] = {
     "name": text,
     "unit": text,

@@ -114,17 +114,6 @@ def flag(value: Any) -> str | None:
     return None if isinstance(value, bool) else f"is {shown(value)}; give true or false"
 
 
-@_with(_list({"type": "number", "exclusiveMinimum": 0.0}, 2, 2))
-def interval(value: Any) -> str | None:
-    remedy = "give two positive numbers [low, high] with low < high"
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        return f"is {shown(value)}; {remedy}"
-    for item in value:
-        if POSITIVE(item) is not None:
-            return f"is {shown(value)}; {remedy}"
-    return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
-
-
 @_with(
     {
         "anyOf": [
@@ -194,6 +183,7 @@ FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 DAMPING = number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True)
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
+_pair = every(POSITIVE, "give two positive numbers [low, high] with low < high", 2, 2)
 points = every(count(2), "give two whole numbers of at least 2", 2, 2)
 steps = every(FRACTION, "give a list of numbers between 0 and 1, both exclusive", 1)
 factors = every(POSITIVE, "give a list of numbers above 0")
@@ -215,6 +205,14 @@ places = every(
     every(coordinate, "", 1, 3), 'give rows of numbers and names of [theta], as [["x", 0.1]]'
 )
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
+
+
+@_with(_pair.schema)
+def interval(value: Any) -> str | None:
+    wrong = _pair(value)
+    if wrong is None and not value[0] < value[1]:
+        return f"is an empty range {shown(value)}; give [low, high] with low < high"
+    return wrong
 
 
 @_with(numbers.schema)

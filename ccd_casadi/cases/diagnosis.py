@@ -131,18 +131,9 @@ def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
 
 def _clusters(modal: ModalPlant) -> list[np.ndarray]:
     """Modes of one frequency, whose shapes are one space; the rigid ones are one."""
-    groups: list[list[int]] = []
-    for i, w in enumerate(modal.natural):
-        last = groups[-1][-1] if groups else None
-        same = last is not None and (
-            (modal.rigid[i] and modal.rigid[last])
-            or (not modal.rigid[last] and w - modal.natural[last] <= HIDDEN * w)
-        )
-        if same:
-            groups[-1].append(i)
-        else:
-            groups.append([i])
-    return [np.array(group) for group in groups]
+    w, rigid = modal.natural, modal.rigid
+    same = (rigid[1:] & rigid[:-1]) | (~rigid[:-1] & (np.diff(w) <= HIDDEN * w[1:]))
+    return np.split(np.arange(len(w)), np.flatnonzero(~same) + 1)
 
 
 def _hidden(modal: ModalPlant, index: int, place: str) -> list[Finding]:

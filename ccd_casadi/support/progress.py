@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from types import TracebackType
 from typing import Self, TextIO
 
 from ccd_casadi.support.notebook import in_notebook
@@ -60,10 +59,7 @@ class Progress:
             self._show(end="")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:  # fmt: skip
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None and self.done:
             single, self.total = self.total == 1, self.done
             if single and not self.cell:
