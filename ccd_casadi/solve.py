@@ -10,7 +10,7 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import counted, shown
+from ccd_casadi.support.units import counted
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.tables import Case
@@ -56,10 +56,10 @@ def summary(solution: "Solution") -> str:
 
 def controller_lines(controller: Mapping[str, Any]) -> list[str]:
     """A controller of fixed structure: its order and gain, its sections in Hz."""
-    from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.inner_problem.sections_words import SectionWords, gain_words
 
     return [
-        f"controller    order {controller['order']}, gain {_gains(controller)}",
+        f"controller    order {controller['order']}, gain {gain_words(controller)}",
         *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
     ]
 
@@ -83,14 +83,6 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
     ]
     beside = f" ({'; '.join(others)})" if others else ""
     return [f"design plant  {robust['design_at']}{beside}"]
-
-
-def _gains(controller: Mapping[str, Any]) -> str:
-    """`4.7e+05 N/m`, of several channels `z: 4.7e+05 N/m, tip: …`."""
-    channels = controller.get("channels")
-    if channels is None:
-        return shown(controller["gain"], "N/m", 4)
-    return ", ".join(f"{item['name']}: {shown(item['gain'], 'N/m', 4)}" for item in channels)
 
 
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
