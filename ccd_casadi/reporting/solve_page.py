@@ -172,7 +172,7 @@ def _theta(
     iterates = solution.outcome.iterates
     process = bandwidth_process(solution.outcome.surrogates)
     best = float(solution.result["bandwidth_hz"])
-    extra = caption_disagreement(problem, process, truths, verified.theta)
+    extra = caption_disagreement(process, truths)
     if len(problem.names) == 2:
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, process, truths, radius, verified.theta)
