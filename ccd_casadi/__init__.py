@@ -15,7 +15,7 @@ from ccd_casadi.support.notebook import Shown
 from surrogates.lazy_names import from_stub as _from_stub
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
-    _interrupts.starting()
+    _interrupts.exit_on_ctrl_c()
 
 del _interrupts
 

@@ -9,7 +9,7 @@ from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import number, one_line, positive
+from ccd_casadi.support.options import one_line, positive, real
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.result import told
+    from ccd_casadi.codesign.result import with_verdict_line
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
@@ -81,7 +81,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             folder / FMU_FILE, found.realisation, texts, str(naming["title"])
         ):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    finished = told(finished, folder, "deployable", deployed_line(finished, found))
+    finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
     if not options.quiet:
         say(_summary(finished, found))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
@@ -151,10 +151,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     delay = arguments.add_mutually_exclusive_group()
     delay.add_argument(
-        "--delay", metavar="SECONDS", type=number(), help="time from reading y to the new u, in s"
+        "--delay", metavar="SECONDS", type=real(), help="time from reading y to the new u, in s"
     )
     delay.add_argument(
-        "--delay-samples", metavar="X", type=number(), default=Timing.delay_samples,
+        "--delay-samples", metavar="X", type=real(), default=Timing.delay_samples,
         help="the same time in sampling periods (default: 1)",
     )  # fmt: skip
     arguments.add_argument(
@@ -179,7 +179,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         ("jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
     ):
         arguments.add_argument(
-            f"--{name}", metavar=metavar, type=number(), default=0.0, help=f"{words} (default: 0)"
+            f"--{name}", metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)"
         )
     add_move_options(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])

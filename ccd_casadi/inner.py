@@ -82,7 +82,7 @@ def _progress(options: argparse.Namespace) -> Callable[[str], None] | None:
 def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> ExitCode:
     """Print the answer, after controller.json is written: the folder may be refused."""
     from ccd_casadi.codesign.design_entries import figures_dict
-    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.versions import versions
 
     if options.out is not None and found.controller is not None:
@@ -95,9 +95,9 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
         "seed": options.seed,
         "formulation": "inner",
         "versions": versions(),
-        "sweep": [clean(figures_dict(row)) for row in found.rows],
+        "sweep": [json_values(figures_dict(row)) for row in found.rows],
     }
-    json.dump(clean(answer), sys.stdout, indent=2, allow_nan=False)
+    json.dump(json_values(answer), sys.stdout, indent=2, allow_nan=False)
     print()
     return ExitCode.of(found.status)
 

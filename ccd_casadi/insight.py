@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from time import perf_counter
 
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
-from ccd_casadi.support.options import whole
+from ccd_casadi.support.options import integer
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import say
 
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--points",
         metavar="N",
-        type=whole(2, 9999),
+        type=integer(2, 9999),
         default=20,
         help="most points on the front (default: 20)",
     )

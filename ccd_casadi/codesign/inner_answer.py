@@ -50,7 +50,7 @@ from ccd_casadi.lti.closed_loop import open_alone
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import statics
@@ -147,9 +147,9 @@ def _design(
         )  # fmt: skip
         compliance = compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
     answer = {
-        **clean(figures_dict(figures)),
+        **json_values(figures_dict(figures)),
         **compliance,
-        **clean(loop_of_design(problem, theta, made)),
+        **json_values(loop_of_design(problem, theta, made)),
         "active": list(active_constraints(problem.inner, figures)) if feasible else [],
         "feasible": feasible,
         "local_peaks": [

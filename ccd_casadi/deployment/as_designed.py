@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.channels import LoopChannel, along, split
+from ccd_casadi.deployment.channels import LoopChannel, along_directions, scalar_channels
 from ccd_casadi.deployment.discretise import Conversion, Target, loop_at
 from ccd_casadi.deployment.outcome import SAMPLED_BANDWIDTH, ChannelOrders
 from ccd_casadi.deployment.rate_choice import loops_meet
@@ -57,13 +57,13 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
     structure, kappa = structure_of(run.problem), run.kappa
     assert kappa is not None
     if isinstance(structure, Structure):
-        channel = split(run.plant, run.controller)[0]
+        channel = scalar_channels(run.plant, run.controller)[0]
         parts = [(channel, structure, kappa)]
     else:
         decoupling, parts = structure.decoupling, []
         for i, (own, values) in enumerate(structure.split(kappa)):
             u, v = decoupling.outputs[:, [i]], decoupling.inputs[:, [i]]
-            plant, K = along(run.plant, u, v), state_space(own, values)
+            plant, K = along_directions(run.plant, u, v), state_space(own, values)
             parts.append((LoopChannel(decoupling.names[i], u, v, plant, K), own, values))
     found = []
     for channel, own, values in parts:

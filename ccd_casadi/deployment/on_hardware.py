@@ -16,7 +16,7 @@ from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
-from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.move import Electronics, move
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.lti.state_space import StateSpace
@@ -85,7 +85,7 @@ def on_hardware(
         progress("least force")
         least = 1.0
         for share in SHARES:
-            held = limited(replace(free, saturation=share * peak), bandwidth)
+            held = with_anti_windup(replace(free, saturation=share * peak), bandwidth)
             if not np.isfinite(made(held, forward).settled):
                 break
             least = share

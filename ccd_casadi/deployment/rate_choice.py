@@ -16,7 +16,7 @@ from ccd_casadi.deployment.discretise import (
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.robust.sampled import SampledFigures, together
+from ccd_casadi.robust.sampled import SampledFigures, worst_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
@@ -30,7 +30,7 @@ def loops_meet(
     delay = timing.delay_at(rate)
 
     def at(member: Member | None = None) -> SampledFigures:
-        return together([
+        return worst_figures([
             loop_at((c.plant if member is None else member.seen_by(c)).plant_si(), K, conversion,
                     1.0 / rate, delay)
             for c, K in loops

@@ -17,7 +17,7 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.deployment.channels import split
+from ccd_casadi.deployment.channels import scalar_channels
 from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import bode
@@ -203,7 +203,7 @@ def stage_chapters(
 def _loop(
     problem: CoDesignProblem, theta: Sequence[float], loop: LoopView, *more: c.Table
 ) -> list[c.Chapter]:
-    channels = split(scaled_plant(problem, theta), loop.loop.controller)
+    channels = scalar_channels(scaled_plant(problem, theta), loop.loop.controller)
     plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),))
     if loop.bounded.asked:  # of a fixed structure
         return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]

@@ -66,7 +66,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(ExitCode.BAD_INPUT, f"{one_line(message)}; see {self.prog} --help\n")
 
 
-def whole(least: int, most: int = 999_999_999) -> Callable[[str], int]:
+def integer(least: int, most: int = 999_999_999) -> Callable[[str], int]:
     """Return the type of an option that is a whole number from `least` to `most`.
 
     >>> whole(1)("12")
@@ -83,7 +83,7 @@ def whole(least: int, most: int = 999_999_999) -> Callable[[str], int]:
     return convert
 
 
-def number(
+def real(
     least: float = 0.0, most: float = math.inf, *, strict: bool = False
 ) -> Callable[[str], float]:
     """Return the type of an option that is a finite number from `least` to `most`.
@@ -110,7 +110,7 @@ def number(
     return convert
 
 
-positive = number(strict=True)
+positive = real(strict=True)
 
 
 def add_break_frequencies(arguments: argparse.ArgumentParser, words: str) -> None:
