@@ -145,42 +145,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         "ccd_casadi.deploy",
         "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
     )
-    arguments.add_argument(
-        "--rate-hz", metavar="X", type=positive,
-        help="sampling rate (default: the next round rate above what is needed)",
-    )  # fmt: skip
+    add = arguments.add_argument
+    words = "sampling rate (default: the next round rate above what is needed)"
+    add("--rate-hz", metavar="X", type=positive, help=words)
     delay = arguments.add_mutually_exclusive_group()
-    delay.add_argument(
-        "--delay", metavar="SECONDS", type=real(), help="time from reading y to the new u, in s"
-    )
-    delay.add_argument(
-        "--delay-samples", metavar="X", type=real(), default=Timing.delay_samples,
-        help="the same time in sampling periods (default: 1)",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--lead", choices=["on", "off"], default="on",
-        help="a lead that compensates hold and delay (default: on, which lowers the rate)",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--unverified", action="store_true",
-        help="deploy a run that is not verified; the result is not verified either",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--saturation", metavar="NEWTON", type=positive,
-        help="limit every u to plus or minus this, with anti-windup (default: off)",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--fmu", action="store_true",
-        help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC names",
-    )  # fmt: skip
+    words = "time from reading y to the new u, in s"
+    delay.add_argument("--delay", metavar="SECONDS", type=real(), help=words)
+    delay.add_argument("--delay-samples", metavar="X", type=real(), default=Timing.delay_samples,
+                       help="the same time in sampling periods (default: 1)")  # fmt: skip
+    words = "a lead that compensates hold and delay (default: on, which lowers the rate)"
+    add("--lead", choices=["on", "off"], default="on", help=words)
+    words = "deploy a run that is not verified; the result is not verified either"
+    add("--unverified", action="store_true", help=words)
+    words = "limit every u to plus or minus this, with anti-windup (default: off)"
+    add("--saturation", metavar="NEWTON", type=positive, help=words)
+    words = "also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC names"
+    add("--fmu", action="store_true", help=words)
     for name, metavar, words in (
-        ("sensor-step", "METRE", "of the simulated sensor"),
-        ("force-step", "NEWTON", "of the simulated actuator"),
-        ("jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
+        ("--sensor-step", "METRE", "of the simulated sensor"),
+        ("--force-step", "NEWTON", "of the simulated actuator"),
+        ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
     ):
-        arguments.add_argument(
-            f"--{name}", metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)"
-        )
+        add(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
     add_move_options(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])
 

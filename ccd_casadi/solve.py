@@ -198,26 +198,15 @@ def command(options: argparse.Namespace) -> ExitCode:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser("ccd_casadi.solve", "Design a stage and its controller together.")
-    arguments.add_argument(
-        "--formulation",
-        choices=FORMULATIONS,
-        help="default: nested, or direct with many parameters or lists",
-    )
-    arguments.add_argument(
-        "--resume",
-        action="store_true",
-        help="print what the run folder holds; every run continues from it",
-    )
-    arguments.add_argument(
-        "--surrogate",
-        metavar="NAME",
-        help="start from a version of the run folder's surrogates (0002), not by sampling",
-    )
-    arguments.add_argument(
-        "--no-report",
-        action="store_true",
-        help="write no pages, for jobs that only need result.json",
-    )
+    add = arguments.add_argument
+    words = "default: nested, or direct with many parameters or lists"
+    add("--formulation", choices=FORMULATIONS, help=words)
+    words = "print what the run folder holds; every run continues from it"
+    add("--resume", action="store_true", help=words)
+    words = "start from a version of the run folder's surrogates (0002), not by sampling"
+    add("--surrogate", metavar="NAME", help=words)
+    words = "write no pages, for jobs that only need result.json"
+    add("--no-report", action="store_true", help=words)
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
