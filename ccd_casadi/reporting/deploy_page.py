@@ -20,7 +20,6 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
-from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number, shown
@@ -76,7 +75,8 @@ def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, s
 
 
 def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
-    nyquist = 0.5 * found.rate_hz
+    scalar = run.plant.B.shape[1] == len(run.plant.C) == 1
+    nyquist, named = 0.5 * found.rate_hz, "|{}|" if scalar else "σ_max({})"
     low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
     hz = frequency_grid(low, high, POINTS, run.plant.grid * run.plant.omega_0 / HZ)
     curves, drawn = [], []
@@ -89,8 +89,8 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
     crossing = bandwidth_level(bandwidth, text=", continuous")
-    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named(run, 'S')} (–)")
-    bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist), legend=None)
+    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
+    bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
     title = "Sensitivity and controller: full, reduced and sampled, over frequency"
     ends = [shown(each.y[-1], "N/m") for each in drawn]
     caption = (

@@ -37,7 +37,7 @@ def robustness_page(
     chapters = (
         Chapter("In short", tuple(map(Words, others))),
         _margins(found),
-        _gains(run, found),
+        _gains(found),
         _perturbed(run, found),
         _tolerances(run, found),
         *_structured(found),
@@ -158,10 +158,10 @@ def _margins(found: Study) -> Chapter:
     return Chapter("Margins", (Table(head, tuple(rows)), Words(words)))
 
 
-def _gains(run: FinishedRun, found: Study) -> Chapter:
+def _gains(found: Study) -> Chapter:
     shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
-        (figures.named(run, name),
+        (found.view.named(name),
          shown(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
         for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
     ]  # fmt: skip
@@ -179,7 +179,7 @@ def _gains(run: FinishedRun, found: Study) -> Chapter:
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
     drawn = figures.gains(
-        run, found, "Sensitivity, complementary sensitivity, position by a force at the actuators "
+        found, "Sensitivity, complementary sensitivity, position by a force at the actuators "
         "(GS), and force by sensor noise (KS).",
     )  # fmt: skip
     white = (Heading("White noise (one-sided density)"), Facts(facts))
