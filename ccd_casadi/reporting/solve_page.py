@@ -27,10 +27,12 @@ from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.landscape import (
+    Truths,
     bandwidth_process,
     caption_disagreement,
     caption_landscape,
     landscape_data,
+    read_truths,
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
@@ -45,7 +47,6 @@ from ccd_casadi.reporting.structured_page import (
     limits_blocks,
     structured_facts,
 )
-from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import table_trust, trust_figure
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.progress import Progress

@@ -28,8 +28,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.report import main as report_command
 from ccd_casadi.reporting.bode import bode
+from ccd_casadi.reporting.landscape import read_truths
 from ccd_casadi.reporting.solve_page import solve_page, write_report
-from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
