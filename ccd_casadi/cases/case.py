@@ -15,9 +15,10 @@ from ccd_casadi.cases.checks import CaseError, Fail, Test, check_of, closest, re
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.kinds import check_kind
 from ccd_casadi.cases.motion import check_motion
-from ccd_casadi.cases.places import checked_places, place_names
+from ccd_casadi.cases.places import checked_places
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.tables import TABLES, Case
+from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.support.options import one_line
 
 TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
@@ -160,7 +161,8 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     for place in absolute:
         plant_table(dict(data["plant"]) | options_in(place, fail), path, fail)
     tables["robust"] = replace(tables["robust"], plants=absolute)
-    of_case = (*place_names(tables["places"]), *filter(None, [tables["motor"].size]))
+    places, size = tables["places"], tables["motor"].size
+    of_case = (*names_in((*places.actuators, *places.sensors)), *filter(None, [size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":

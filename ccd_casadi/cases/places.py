@@ -6,7 +6,6 @@ from pathlib import Path
 
 from ccd_casadi.cases.checks import Fail, shown
 from ccd_casadi.cases.tables import PlacesTable
-from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.plants.places import Places
 
 
@@ -31,11 +30,6 @@ def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
     if not numbers or len({len(row) for row in numbers}) != 1 or len(numbers[0]) not in (1, 2, 3):
         raise fail("places.nodes", "are not rows of as many coordinates, 1 to 3; correct them")
     return replace(table, nodes=numbers)
-
-
-def place_names(table: PlacesTable) -> tuple[str, ...]:
-    """The parameters that it names."""
-    return names_in((*table.actuators, *table.sensors))
 
 
 def places_of(table: PlacesTable) -> Places | None:

@@ -233,13 +233,6 @@ _READERS: dict[type[ControllerProblem], Callable[..., dict[str, Any]]] = {
 }
 
 
-def refuse_structured(run: FinishedRun, command: str, remedy: str) -> None:
-    """Raise UserError where a command is for mixed sensitivity only."""
-    if run.kappa is not None:
-        words = f'{command} is for controller.structure = "h_infinity" so far; {remedy}'
-        raise UserError(f"{run.folder / 'case.toml'}: controller.structure: {words}")
-
-
 def read_json(path: Path) -> Mapping[str, Any]:
     """A JSON object. Raises UserError where there is none."""
     try:
