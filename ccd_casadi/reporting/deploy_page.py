@@ -141,25 +141,22 @@ def _rates(found: Deployment) -> c.Words:
 
 
 def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
-    head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
-    rows = []
-    for row in item.rows:
-        f = row.figures
-        chosen = "chosen" if row is item.chosen else ""
-        result = chosen if f.certified else f.outcome.value
-        rows.append((
-            row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
-            f.gamma / run.figures.gamma if f.certified else float("nan"), result,
-        ))  # fmt: skip
     if item.designed is not None:
         words = f"Channel {item.channel.name}: {item.chosen.order} states, as designed."
         return (c.Words(words),)
+    head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
+    rows = tuple(
+        (row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
+         f.gamma / run.figures.gamma if f.certified else float("nan"),
+         f.outcome.value if not f.certified else "chosen" if row is item.chosen else "")
+        for row in item.rows for f in [row.figures]
+    )  # fmt: skip
     words = (
         f"Channel {item.channel.name}: {item.chosen.order} of {item.rows[0].order} states are "
         f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
         f"above twice its bound; {item.strict.order} keep S_max itself."
     )
-    return c.Words(words), c.Table(head, tuple(rows))
+    return c.Words(words), c.Table(head, rows)
 
 
 def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
