@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, program, run, run_folder
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.units import counted
 
 
@@ -80,8 +80,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     if options.out is not None:
         write_json(run_folder(options.case, options.out) / "check.json", found)
     say(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
-    if not options.json and not options.quiet:
-        say(f"next          {program('ccd_casadi.solve')} {options.case}")
+    if not options.json:
+        inform(f"next          {program('ccd_casadi.solve')} {options.case}")
     return ExitCode.DONE
 
 

@@ -11,7 +11,7 @@ from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import one_line, positive, real
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
@@ -82,20 +82,18 @@ def command(options: argparse.Namespace) -> ExitCode:
         ):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
-    if not options.quiet:
-        say(_summary(finished, found))
+    inform(_summary(finished, found))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.index import index_of, publish
     from ccd_casadi.reporting.moves import way_words
 
-    if moved is not None and not options.quiet:
+    if moved is not None:
         last = list(moved.ways)[-1]
-        say(f"{'a move':13s} {way_words(last, [moved.ways[last]])}")
+        inform(f"{'a move':13s} {way_words(last, [moved.ways[last]])}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
-    if not options.quiet:
-        say(f"page          {folder / 'report.html'}")
+    inform(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
     say(one_line(f"not verified: {_shortfall(finished, found)}"), sys.stderr)

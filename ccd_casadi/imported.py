@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import integer
+from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.plants.imported.modal_table import ModalTable
@@ -37,9 +38,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         raise UserError(str(error)) from error
     file = run_folder(folder, options.out or folder) / "modes.csv"
     write_modal_table(file, table)
-    if not options.quiet:
-        N, r = table.omega.shape
-        print(f"{file}: {N} samples of {r} modes, {', '.join(table.names)}")
+    N, r = table.omega.shape
+    inform(f"{file}: {N} samples of {r} modes, {', '.join(table.names)}")
     return ExitCode.DONE
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.units import counted
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -169,23 +169,21 @@ def command(options: argparse.Namespace) -> ExitCode:
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(store) as samples,
     ):
-        if options.resume and not options.quiet:
+        if options.resume:
             held = counted(samples.count(), "row") if samples.count() else "nothing yet"
-            say(f"resuming      {store} holds {held}", sys.stderr)
+            inform(f"resuming      {store} holds {held}", sys.stderr)
         sampler = Sampler(problem, samples, workers, quiet=options.quiet)
         solution = with_units(co_design(sampler, formulation, options.seed), problem)
         write_run(folder, case, solution)
     code = ExitCode.of(solution.result["status"])
-    if not options.quiet:
-        say(summary(solution))
-        say(f"run folder    {folder}")
+    inform(summary(solution))
+    inform(f"run folder    {folder}")
     if not options.no_report:
         from ccd_casadi.reporting.solve_page import write_report
 
         plant_case, solved = resolved(case, solution), solution.problem or problem
         write_report(folder, plant_case, solved, solution)
-        if not options.quiet:
-            say(f"page          {folder / 'index.html'}")
+        inform(f"page          {folder / 'index.html'}")
     if options.quiet and code is not ExitCode.DONE:
         say(f"{options.case}: {solution.result['reason']}", sys.stderr)
     return code

@@ -8,7 +8,7 @@ from time import perf_counter
 
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.options import integer, one_line, positive, real
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -37,7 +37,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         found = tune(
             options.run, rate_hz=options.rate_hz, delay=options.delay, S_max=options.s_max,
             shape=options.shape, effort=options.effort, structure=structure, seed=options.seed,
-            progress=None if options.quiet else lambda words: say(words, sys.stderr),
+            progress=lambda words: inform(words, sys.stderr),
             workers=workers,
         )  # fmt: skip
     answer, case = answer_of(found.case, found.design), found.case
@@ -64,8 +64,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             *(f"{'':14s}{SectionWords(**item).text}" for item in result["controller"]["sections"]),
             f"{'page':14s}{folder / 'report.html'}",
         ]
-        if not options.quiet:
-            say("\n".join([f"{'status':14s}{answer.status}", *lines]))
+        inform("\n".join([f"{'status':14s}{answer.status}", *lines]))
     if answer.status != "verified":
         say(one_line(f"{case.file}: {answer.status}: {result['reason']}"), sys.stderr)
     return ExitCode.of(answer.status)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -30,8 +30,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         found = worth(case, Sampler(problem, store, workers, quiet=options.quiet), options.seed)
     answer = found | {"seed": options.seed, "versions": versions()}
     write_json(folder / "worth.json", json_values(answer))
-    if not options.quiet:
-        say("\n".join([*worth_words(found), f"file          {folder / 'worth.json'}"]))
+    inform("\n".join([*worth_words(found), f"file          {folder / 'worth.json'}"]))
     return ExitCode.DONE
 
 

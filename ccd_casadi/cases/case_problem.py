@@ -21,7 +21,7 @@ from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.options import one_line
-from ccd_casadi.support.progress import progress_shown
+from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.units import HZ
 
 
@@ -105,7 +105,7 @@ def problem_of(case: Case) -> CoDesignProblem:
             require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
-            with progress_shown(False):
+            with kept_quiet(True):
                 found = diagnose(problem, case.suspension.rigid_modes)[1]
             for finding in found:
                 if finding.severity is Severity.ERROR:

@@ -5,18 +5,12 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
-from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.robust.structured import StructuredBound
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
-
-
-def gains(found: Study, caption: str) -> Figure:
-    """S, KS, T and GS of the loop with their bounds."""
-    return Figure(figure_gains([found.view], compliance=True), caption)
 
 
 def perturbed(run: FinishedRun, found: Study, caption: str) -> Figure:

@@ -3,9 +3,10 @@
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Chapter, Facts, Heading, Page, Table, Words
+from ccd_casadi.drawing.content import Chapter, Facts, Figure, Heading, Page, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
@@ -178,10 +179,11 @@ def _gains(found: Study) -> Chapter:
     )  # fmt: skip
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
-    drawn = figures.gains(
-        found, "Sensitivity, complementary sensitivity, position by a force at the actuators "
-        "(GS), and force by sensor noise (KS).",
-    )  # fmt: skip
+    caption = (
+        "Sensitivity, complementary sensitivity, position by a force at the actuators (GS), and "
+        "force by sensor noise (KS)."
+    )
+    drawn = Figure(figure_gains([found.view], compliance=True), caption)
     white = (Heading("White noise (one-sided density)"), Facts(facts))
     body = (drawn, Facts(tuple(tops)), *white)  # at rest: in short
     return Chapter("Disturbance and noise", body)

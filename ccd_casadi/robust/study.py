@@ -31,7 +31,7 @@ from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import progress_shown
+from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics, statics
 
@@ -93,7 +93,7 @@ def robustness(
     Study
         The content of robustness.json.
     """
-    with progress_shown(not quiet):
+    with kept_quiet(quiet):
         return _study(run, demands or Demands(), seed, workers)
 
 

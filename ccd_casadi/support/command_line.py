@@ -15,8 +15,7 @@ from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import Parser, integer, one_line, usable_cores
-from ccd_casadi.support.progress import progress_shown
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import kept_quiet, say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
@@ -118,7 +117,7 @@ def run(
             threadpool_limits(limits=1),
             threads_permitted(getattr(options, "workers", 1)),
             permit_user_code(not options.no_user_code),
-            progress_shown(not options.quiet),
+            kept_quiet(options.quiet),
             ctrl_c_noticed(),
         ):
             code = main(options)
