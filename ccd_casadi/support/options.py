@@ -69,7 +69,7 @@ class Parser(argparse.ArgumentParser):
 def integer(least: int, most: int = 999_999_999) -> Callable[[str], int]:
     """Return the type of an option that is a whole number from `least` to `most`.
 
-    >>> whole(1)("12")
+    >>> integer(1)("12")
     12
     """
 
@@ -90,7 +90,7 @@ def real(
 
     `strict` leaves the bounds out.
 
-    >>> number(0.0, strict=True)("2.5")
+    >>> real(0.0, strict=True)("2.5")
     2.5
     """
     words = f"number above {least:g}" if strict else f"number from {least:g}"

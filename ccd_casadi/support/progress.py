@@ -10,8 +10,7 @@ import time
 from typing import Self, TextIO
 
 from ccd_casadi.support.notebook import in_notebook
-from ccd_casadi.support.terminal import columns
-from ccd_casadi.support.terminal import quiet as quietly
+from ccd_casadi.support.terminal import QUIET, columns
 
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
@@ -34,7 +33,7 @@ class Progress:
         self.total, self.label, self.note = total, label, ""
         cell = in_notebook(sys.stdout)
         self.stream = stream or (sys.stdout if cell else sys.stderr)
-        self.silent = (quietly.get() if quiet is None else quiet) or total <= 0
+        self.silent = (QUIET.get() if quiet is None else quiet) or total <= 0
         self.cell = in_notebook(self.stream)
         self.terminal = not self.silent and (self.cell or self.stream.isatty())
         self.interval = (0.25 if self.cell else 0.1) if self.terminal else 5.0

@@ -13,7 +13,7 @@ WIDTH = 100  # characters of a line at most, and where no terminal is
 LABEL = re.compile(r"\s*(\S+( \S+)*?\s{2,})?((passed|warned|failed|unknown)\s{2,})?")
 
 COLOURS = {"passed": 32, "verified": 32, "warned": 33, "failed": 31, "not_verified": 31}
-quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 STATE = re.compile(rf"^(\w+\s{{2,}})({'|'.join(COLOURS)})\b")
 
 
@@ -62,15 +62,15 @@ def say(text: str, stream: TextIO | None = None) -> None:
 
 def inform(text: str, stream: TextIO | None = None) -> None:
     """As `say`, unless `kept_quiet` (--quiet) forbids what is no answer and no mistake."""
-    if not quiet.get():
+    if not QUIET.get():
         say(text, stream)
 
 
 @contextmanager
 def kept_quiet(yes: bool) -> Iterator[None]:
     """Within the block `inform` and progress bars print nothing, or (`yes` False) do."""
-    token = quiet.set(yes)
+    token = QUIET.set(yes)
     try:
         yield
     finally:
-        quiet.reset(token)
+        QUIET.reset(token)
