@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.case import read_toml, table_of
-from ccd_casadi.cases.checks import Fail, count, require_good, shown, text
+from ccd_casadi.cases.checks import Fail, count, require_good, short_repr, text
 from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
@@ -56,7 +56,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
                 name, f'has no effect on plant.model = "{MODEL}", which has no theta; drop it'
             )
         if not isinstance(table, Mapping):
-            raise fail(name, f"is {shown(table)}; write a table [{name}]")
+            raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     response = _response(plant, path, fail)
     if "inner" not in data:
         raise fail("inner", "is missing; add a table [inner]")

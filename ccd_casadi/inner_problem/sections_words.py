@@ -10,7 +10,7 @@ from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Kind
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, shown
+from ccd_casadi.support.units import HZ, with_unit
 
 NEAR = 1.1  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
 
@@ -104,8 +104,10 @@ def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict
 def gain_words(controller: Mapping[str, Any]) -> str:
     """`470 kN/m`, of several channels `z: 470 kN/m, tip: …`; of `controller` of result.json."""
     if "gain" in controller:
-        return shown(controller["gain"], "N/m", 4)
-    return ", ".join(f"{c['name']}: {shown(c['gain'], 'N/m', 4)}" for c in controller["channels"])
+        return with_unit(controller["gain"], "N/m", 4)
+    return ", ".join(
+        f"{c['name']}: {with_unit(c['gain'], 'N/m', 4)}" for c in controller["channels"]
+    )
 
 
 def channel_words(own: Mapping[str, Any]) -> str:

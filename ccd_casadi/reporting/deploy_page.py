@@ -22,7 +22,7 @@ from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_pan
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, shown
+from ccd_casadi.support.units import HZ, number, with_unit
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for
@@ -92,7 +92,7 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
     bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
     title = "Sensitivity and controller: full, reduced and sampled, over frequency"
-    ends = [shown(each.y[-1], "N/m") for each in drawn]
+    ends = [with_unit(each.y[-1], "N/m") for each in drawn]
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
         f"up to half the sampling rate. There the controller's gain, which sensor noise and "
@@ -167,8 +167,8 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     if item.designed is not None:
         structure, kappa = item.designed
         words = (
-            f"Channel {item.channel.name}: gain {shown(gain_of(kappa), 'N/m', 4)}; the sections as "
-            "they were designed."
+            f"Channel {item.channel.name}: gain {with_unit(gain_of(kappa), 'N/m', 4)}; the "
+            "sections as they were designed."
         )
         return c.Words(words), structured_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
@@ -177,9 +177,9 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
-        f"Channel {item.channel.name}: gain {shown(found.gain, 'N/m', 4)} at s = 0, "
-        f"{shown(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at s = 0."
-        " A negative ζ, or a negative frequency of a single root, is in the right half plane."
+        f"Channel {item.channel.name}: gain {with_unit(found.gain, 'N/m', 4)} at s = 0, "
+        f"{with_unit(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at "
+        "s = 0. A negative ζ, or a negative frequency of a single root, is in the right half plane."
     )
     return c.Words(words), c.Table(head, rows)
 

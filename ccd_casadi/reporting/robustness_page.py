@@ -10,9 +10,9 @@ from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
-from ccd_casadi.robust.perturbed import Judged, Line
+from ccd_casadi.robust.perturbed import Line, PerturbedLoop
 from ccd_casadi.robust.study import Study
-from ccd_casadi.support.units import HZ, metres, number, shown
+from ccd_casadi.support.units import HZ, metres, number, with_unit
 
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
@@ -130,7 +130,7 @@ def _damping(line: Line, ends: tuple[float, float]) -> str:
     return f"{stable}, within S_max from {line.within[0]:.3g} to {line.within[1]:.3g}."
 
 
-def _outcome(item: Judged) -> str:
+def _outcome(item: PerturbedLoop) -> str:
     if not item.stable:
         return "unstable"
     return f"peak of S {item.peak:.4g}, ω_b {item.bandwidth / HZ:.4g} Hz"
@@ -163,7 +163,7 @@ def _gains(found: Study) -> Chapter:
     shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
         (found.view.named(name),
-         shown(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
+         with_unit(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
         for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
     ]  # fmt: skip
     n, d = found.noise, found.demands

@@ -11,7 +11,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words, gain_words
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.reporting.facts import Fact, binding, loop_facts, sensitivity_facts, value_facts
-from ccd_casadi.support.units import HZ, counted, number, shown
+from ccd_casadi.support.units import HZ, counted, number, with_unit
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
@@ -116,7 +116,7 @@ def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fac
         ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
          r["compliance_words"]),
         *loop_facts(r),
-        ("Largest |KS|", shown(r["KS_max"], "N/m", 4), ""),
+        ("Largest |KS|", with_unit(r["KS_max"], "N/m", 4), ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),

@@ -19,8 +19,8 @@ from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
 from ccd_casadi.robust.perturbed import (
-    Judged,
     Line,
+    PerturbedLoop,
     damping_line,
     shift_line,
     single_modes,
@@ -56,8 +56,8 @@ class Study:
     statics: Statics
     shift: Line
     damping: Line
-    modes: tuple[Judged, ...]
-    box: Judged
+    modes: tuple[PerturbedLoop, ...]
+    box: PerturbedLoop
     tolerances: Tolerances
     structured: StructuredBound | None
     setpoint: Setpoint
@@ -256,7 +256,7 @@ def _disk(margin: DiskMargin) -> dict[str, float]:
     return vars(margin) | {"gain": margin.gain, "phase_deg": margin.phase_deg}
 
 
-def _judged(item: Judged, *places: str) -> dict[str, Any]:
+def _judged(item: PerturbedLoop, *places: str) -> dict[str, Any]:
     """Its figures, after the first of its places by these names."""
     return dict(zip(places, item.place, strict=False)) | {
         "stable": item.stable,

@@ -109,7 +109,7 @@ def draw_morph(
         for row in theta:
             try:
                 solid.load(gmsh, drawn(row)[0])
-                samples.append(solid.moved(gmsh, mesh))
+                samples.append(solid.moved_points(gmsh, mesh))
             except PlantError as refused:
                 place = ", ".join(f"{n}={v:g}" for n, v in zip(names, row, strict=True))
                 raise PlantError(f"the solid at {place}: {refused}") from refused

@@ -64,8 +64,8 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
     r = min(counts)
     return ModalTable(
         names=tuple(names),
-        input_names=named(folder, dofs, "in"),
-        output_names=named(folder, dofs, "out"),
+        input_names=names_of_kind(folder, dofs, "in"),
+        output_names=names_of_kind(folder, dofs, "out"),
         constraint_names=tuple(name.split(":", 1)[1] for name in constraints),
         theta=np.array([[number(row, name) for name in names] for row in index]),
         omega=np.array([omega[:r] for omega, _, _ in found]),
@@ -126,7 +126,7 @@ def _shape_values(
 
 def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) -> Array:
     """(n, k) columns that pick the dofs of each name of this kind."""
-    names = named(folder, dofs, kind)
+    names = names_of_kind(folder, dofs, kind)
     found = np.zeros((size, len(names)))
     for row in dofs:
         if row["kind"] == kind:
@@ -139,7 +139,7 @@ def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) ->
     return found
 
 
-def named(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
+def names_of_kind(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
     """Names of this kind in dofs.csv. Raises PlantError where there is no input or no output."""
     names = tuple(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
     if kind != "shape" and not names:

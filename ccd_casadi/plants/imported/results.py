@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.plants.imported.matrices import named, number_in, read_rows
+from ccd_casadi.plants.imported.matrices import names_of_kind, number_in, read_rows
 from ccd_casadi.plants.imported.modal_table import ModalTable
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -59,8 +59,8 @@ def results_table(folder: Path) -> ModalTable:
 
     return ModalTable(
         names=tuple(names),
-        input_names=named(folder, dofs, "in"),
-        output_names=named(folder, dofs, "out"),
+        input_names=names_of_kind(folder, dofs, "in"),
+        output_names=names_of_kind(folder, dofs, "out"),
         constraint_names=tuple(name.split(":", 1)[1] for name in constraints),
         theta=numbers(*names),
         omega=2.0 * np.pi * np.array([item.frequency_hz[:r] for item in modes]),
