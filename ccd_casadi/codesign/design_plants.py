@@ -21,7 +21,7 @@ from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import missed_bounds
-from ccd_casadi.plants.plant import theta_words
+from ccd_casadi.plants.plant import named_values
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import with_all_spent
 from ccd_casadi.support.arrays import Array
@@ -123,7 +123,7 @@ def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
         return "; ".join(part for part in parts if part)
     where = ""
     if sampler.nearest is not None and np.isfinite(sampler.nearest.violation):
-        where = f"nearest at {theta_words(plant_of(problem), sampler.nearest.theta)}: "
+        where = f"nearest at {named_values(plant_of(problem).names, sampler.nearest.theta)}: "
     thetas = len({entry.theta for entry in sampler.trace})
     return f"{search_words(problem, thetas)}; {where}{words}; {remedies(problem, share)}"
 

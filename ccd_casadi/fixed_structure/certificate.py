@@ -202,7 +202,7 @@ def judged(
     tops = peaks(table, grid, values)
     loops = [loops[i] for i in good]
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], integrator)
-    norm, confirmed = norms(loops, table, *tops["S"])
+    norm, confirmed = norms(loops, table.period, *tops["S"])
     channels: list[list[ChannelFigures]] = [[] for _ in good]
     for one in bounds.channels:
         of_rows, certain = _rows(one, loops, table, grid, values, tops, integrator)
@@ -250,7 +250,7 @@ def _rows(
         return [ChannelFigures(own.name)] * len(grid), np.ones(len(grid), bool)
     curve, u = f"S of {own.name}", np.array([own.output])
     rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
-    norm, confirmed = norms(rows, table, *tops[curve], row=own.output)
+    norm, confirmed = norms(rows, table.period, *tops[curve])
     _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, own.output)
     missing = np.full(len(grid), np.nan)
     weighted = tops.get(f"weighted KS of {own.name}", (missing, missing))[0]

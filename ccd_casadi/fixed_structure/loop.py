@@ -144,26 +144,20 @@ class PlantSet:
         half = np.minimum(0.5 * self.period * omega, 0.5 * np.pi)
         return np.asarray(2.0 / self.period * np.tan(half))
 
-    def responses(
-        self, which: np.ndarray, v: Array, *, free: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """G (..., p, m) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape.
-
-        `free` of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d,
-        whatever the sampling.
-        """
+    def responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G (..., p, m) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
         v = np.asarray(v, float)
-        at, plants, chain = v, self.modes, np.ones_like(v)
-        if free:
-            at, plants, chain = self.frequency(v), plants._replace(period=0.0), self.chain(v)
-        found = modes.responses(plants, np.ravel(which), at.ravel())
+        found = modes.responses(self.modes, np.ravel(which), v.ravel())
         G, slope = (found[:, i].reshape(*v.shape, *found.shape[2:]) for i in (0, 1))
-        return G, slope * chain[..., None, None]
+        return G, slope
 
     def form_to_theta(
         self, which: int, v: Array, left: np.ndarray, right: np.ndarray, *, free: bool = False
     ) -> np.ndarray:
         """∂(x G y)/∂θ (k, n_θ) of one plant at jv with rows x (k, p) and columns y (k, m).
+
+        `free` of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d,
+        whatever the sampling.
 
         x (dC f(A) B + C f(A) dB + C V (f[p_i, p_j] ∘ V⁻¹dA V) V⁻¹B) y   (Daleckii and Krein)
         """
