@@ -27,10 +27,9 @@ from ccd_casadi.cases.places import checked_places
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.tables import TABLES, Case
 from ccd_casadi.plants.nodes import names_in
-from ccd_casadi.support.options import one_line
+from ccd_casadi.support.options import DEFAULT_CASE, one_line
 
 TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
-DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
 
 

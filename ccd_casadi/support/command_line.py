@@ -13,14 +13,13 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
+from ccd_casadi.support.options import DEFAULT_CASE, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
-from ccd_casadi.support.options import Parser, integer, one_line, usable_cores
 from ccd_casadi.support.terminal import kept_quiet, say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
 
-DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"

@@ -10,6 +10,7 @@ from typing import NoReturn
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
+DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 LONGEST = 1000  # characters of a line: somebody else's message in it may have millions
 
 
