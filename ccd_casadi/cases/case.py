@@ -127,7 +127,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     --------
     >>> parse_case({"plant": {"model": "two_mas"}, "theta": {}})
     Traceback (most recent call last):
-    ccd_casadi.cases.case.CaseError: case: objective: is missing; add a table [objective]
+    ccd_casadi.cases.checks.CaseError: case: objective: is missing; add a table [objective]
     """
 
     fail = Fail(path)
