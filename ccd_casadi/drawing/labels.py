@@ -15,7 +15,7 @@ POINT = 3.0  # pt; half a marker
 # places beside a point, in pt, after the one that was asked for
 AROUND = ((0, 7), (8, 3), (-8, 3), (0, -7), (8, -5), (-8, -5), (0, 20), (12, 16), (-12, 16),
           (0, -20), (12, -18), (-12, -18))  # fmt: skip
-SHARES = (0.0, 0.2, 0.45, 0.75)  # of a line's length where its words may begin
+SHARES = (0.0, 0.2, 0.45, 0.75, 0.1, 0.3, 0.6, 0.9)  # of a line's length where words may begin
 APART = 2.0  # pt between the points that a curve is looked at by
 BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 
@@ -26,6 +26,11 @@ def inside(axes: "Axes") -> Box:
     """The axes themselves in pt, from the lower left corner of the figure."""
     box, scale = axes.get_window_extent(), 72.0 / axes.figure.dpi
     return scale * box.x0, scale * box.y0, scale * box.x1, scale * box.y1
+
+
+def legend_height(names: Sequence[str]) -> float:
+    """Of a legend of these names, in pt."""
+    return LINE * (len(names) + 0.8)
 
 
 def scales_of(axes: "Axes", log_x: bool = False, log_y: bool = False) -> list[list[float]]:
@@ -60,19 +65,19 @@ class Labels:
         self._taken: list[Box] = []
         self._curves = np.empty((0, 2))
 
-    def corner(self, names: Sequence[str]) -> str:
-        """The place of a legend of these names that covers least; nothing lies over it then."""
+    def corner(self, names: Sequence[str]) -> tuple[str, float]:
+        """The place of a legend of these names that covers least, and how much it covers; nothing
+        lies over it then."""
         boxes = self._corners(names)
         costs = {where: self._covered(box) + sum(_meet(box, one) for one in self._taken)
                  for where, box in boxes.items()}  # fmt: skip
         where = min(costs, key=lambda each: costs[each])
         self._taken.append(boxes[where])
-        return where
+        return where, costs[where]
 
     def _corners(self, names: Sequence[str]) -> dict[str, Box]:
         left, bottom, right, top = self._inside
-        wide = LETTER * max(map(len, names)) + HANDLE
-        tall = LINE * (len(names) + 0.8)
+        wide, tall = LETTER * max(map(len, names)) + HANDLE, legend_height(names)
         middle = 0.5 * (left + right - wide)
         across = {"right": right - wide, "left": left, "center": middle}
         up = {"upper": top - tall, "lower": bottom, "center": 0.5 * (bottom + top - tall)}
@@ -113,26 +118,29 @@ class Labels:
             self._write(text, (dx, dy), (x, y), "data", held, ha=side, va=_above(dy), bbox=BEHIND)
 
     def along(self, value: float, text: str, vertical: bool) -> None:
-        """A label at a line across the axes, upright beside a vertical one."""
+        """A label at a line across the axes; upright beside a vertical one, or level with a place
+        on it where that alone keeps off the curves."""
         left, bottom, right, top = self._inside
         corner = self._axes.get_xlim()[0], self._axes.get_ylim()[0]
         line = self._at(value, corner[1])[0] if vertical else self._at(corner[0], value)[1]
         start, end = (bottom + 4.0, top) if vertical else (left + 3.0, right)
         wide = LETTER * len(text)
         places = []
-        for share in SHARES:
-            for side in (2.0, -2.0):
-                a, b = start + share * (end - start), line + side - (LINE if side < 0 else 0.0)
-                box = (b, a, b + LINE, a + wide) if vertical else (a, b, a + wide, b + LINE)
-                places.append((box, (a - (bottom if vertical else left)), side))
+        for long, across in ((wide, LINE), (LINE, wide))[: 1 + vertical]:
+            for share in SHARES:
+                for side in (2.0, -2.0):
+                    a, b = start + share * (end - start), line + side - across * (side < 0)
+                    box = (a, b, a + long, b + across)
+                    box = (b, a, b + across, a + long) if vertical else box
+                    places.append((box, a - (bottom if vertical else left), side, long == wide))
         found = self._best([box for box, *_ in places])
         if found is None:
             return
-        _, at, side = places[found]
+        _, at, side, upright = places[found]
         if vertical:
             self._write(
                 text, (side, 0.0), (value, at / (top - bottom)), self._axes.get_xaxis_transform(),
-                self._held(value, None), rotation=90, va="bottom",
+                self._held(value, None), rotation=90 * upright, va="bottom",
                 ha="left" if side > 0 else "right",
             )  # fmt: skip
         else:

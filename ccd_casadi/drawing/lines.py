@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
-from ccd_casadi.drawing.labels import APART, Labels, in_points, inside, scales_of
+from ccd_casadi.drawing.labels import APART, Labels, in_points, inside, legend_height, scales_of
 from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
 from ccd_casadi.drawing.turntable import modes_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LEAST_POINTS = 8  # of a curve that values are read off
 LEAST_SPAN = 1e-4  # of a value: an axis of less shows digits that nobody reads
@@ -55,11 +56,17 @@ def _placed(what: Place, width: float, height: float, key: str, title: str) -> s
 
 
 def _picture(panel: Panel, width: float, height: float, key: str, title: str) -> str:
+    figure, axes = drawn_axes(panel, width, height)
+    title = f"{title}: {panel.title or panel.y_label}"
+    return to_svg(figure, key, title, _for_cursor(axes, panel, height), 100.0)
+
+
+def drawn_axes(panel: Panel, width: float, height: float) -> tuple["Figure", "Axes"]:
+    """A panel in a figure of its own, size in inches."""
     figure = new_figure(height, width)
     axes = place(figure, LEFT, BOTTOM, width - LEFT - RIGHT, height - BOTTOM - TOP)
-    title = f"{title}: {panel.title or panel.y_label}"
     _draw(axes, panel)
-    return to_svg(figure, key, title, _for_cursor(axes, panel, height), 100.0)
+    return figure, axes
 
 
 def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
@@ -120,12 +127,24 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         line(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)), gid=f"level{i}")
     labels = _labels(axes, panel)
     if panel.legend is not None and (names := axes.get_legend_handles_labels()[1]):
-        where = labels.corner(names)
+        where, covered = labels.corner(names)
+        if covered and panel.y_range is None:  # a strip above the curves is the legend's
+            _raised(axes, legend_height(names), panel.log_y)
+            labels = _labels(axes, panel)
+            where, _ = labels.corner(names)
         axes.legend(loc=cast(Any, where), borderaxespad=0.2)
     for mark in panel.marks:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
+
+
+def _raised(axes: "Axes", strip: float, log: bool) -> None:
+    """Moves the top of the axes up by a strip, in pt of their height."""
+    _, bottom, _, top = inside(axes)
+    low, high = np.log(axes.get_ylim()) if log else np.array(axes.get_ylim())
+    high = low + (high - low) / (1.0 - min(strip / (top - bottom), 0.5))
+    axes.set_ylim(*(np.exp([low, high]) if log else (low, high)))
 
 
 def _labels(axes: "Axes", panel: Panel) -> Labels:
