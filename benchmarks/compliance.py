@@ -24,9 +24,9 @@ from scipy.linalg import solve_continuous_lyapunov
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.inner_problem.sections_search import least_value_at, prepared
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_search import least_value_at, prepared
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -66,7 +66,7 @@ def figures(problem: CoDesignProblem, theta: tuple[float, ...], K: StateSpace) -
     plain = scaled_plant(replace(problem, robust=None), theta)
     loop = closed_loop(plain.plant_si(), K).GS
     static = np.linalg.norm(loop.C @ np.linalg.solve(loop.A, loop.B), 2)
-    if isinstance(problem.controller, SectionsProblem):
+    if isinstance(problem.controller, StructuredProblem):
         uncertain = uncertain_plant(problem, theta)
         others = uncertain.plants(uncertain.corners())
     else:
@@ -164,7 +164,7 @@ def main() -> None:
                         continue
                     # no less bandwidth than the first kind has, or half of one's own
                     least = min(HZ * first, raced.bandwidth) if biquads else 0.5 * raced.bandwidth
-                    assert isinstance(ready.controller, SectionsProblem)
+                    assert isinstance(ready.controller, StructuredProblem)
                     ready = replace(
                         ready, controller=replace(ready.controller, bandwidth_least=least)
                     )  # fmt: skip

@@ -25,7 +25,7 @@ from kinds import kinds
 import ccd_casadi as ccd
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_problem import Uncertainty
+from ccd_casadi.inner_problem.structured_problem import Uncertainty
 from ccd_casadi.sampling.rows import problem_hash
 
 FILE = ROOT / "tests/data/golden.json"

@@ -24,9 +24,9 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem, structure_of
-from ccd_casadi.inner_problem.sections_search import prepared, with_range
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of, structured_of
+from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
 
@@ -71,7 +71,7 @@ def look(count: int) -> None:
     found = []
     for theta in product(*axes):
         if (constraint_values(plant_of(problem), theta) <= 1e-9).all():
-            value = sections_value(problem, theta)
+            value = structured_value(problem, theta)
             found.append((value.bandwidth / HZ if value.feasible else 0.0, theta))
     print(f"{len(found)} beams, {sum(width == 0.0 for width, _ in found)} without a design")
     for width, (guide, tip) in sorted(found, reverse=True)[:5]:
@@ -80,7 +80,7 @@ def look(count: int) -> None:
 
 def main(beams: list[tuple[float, float]]) -> None:
     problem = with_range(problem_of(load_case(CASE)))  # of K's roots, as the co-design has it
-    frequencies = sections_of_problem(problem).frequencies
+    frequencies = structured_of(problem).frequencies
     print(
         "guide mm  tip mm   mass kg   |  rule: w Hz    -3 dB Hz  max|S| | free PID: -3 dB  max|S|"
     )

@@ -18,9 +18,9 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_plant_set import plants_of, with_sections
-from ccd_casadi.inner_problem.sections_search import least_from, prepared
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_plant_set import plants_of, with_structured
+from ccd_casadi.inner_problem.structured_search import least_from, prepared
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.units import HZ
 
@@ -45,8 +45,8 @@ def main() -> None:
     )
     for value in values.tolist():
         theta = tuple((at | {varied: value}).values())
-        fast = sections_value(with_sections(anchored, minimise="bandwidth"), theta).design
-        least = sections_value(anchored, theta)
+        fast = structured_value(with_structured(anchored, minimise="bandwidth"), theta).design
+        least = structured_value(anchored, theta)
         motion, free = motion_of(anchored, theta), replace(anchored, suspension=FREE)
         times = [
             1e3 * exact_times(anchored, motion, plants_of(free, theta), design.controller).max()

@@ -17,6 +17,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drawing.content import (
     Block,
+    Chapter,
     Curve,
     Figure,
     Head,
@@ -25,7 +26,6 @@ from ccd_casadi.drawing.content import (
     Mark,
     Page,
     Panel,
-    Section,
     Table,
     Words,
 )
@@ -40,7 +40,7 @@ ROOT = Path(__file__).resolve().parent.parent
 THETA = (60.0, 60.0)
 
 
-def sections(problem: CoDesignProblem, published: dict[str, Any]) -> list[Section]:
+def sections(problem: CoDesignProblem, published: dict[str, Any]) -> list[Chapter]:
     """Figures 4 and 5; none where the case has no feasible design."""
     loops = {
         name: loop
@@ -50,8 +50,8 @@ def sections(problem: CoDesignProblem, published: dict[str, Any]) -> list[Sectio
     if "A" not in loops:
         return []
     return [
-        Section("The paper's figure 4: the plant, 60 kg each", _plant(loops["A"], published)),
-        Section("The paper's figure 5: cases A and B", _cases(loops, published)),
+        Chapter("The paper's figure 4: the plant, 60 kg each", _plant(loops["A"], published)),
+        Chapter("The paper's figure 5: cases A and B", _cases(loops, published)),
     ]
 
 

@@ -25,10 +25,10 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import SLACK_OF_MANY, prove
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
-    sections_of_problem,
     structure_of,
+    structured_of,
     uncertain_plant,
 )
 from ccd_casadi.plants.modal import modal_plant
@@ -139,7 +139,7 @@ def main() -> None:
     given = parser.parse_args()
     problem = problem_of(load_case(CASE))
     whole = uncertain_plant(problem, THETA)
-    structure, sampling = structure_of(problem), sections_of_problem(problem).sampling
+    structure, sampling = structure_of(problem), structured_of(problem).sampling
     values = json.loads((built.DESIGN / "sections.json").read_text())
     kappa = np.log([values[name] for name in structure.names])
     bounds = replace(bounds_of(problem), shape=None)

@@ -34,15 +34,15 @@ from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
 from ccd_casadi.fixed_structure.design import synthesise_sections
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     moved,
-    sections_of_problem,
     structure_of,
+    structured_of,
     with_options,
 )
-from ccd_casadi.inner_problem.sections_robustness import worst_members
-from ccd_casadi.inner_problem.sections_search import ROUNDS, prepared, with_range
+from ccd_casadi.inner_problem.structured_robustness import worst_members
+from ccd_casadi.inner_problem.structured_search import ROUNDS, prepared, with_range
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.studies.sequential import first_resonance
@@ -66,7 +66,7 @@ STAGES = {
 
 def plants_at(problem: CoDesignProblem, theta: tuple[float, ...]) -> list[ScaledPlant]:
     """Model and payload, all modes low and high, least damping."""
-    u = sections_of_problem(problem).uncertainty
+    u = structured_of(problem).uncertainty
     loaded = with_options(problem, u.options[PAYLOAD])
     systems = tuple(mechanics(plant_of(p), theta, derivatives=False) for p in (problem, loaded))
     box = UncertainPlant(systems, problem.suspension, problem.weights.M_K, u.resonance_shift,
@@ -91,7 +91,7 @@ def climbs(
     race: bool,
 ) -> Climb:
     """The largest bandwidth of every channel with parameters of its own."""
-    whole, sections = structure_of(problem), sections_of_problem(problem)
+    whole, sections = structure_of(problem), structured_of(problem)
     assert isinstance(whole, ChannelStructure)
     found, stacked = {}, kappa.copy()
     for i in whole.free:
@@ -120,7 +120,7 @@ def on_the_whole_set(
 
     `worst_excess`: by how much a last search of the box, with another seed, passed a bound.
     """
-    sections = replace(sections_of_problem(problem), anchors=(tuple(map(float, kappa)),))
+    sections = replace(structured_of(problem), anchors=(tuple(map(float, kappa)),))
     asked = replace(problem, controller=sections, start=theta)
     asked, made = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
     if not made.certified or made.certificate is None:

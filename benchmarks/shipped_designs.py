@@ -25,7 +25,7 @@ from ccd_casadi import inner
 from ccd_casadi.analysis.loop_figures import light_roots
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop, constant_drive
 from ccd_casadi.lti.state_space import StateSpace

@@ -42,14 +42,14 @@ def problems():
     from ccd_casadi.fixed_structure.channel_design import synthesise
     from ccd_casadi.fixed_structure.design import problem_for
     from ccd_casadi.fixed_structure.sections_design import in_problem_units
-    from ccd_casadi.inner_problem.sections_plant_set import (
+    from ccd_casadi.inner_problem.structured_plant_set import (
         bounds_of,
         plants_of,
-        sections_of_problem,
         structure_of,
+        structured_of,
         with_options,
     )
-    from ccd_casadi.inner_problem.sections_search import with_range
+    from ccd_casadi.inner_problem.structured_search import with_range
 
     shifts = (-0.03, -0.015, 0.0, 0.015, 0.03)
     found, kappa = loop(0, Structure(), FAST, shifts)
@@ -65,7 +65,7 @@ def problems():
         if offsets:
             moved = [with_options(stated, (("offset", offset),)) for offset in offsets]
             plants = [plant for one in moved for plant in plants_of(one, at)]
-        sections = sections_of_problem(stated)
+        sections = structured_of(stated)
         if folder is None:
             made = synthesise(plants, structure, bounds, sampling=sections.sampling, starts=2,
                               frequencies=sections.frequencies)  # fmt: skip

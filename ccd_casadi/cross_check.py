@@ -25,7 +25,7 @@ def _problem(
     """Problem, θ and (ω_S, ω_T) in rad/s of a case file with --theta, or of a finished run."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
-    from ccd_casadi.cases.run_folder import read_run, refuse_sections
+    from ccd_casadi.cases.run_folder import read_run, refuse_structured
     from ccd_casadi.inner_problem.problem import true_inner
 
     point = break_frequencies(options)
@@ -34,7 +34,7 @@ def _problem(
         if options.theta is not None:
             raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
         point = point or (done.weights.omega_S, done.weights.omega_T)
-        refuse_sections(done, "cross_check", "result.json holds the judge's own figures")
+        refuse_structured(done, "cross_check", "result.json holds the judge's own figures")
         problem, theta = done.problem, done.theta
     else:
         case = load_case(options.case)

@@ -22,9 +22,9 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.measured_case import measured_case
-    from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, sections_answer
+    from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, structured_answer
     from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
-    from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+    from ccd_casadi.inner_problem.structured_problem import StructuredProblem
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.process_pool import Workers
 
@@ -39,10 +39,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     problem = problem_of(case)
     theta = parse_theta(case, options.theta)
     point = break_frequencies(options)
-    answer = {MixedSensitivityProblem: mixed_answer, SectionsProblem: sections_answer}
+    answer = {MixedSensitivityProblem: mixed_answer, StructuredProblem: structured_answer}
     with Workers(options.workers) as workers:
-        if isinstance(problem.controller, SectionsProblem):
-            workers.begin(sections_answer.__module__)
+        if isinstance(problem.controller, StructuredProblem):
+            workers.begin(structured_answer.__module__)
         how = InnerOptions(options.seed, workers, _progress(options), point, options.begin_at)
         try:
             found = answer[type(problem.controller)](problem, theta, how)

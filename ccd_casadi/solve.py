@@ -13,7 +13,7 @@ from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import counted, shown
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
-    from ccd_casadi.cases.sections import Case
+    from ccd_casadi.cases.tables import Case
     from ccd_casadi.codesign.verified import Solution
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 

@@ -4,8 +4,6 @@ Source: Rasmussen & Williams (2006), eq. 5.8 and 5.9; the gradients enter as
 further observations of the same process (section 9.4).
 """
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
 from scipy.linalg.lapack import dpotri
@@ -29,7 +27,6 @@ from surrogates.interface import Array, SurrogateFitError
 LENGTH_BOUNDS = (1e-2, 1e3)
 SIGNAL_BOUNDS = (1e-3, 1e6)
 NOISE_BOUNDS = (1e-12, 1e0)
-SINGULAR = -1e10  # a likelihood where K is: a wall, flat, so that the line search backs off
 JITTERS = (0.0, *(10.0**k for k in range(-15, -5)))
 
 
@@ -118,35 +115,3 @@ def symmetric_inverse(L: Array) -> Array:
     inverse, _ = dpotri(L, lower=1)
     lower = np.tril(inverse)
     return lower + np.tril(inverse, -1).T
-
-
-def maximised(
-    likelihood: Callable[[Array], tuple[float, Array]],
-    starts: Sequence[Array],
-    bounds: Sequence[tuple[float, float]],
-    iterations: int = 15_000,
-) -> tuple[float, Array]:
-    """Return the largest log likelihood and its positive parameters (k,), by L-BFGS-B.
-
-    `likelihood` gives it at parameters, with its slope (k,) in their logarithms, or raises
-    LinAlgError; it is SINGULAR where it does so everywhere. `starts` are clipped to the bounds.
-    """
-    from scipy.optimize import minimize  # slow to import, and only fitting needs it
-
-    def negative(theta: Array) -> tuple[float, Array]:
-        try:
-            value, slope = likelihood(np.exp(theta))
-        except LinAlgError:
-            return -SINGULAR, np.zeros_like(theta)
-        return -value, -slope
-
-    limits = np.log(bounds)
-    ends = [
-        minimize(
-            negative, np.clip(np.log(start), *limits.T), jac=True, bounds=limits,
-            method="L-BFGS-B", options={"maxiter": iterations},
-        )
-        for start in starts
-    ]  # fmt: skip
-    best = min(ends, key=lambda end: float(end.fun))
-    return -float(best.fun), np.exp(best.x)

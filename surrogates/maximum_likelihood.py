@@ -3,17 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import LinAlgError
 
 from surrogates.covariance import Hyperparameters, Kernel
 from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
 from surrogates.interface import Array, SurrogateFitError
-from surrogates.likelihood import (
-    LENGTH_BOUNDS,
-    NOISE_BOUNDS,
-    SIGNAL_BOUNDS,
-    log_likelihood,
-    maximised,
-)
+from surrogates.likelihood import LENGTH_BOUNDS, NOISE_BOUNDS, SIGNAL_BOUNDS, log_likelihood
 from surrogates.samples import Samples
 
 # The likelihood costs O(N³) a look. Several starts are tried on at most START_ORDER
@@ -23,6 +18,7 @@ START_ORDER = 200
 POLISH_ORDER = 600
 # Relative jitter during the search, so that no trial point is lost to rounding.
 SEARCH_JITTER = 1e-15
+SINGULAR = 1e10  # -log p where K is: a wall, flat, so that the line search backs off
 # Observations that an exact process holds: 200 MB and some ten seconds to factorise.
 EXACT_LIMIT = 5000
 
@@ -52,6 +48,8 @@ def fit_process(
 
 def estimate(samples: Samples, kernel: Kernel, seed: int = 0, starts: int = 5) -> Hyperparameters:
     """Return the hyperparameters of `fit_process`, of at most 600 of the observations."""
+    from scipy.optimize import minimize  # slow to import, and only fitting needs it
+
     own = uneven_noise(samples)
     fixed: list[float | None] = [None, 0.0 if samples.dY is None else None]
     if samples.noise is not None:
@@ -60,21 +58,34 @@ def estimate(samples: Samples, kernel: Kernel, seed: int = 0, starts: int = 5) -
     n, d = X.shape
     bounds = [LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS]
     bounds += [NOISE_BOUNDS if noise is None else (max(noise, 1e-300),) * 2 for noise in fixed]
+    limits = np.log(bounds)
     order = rng.permutation(n)
     by_component = samples.targets.reshape(-1, n)
 
     def search(starts: list[Array], limit: int, iterations: int) -> Array:
+        """Their best end by L-BFGS-B over the logarithms, on `limit` observations."""
         rows = order[: max(limit // len(by_component), 2)]
         observed = by_component[:, rows].ravel()
         own_here = own[rows] if own.size else own
-        return maximised(
-            lambda natural: log_likelihood(
-                kernel, X[rows], observed, _parameters(natural), SEARCH_JITTER, own_here
-            ),
-            starts,
-            bounds,
-            iterations,
-        )[1]
+
+        def negative(logarithms: Array) -> tuple[float, Array]:
+            parameters = _parameters(np.exp(logarithms))
+            try:
+                value, slope = log_likelihood(
+                    kernel, X[rows], observed, parameters, SEARCH_JITTER, own_here
+                )
+            except LinAlgError:
+                return SINGULAR, np.zeros_like(logarithms)
+            return -value, -slope
+
+        ends = [
+            minimize(
+                negative, np.clip(np.log(start), *limits.T), jac=True, bounds=limits,
+                method="L-BFGS-B", options={"maxiter": iterations},
+            )
+            for start in starts
+        ]  # fmt: skip
+        return np.asarray(np.exp(min(ends, key=lambda end: float(end.fun)).x))
 
     # The second start is a nearly linear function of many inputs, the others are drawn.
     first = np.array([0.5] * d + [1.0, 1e-6, 1e-6])

@@ -13,7 +13,6 @@ import numpy as np
 from surrogates.extrapolation import extrapolation
 from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, loo_errors
 from surrogates.interface import Array, Errors, errors
-from surrogates.samples import Samples
 
 # Q² of left-out samples above which the surrogate follows them, and below which it does poorly.
 FOLLOWED = 0.995
@@ -54,10 +53,8 @@ class Quality:
         Errors left out one by one; share inside nominal 95 % bands.
     extrapolates : tuple of str
         What is amiss at the point of interest; nothing where samples support it.
-    at_point : (float, float) or None
-        Where that point is a sample, the error there without it, in `unit` and in deviations.
     around : tuple of Missed
-        The same of every sample around that point, itself included.
+        Error, in `unit` and in deviations, of every sample around that point, itself included.
 
     .. [1] Rasmussen & Williams (2006), 5.4.2.
     """
@@ -70,8 +67,12 @@ class Quality:
     loo: Errors
     coverage: float
     extrapolates: tuple[str, ...]
-    at_point: tuple[float, float] | None = None
     around: tuple[Missed, ...] = ()
+
+    @property
+    def at_point(self) -> tuple[float, float] | None:
+        """Where that point is a sample, the error there without it, in `unit` and in deviations."""
+        return next(((m.error, m.sigmas) for m in self.around if m.at_point), None)
 
     @property
     def missed(self) -> Missed | None:
@@ -157,41 +158,28 @@ def quality_of(
     ValueError
         The point does not have the process's inputs.
     """
-    samples, residuals, deviations = _left_out(process)
+    residuals, deviations = _left_out(process)
     standardised = residuals / (process.band * deviations)
-    predicted = samples.Y - residuals
-    unit_x = (np.asarray(x, float) - process.lower) / (process.upper - process.lower)
-    away = np.abs(process.X - unit_x).max(axis=1)
+    X = process.lower + process.X * (process.upper - process.lower)
+    true = process.output_mean + process.output_scale * process.targets[: len(X)]
+    predicted = true - residuals
+    away = np.abs(process.X - process.in_unit_box(x)).max(axis=1)
     around = tuple(
         Missed(float(factor * residuals[i]), float(abs(standardised[i])), bool(away[i] <= SAME))
         for i in np.flatnonzero(away <= NEAR)
     )
-    at_point = next(((m.error, m.sigmas) for m in around if m.at_point), None)
     return Quality(
         name=name,
         unit=unit,
-        true=np.exp(samples.Y) if logarithm else factor * samples.Y,
+        true=np.exp(true) if logarithm else factor * true,
         predicted=np.exp(predicted) if logarithm else factor * predicted,
         standardised=standardised,
-        loo=errors(factor * residuals, factor * samples.Y),
+        loo=errors(factor * residuals, factor * true),
         coverage=float(np.mean(np.abs(standardised) <= TWO_SIDED_95)),
-        extrapolates=extrapolation(process, samples.X, x).reasons,
-        at_point=at_point,
+        extrapolates=extrapolation(process, X, x).reasons,
         around=around,
     )
 
 
-@lru_cache(maxsize=8)  # a process is judged before it is relied on, and again in the report
-def _left_out(process: GaussianProcess) -> tuple[Samples, Array, Array]:
-    """The samples, residuals and deviations one by one: nothing of x."""
-    return (_samples(process), *loo_errors(process))
-
-
-def _samples(process: GaussianProcess) -> Samples:
-    """The samples that a process holds, in input and output units."""
-    n, d = process.X.shape
-    width = process.upper - process.lower
-    targets = process.output_scale * process.targets.reshape(-1, n)
-    slopes = None if len(targets) == 1 else targets[1 : 1 + d].T / width
-    X = process.lower + process.X * width
-    return Samples(process.lower, process.upper, X, process.output_mean + targets[0], slopes)
+# A process is judged before it is relied on, and again in the report.
+_left_out = lru_cache(maxsize=8)(loo_errors)

@@ -96,9 +96,6 @@ def checked(
     points, values = np.array(X, dtype=float), np.array(Y, dtype=float)
     if points.ndim != 2 or len(points) < 2:
         raise SurrogateFitError(f"expected X (n >= 2, d), got {points.shape}")
-    low, high = _bounds(points, lower, upper)
-    if points.shape[1] != low.size:
-        raise SurrogateFitError(f"expected X (n >= 2, {low.size}), got {points.shape}")
     if values.shape != (len(points),):
         more = "; fit_outputs takes several outputs" if values.ndim == 2 else ""
         raise SurrogateFitError(f"expected Y ({len(points)},), got {values.shape}{more}")
@@ -117,13 +114,14 @@ def checked(
             raise SurrogateFitError("noise must not be negative")
     if not all(np.isfinite(a).all() for a in (points, values, slopes, deviations) if a is not None):
         raise SurrogateFitError("samples must be finite; drop the failed evaluations first")
+    low, high = _bounds(points, lower, upper)
+    if points.shape[1] != low.size:
+        raise SurrogateFitError(f"expected X (n >= 2, {low.size}), got {points.shape}")
     return Samples(low, high, points, values, slopes, deviations)
 
 
 def _bounds(points: Array, lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[Array, Array]:
     if lower is None or upper is None:
-        if not np.isfinite(points).all():
-            raise SurrogateFitError("samples must be finite; drop the failed evaluations first")
         still = np.flatnonzero(np.ptp(points, axis=0) == 0.0)
         if still.size:
             raise SurrogateFitError(

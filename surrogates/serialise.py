@@ -11,8 +11,7 @@ import json
 import os
 import typing
 from collections.abc import Sequence
-from dataclasses import MISSING, fields, is_dataclass
-from enum import Enum
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,15 +51,9 @@ def save(
         `extra` is not JSON; a number is not finite.
     """
     members = list(surrogates) if isinstance(surrogates, Sequence) else [surrogates]
-    text = json.dumps(
-        {
-            "schema": SCHEMA,
-            "surrogates": [{"kind": KIND, **_fields(member)} for member in members],
-            "extra": extra or {},
-        },
-        allow_nan=False,
-    )
-    write_whole(Path(path), text)
+    records = [{"kind": KIND, **asdict(member)} for member in members]
+    document = {"schema": SCHEMA, "surrogates": records, "extra": extra or {}}
+    write_whole(Path(path), json.dumps(document, default=np.ndarray.tolist, allow_nan=False))
 
 
 def load(path: str | os.PathLike[str]) -> tuple[tuple[GaussianProcess, ...], dict[str, Any]]:
@@ -97,18 +90,6 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[GaussianProcess, ...], dic
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise SurrogateFileError(f"{path}: damaged record ({error!r:.300})") from error
     return tuple(members), extra
-
-
-def _fields(value: Any) -> dict[str, Any]:
-    return {f.name: _encode(getattr(value, f.name)) for f in fields(value)}
-
-
-def _encode(value: Any) -> Any:
-    if is_dataclass(value):
-        return _fields(value)
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return value.value if isinstance(value, Enum) else value
 
 
 def _member(record: Any) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
 from ccd_casadi.cases.checks import NOT_NEGATIVE, POSITIVE, Check, rows, shown, text
-from ccd_casadi.cases.sections import BudgetSection
+from ccd_casadi.cases.tables import BudgetTable
 
 Fail = Callable[[str, str], Exception]
 # Unit -> factor of a density to SI, and whether the number is its square root.
@@ -58,29 +58,29 @@ TABLE_CHECKS: dict[str, Check] = {
 }
 
 
-def checked_budget(section: BudgetSection, folder: Path, fail: Fail) -> BudgetSection:
-    """The section with every table checked and the files of spectra read into `psd`."""
+def checked_budget(table: BudgetTable, folder: Path, fail: Fail) -> BudgetTable:
+    """The table with every entry checked and the files of spectra read into `psd`."""
     found: dict[str, tuple[Mapping[str, Any], ...]] = {}
     for kind in Kind:
-        given = getattr(section, kind.value)
+        given = getattr(table, kind.value)
         several = given if isinstance(given, list | tuple) else (given,)
         entries = []
         for i, entry in enumerate(several, 1):
             place = f"budget.{kind.value}" + (f" {i}" if len(several) > 1 else "")
             entries.append(_checked(entry, kind, place, folder, fail))
         found[kind.value] = tuple(entries)
-    if section.window_ms is not None and not any(found.values()):
+    if table.window_ms is not None and not any(found.values()):
         words = "has no spectrum to go with; add [budget.force] or another"
         raise fail("budget.window_ms", words)
-    return replace(section, **found)  # type: ignore[arg-type]
+    return replace(table, **found)  # type: ignore[arg-type]
 
 
-def error_budget(section: BudgetSection) -> ErrorBudget | None:
+def error_budget(table: BudgetTable) -> ErrorBudget | None:
     """The sources in SI; None for a case without any."""
-    sources = tuple(_source(entry, kind) for kind in Kind for entry in getattr(section, kind.value))
+    sources = tuple(_source(entry, kind) for kind in Kind for entry in getattr(table, kind.value))
     if not sources:
         return None
-    return ErrorBudget(sources, None if section.window_ms is None else 1e-3 * section.window_ms)
+    return ErrorBudget(sources, None if table.window_ms is None else 1e-3 * table.window_ms)
 
 
 def _checked(

@@ -11,12 +11,12 @@ from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget
 from ccd_casadi.cases.checks import closest, shown
-from ccd_casadi.cases.controller_sections import ChannelSection
+from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.kinds import check_kind, read_options
 from ccd_casadi.cases.motion import check_motion
 from ccd_casadi.cases.places import checked_places, place_names
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
-from ccd_casadi.cases.sections import SECTIONS, Case
+from ccd_casadi.cases.tables import TABLES, Case
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import one_line
 
@@ -38,7 +38,7 @@ _ORDERED_WEIGHTS = (
 _OF_THE_WHOLE = {
     ("inner", "S_max"),
     ("controller", "weighted_level"),
-    *(("weights", item.name) for item in fields(SECTIONS["weights"])),
+    *(("weights", item.name) for item in fields(TABLES["weights"])),
 }
 _PER_CHANNEL = (
     "give a number, the whole loop's: S_max, M_K and bandwidth_ratio of a channel go in a table "
@@ -133,54 +133,54 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     def fail(key: str, words: str) -> CaseError:
         return CaseError(one_line(f"{path}: {key}: {words}"))
 
-    known = ("plant", "theta", *SECTIONS)
+    known = ("plant", "theta", *TABLES)
     for name, table in data.items():
         if name not in known:
-            raise fail(name, f"unknown section{closest(name, known)}")
+            raise fail(name, f"unknown table{closest(name, known)}")
         if not isinstance(table, Mapping):
             raise fail(name, f"is {shown(table)}; write a table [{name}]")
     for name in ("plant", "theta"):
         if name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
-    sections = {}
-    for name, kind in SECTIONS.items():
+    tables = {}
+    for name, kind in TABLES.items():
         required = any(item.default is MISSING for item in fields(kind))
         if required and name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
-        sections[name] = section_of(kind, name, data.get(name, {}), fail)
-    controller = sections["controller"]
+        tables[name] = table_of(kind, name, data.get(name, {}), fail)
+    controller = tables["controller"]
     if controller.channel:
         own = data["controller"]["channel"]
         channel = tuple(
-            (key, section_of(ChannelSection, f"controller.channel.{key}", own[key], fail))
+            (key, table_of(ChannelTable, f"controller.channel.{key}", own[key], fail))
             for key in own
         )
-        sections["controller"] = replace(controller, channel=channel)
+        tables["controller"] = replace(controller, channel=channel)
     for low, high, why in _ORDERED_WEIGHTS:
-        below, above = getattr(sections["weights"], low), getattr(sections["weights"], high)
+        below, above = getattr(tables["weights"], low), getattr(tables["weights"], high)
         if not below < above:
             words = f"is {above:g}, not above {low} = {below:g}; give {high} > {low}, so that {why}"
             raise fail(f"weights.{high}", words)
-    check_kind(sections, fail)
-    sections["budget"] = checked_budget(sections["budget"], path.parent, fail)
-    sections["places"] = checked_places(sections["places"], path.parent, fail)
+    check_kind(tables, fail)
+    tables["budget"] = checked_budget(tables["budget"], path.parent, fail)
+    tables["places"] = checked_places(tables["places"], path.parent, fail)
     plant = plant_table(data["plant"], path, fail)
-    files = sections["robust"].plants
+    files = tables["robust"].plants
     absolute = tuple(str((path.parent / file).resolve()) for file in files)
     for file, place in zip(files, absolute, strict=True):
         plant_table(dict(data["plant"]) | options_in(file, place, fail), path, fail)
-    sections["robust"] = replace(sections["robust"], plants=absolute)
-    of_case = (*place_names(sections["places"]), *filter(None, [sections["motor"].size]))
+    tables["robust"] = replace(tables["robust"], plants=absolute)
+    of_case = (*place_names(tables["places"]), *filter(None, [tables["motor"].size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":
             words = 'needs controller.structure = "sections"; choose that, or drop it'
             raise fail(f"theta.{parameter.name}.varies", words)
-    check_motion(sections, {p.name: (p.lower, p.upper) for p in (*theta, *fixed)}, fail)
-    return Case(path=path, plant=plant, theta=theta, fixed=fixed, **sections)
+    check_motion(tables, {p.name: (p.lower, p.upper) for p in (*theta, *fixed)}, fail)
+    return Case(path=path, plant=plant, theta=theta, fixed=fixed, **tables)
 
 
-def section_of(
+def table_of(
     kind: type, name: str, table: Mapping[str, Any], fail: Callable[[str, str], CaseError]
 ) -> Any:
     """A table as its dataclass, every key checked."""

@@ -6,15 +6,15 @@ from ccd_casadi.cases.budget import error_budget
 from ccd_casadi.cases.case import CaseError, options_in
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
-from ccd_casadi.cases.kinds import disturbance_of, sections_problem, weights_of
+from ccd_casadi.cases.kinds import disturbance_of, structured_problem, weights_of
 from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
-from ccd_casadi.cases.sections import Case, RobustSection
+from ccd_casadi.cases.tables import Case, RobustTable
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
 from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import with_options
+from ccd_casadi.inner_problem.structured_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import data_option, model_named
@@ -84,13 +84,13 @@ def problem_of(case: Case) -> CoDesignProblem:
             omega_T=(HZ * inner.omega_T_hz[0], HZ * inner.omega_T_hz[1]),
             gamma_backoff=inner.gamma_backoff,
             sweep_points=inner.sweep_points,
-            # sections bound it themselves, on every plant of theirs
+            # a fixed structure bounds it on every plant of its set
             compliance_max=None if structured else inner.compliance_max,
         ),
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
         robust=None if structured else _robust(case.robust),
-        controller=sections_problem(
+        controller=structured_problem(
             case.controller,
             case.loop,
             case.robust,
@@ -139,14 +139,14 @@ def _option_sets(case: Case) -> tuple[tuple[tuple[str, object], ...], ...]:
     return tuple(found)
 
 
-def _robust(section: RobustSection) -> RobustSet | None:
+def _robust(table: RobustTable) -> RobustSet | None:
     """The set of plants that [robust] names; None where it names no other than the model."""
-    shift = section.resonance_shift
-    if shift == 0.0 and not section.damping:
+    shift = table.resonance_shift
+    if shift == 0.0 and not table.damping:
         return None
     ends = {"auto": None if shift else 0.0, "low": -shift, "nominal": 0.0, "high": shift}
-    design = ends[section.design_at]
-    return RobustSet(shift, section.shifts if shift else 1, section.damping, design)
+    design = ends[table.design_at]
+    return RobustSet(shift, table.shifts if shift else 1, table.damping, design)
 
 
 def _frozen(value: Any) -> Any:

@@ -216,7 +216,7 @@ def closest(name: str, known: Collection[str]) -> str:
 
 
 def key(check: Check, default: Any = MISSING, *, says: str, unit: str = "") -> Any:
-    """The field of a section's dataclass that a key is."""
+    """The field of a table's dataclass that a key is."""
     metadata = {"check": check, "says": says, "unit": unit}
     if default is MISSING:
         return field(metadata=metadata)

@@ -1,4 +1,4 @@
-"""Kinds of inner problem in a case file: which keys go with which, and the sections' problem."""
+"""Kinds of inner problem in a case file: which keys go with which, and the structured problem."""
 
 import tomllib
 from collections.abc import Callable, Mapping
@@ -7,21 +7,25 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.budget import Kind
-from ccd_casadi.cases.controller_sections import ChannelSection, ControllerSection, LoopSection
-from ccd_casadi.cases.sections import Case, InnerSection, RobustSection, WeightsSection
+from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable, LoopTable
+from ccd_casadi.cases.tables import Case, InnerTable, RobustTable, WeightsTable
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR
-from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem, Uncertainty
+from ccd_casadi.inner_problem.structured_problem import (
+    ChannelProblem,
+    StructuredProblem,
+    Uncertainty,
+)
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.weights import Weights
 
-SHAPE = 1.1  # of sections, where the case gives none
+SHAPE = 1.1  # of a fixed structure, where the case gives none
 DISTURBANCE = 10.0  # W_d over M_K, where the case gives none
 MOST_PLANTS = 24  # option sets
 WITH_DISTURBANCE = "h_infinity_disturbance"
-# Keys that only one kind looks at, by section.
-_OF_SECTIONS = {
-    "controller": tuple(f.name for f in fields(ControllerSection) if f.name != "structure"),
+# Keys that only one kind reads, by table.
+_OF_STRUCTURED = {
+    "controller": tuple(f.name for f in fields(ControllerTable) if f.name != "structure"),
     "loop": ("rate_hz", "delay_us"),
     "robust": ("mode_shift", "gain", "plants"),
     "inner": ("shape", "shape_ends", "minimise", "bandwidth_least_hz"),
@@ -34,20 +38,20 @@ _OF_H_INFINITY = {
 }
 
 
-def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception]) -> None:
+def check_kind(tables: Mapping[str, Any], fail: Callable[[str, str], Exception]) -> None:
     """Raise where a key is given that has no effect on the chosen kind of inner problem."""
-    controller, loop = sections["controller"], sections["loop"]
+    controller, loop = tables["controller"], tables["loop"]
     structured = controller.structure == "sections"
     other, remedy = (
         (_OF_H_INFINITY, 'has no effect on controller.structure = "sections"; drop it')
         if structured
-        else (_OF_SECTIONS, 'has an effect with controller.structure = "sections" only; drop it, '
+        else (_OF_STRUCTURED, 'has an effect with controller.structure = "sections" only; drop it, '
               "or choose that structure")
     )  # fmt: skip
-    if controller.structure != WITH_DISTURBANCE and sections["weights"].disturbance is not None:
+    if controller.structure != WITH_DISTURBANCE and tables["weights"].disturbance is not None:
         words = f'has an effect with controller.structure = "{WITH_DISTURBANCE}" only; drop it, '
         raise fail("weights.disturbance", words + "or choose that structure")
-    w2, v = sections["objective"].w2, FIGURES[sections["inner"].minimise]
+    w2, v = tables["objective"].w2, FIGURES[tables["inner"].minimise]
     of_error = v is not BANDWIDTH
     if w2 == 0.0 or (w2 > 0.0 and not (structured and of_error)):
         remedy_of_w2 = "give a negative number: J must reward bandwidth"
@@ -55,13 +59,13 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
             remedy_of_w2 = f"give a positive number: J counts the {v.words} in {v.si_unit}"
         raise fail("objective.w2", f"is {w2!r}; {remedy_of_w2}")
     for name, keys in other.items():
-        table = sections[name]
+        table = tables[name]
         for item in fields(table):
             if item.name in keys and getattr(table, item.name) != item.default:
                 raise fail(f"{name}.{item.name}", remedy)
     if not structured:
         return
-    inner, budget = sections["inner"], sections["budget"]
+    inner, budget = tables["inner"], tables["budget"]
     if v is RMS_ERROR and not any(getattr(budget, kind.value) for kind in Kind):
         words = 'is "rms_error", and no spectrum says what moves the stage; add [budget.force]'
         raise fail("inner.minimise", f"{words} or another")
@@ -90,10 +94,10 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
                 words = f"is {own.like!r}; name a channel with a table and parameters of its own"
                 raise fail(f"controller.channel.{name}.like", words)
             for key in (*(item.name for item in fields(Structure)), *_OF_CHANNELS):
-                if getattr(own, key) != getattr(ChannelSection, key, None):
+                if getattr(own, key) != getattr(ChannelTable, key, None):
                     raise fail(f"controller.channel.{name}.{key}", "is given by like; drop it")
         for key, where in (("S_max", "inner"), ("M_K", "weights")):
-            asked, whole = getattr(own, key), getattr(sections[where], key)
+            asked, whole = getattr(own, key), getattr(tables[where], key)
             if asked is not None and asked > whole:
                 words = f"is {asked:g}, above {where}.{key} = {whole:g}, which the whole loop keeps"
                 remedy = f"give less, or raise {where}.{key} to that of the loosest channel"
@@ -101,13 +105,13 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
         if own.M_K is not None and controller.weighted_level is None:
             words = "has an effect on a bounded KS only; give controller.weighted_level, or drop it"
             raise fail(f"controller.channel.{name}.M_K", words)
-    if len(sections["robust"].plants) > MOST_PLANTS:
+    if len(tables["robust"].plants) > MOST_PLANTS:
         raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
 
 
 def with_structure(case: Case, structure: str) -> Case:
     """The case with another kind of controller; keys without effect on it as if not given."""
-    other = _OF_H_INFINITY if structure == "sections" else _OF_SECTIONS
+    other = _OF_H_INFINITY if structure == "sections" else _OF_STRUCTURED
     tables: dict[str, Any] = {"controller": replace(case.controller, structure=structure)}
     for name, keys in other.items():
         table = tables.get(name, getattr(case, name))
@@ -118,19 +122,19 @@ def with_structure(case: Case, structure: str) -> Case:
     return replace(case, **tables)
 
 
-def disturbance_of(controller: ControllerSection, weights: WeightsSection) -> float:
+def disturbance_of(controller: ControllerTable, weights: WeightsTable) -> float:
     """W_d in force over displacement; 0 where the kind has none."""
     if controller.structure != WITH_DISTURBANCE:
         return 0.0
     return DISTURBANCE * weights.M_K if weights.disturbance is None else weights.disturbance
 
 
-def structure_of(controller: ControllerSection) -> Structure:
-    """The sections that [controller] names."""
+def structure_of(controller: ControllerTable) -> Structure:
+    """The structure that [controller] names."""
     return Structure(**{item.name: getattr(controller, item.name) for item in fields(Structure)})
 
 
-def weights_of(weights: WeightsSection, inner: InnerSection, disturbance: float) -> Weights:
+def weights_of(weights: WeightsTable, inner: InnerTable, disturbance: float) -> Weights:
     """The weights, in SI, with ω_S and ω_T at the lower ends of their ranges."""
     w = weights
     return Weights(
@@ -163,16 +167,16 @@ def read_options(path: Path) -> dict[str, Any]:
     return found
 
 
-def sections_problem(
-    controller: ControllerSection,
-    loop: LoopSection,
-    robust: RobustSection,
-    inner: InnerSection,
+def structured_problem(
+    controller: ControllerTable,
+    loop: LoopTable,
+    robust: RobustTable,
+    inner: InnerTable,
     options: tuple[tuple[tuple[str, object], ...], ...],
     ranges: tuple[tuple[str, float, float], ...] = (),
-) -> SectionsProblem:
+) -> StructuredProblem:
     """The problem of a fixed structure."""
-    return SectionsProblem(
+    return StructuredProblem(
         structure=structure_of(controller),
         shape=SHAPE if inner.shape is None else inner.shape,
         shape_ends=ShapeEnd(inner.shape_ends),
@@ -194,7 +198,7 @@ def sections_problem(
     )
 
 
-def _channels(controller: ControllerSection) -> tuple[ChannelProblem, ...]:
+def _channels(controller: ControllerTable) -> tuple[ChannelProblem, ...]:
     """The channels that the case names, each with its structure."""
     usual, found, given = structure_of(controller), [], dict(controller.channel)
     keys = [item.name for item in fields(Structure)]

@@ -15,16 +15,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.cases.case import CaseError, read_toml, section_of
+from ccd_casadi.cases.case import CaseError, read_toml, table_of
 from ccd_casadi.cases.checks import count, shown, text
 from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
-from ccd_casadi.cases.sections import (
-    SECTIONS,
-    BudgetSection,
-    InnerSection,
-    ObjectiveSection,
-    RobustSection,
-)
+from ccd_casadi.cases.tables import TABLES, BudgetTable, InnerTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
@@ -69,16 +63,16 @@ def measured_case(path: Path) -> MeasuredCase | None:
     response = _response(plant, path, fail)
     if "inner" not in data:
         raise fail("inner", "is missing; add a table [inner]")
-    sections = {
-        name: section_of(SECTIONS[name], name, data.get(name, {}), fail)
+    tables = {
+        name: table_of(TABLES[name], name, data.get(name, {}), fail)
         for name in _TABLES
         if name != "weights" or name in data
     }
-    _check(sections, fail)
-    inner, controller, loop = (sections[name] for name in ("inner", "controller", "loop"))
+    _check(tables, fail)
+    inner, controller, loop = (tables[name] for name in ("inner", "controller", "loop"))
     weights = None
     if controller.weighted_level is not None:
-        weights = weights_of(sections["weights"], inner, 0.0)
+        weights = weights_of(tables["weights"], inner, 0.0)
     return MeasuredCase(
         path=path,
         file=str(plant["file"]),
@@ -110,27 +104,27 @@ def _response(
     return replace(found, unstable_poles=unstable, poles_at_zero=at_zero)
 
 
-def _check(sections: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -> None:
-    inner, controller, loop = (sections[name] for name in ("inner", "controller", "loop"))
+def _check(tables: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -> None:
+    inner, controller, loop = (tables[name] for name in ("inner", "controller", "loop"))
     if controller.structure != "sections":
         words = 'needs structure = "sections": a synthesis of full order has no model to start from'
         raise fail("controller.structure", words)
     if controller.channel:
         raise fail("controller.channel", "a measured response is of one channel; drop it")
-    if controller.weighted_level is not None and "weights" not in sections:
+    if controller.weighted_level is not None and "weights" not in tables:
         raise fail("weights", "is missing, and controller.weighted_level is of them; add a table")
     if inner.minimise != "bandwidth":
         raise fail("inner.minimise", "needs a model, a measured response is none; drop it")
     if loop.delay_us:
         words = "is in a response that was measured as the controller sees it; drop it"
         raise fail("loop.delay_us", words)
-    others = {"objective": ObjectiveSection(0.0, -1.0), "robust": RobustSection(),
-              "budget": BudgetSection()}  # fmt: skip
-    if "weights" in sections:
-        check_kind({**sections, **others}, fail)
+    others = {"objective": ObjectiveTable(0.0, -1.0), "robust": RobustTable(),
+              "budget": BudgetTable()}  # fmt: skip
+    if "weights" in tables:
+        check_kind({**tables, **others}, fail)
 
 
-def _bounds(inner: InnerSection, level: float | None, weights: Any) -> Bounds:
+def _bounds(inner: InnerTable, level: float | None, weights: Any) -> Bounds:
     return Bounds(
         S_max=inner.S_max,
         S_low=inner.S_low,

@@ -14,7 +14,7 @@ SHORTEST = 1e-4  # s in which jerk changes, where neither snap nor a sampling ra
 
 
 @dataclass(frozen=True)
-class MotorSection:
+class MotorTable:
     """[motor]: one motor, or a catalogue as lists in rising order of the moving mass."""
 
     force_constant: float | tuple[float, ...] | None = key(
@@ -36,7 +36,7 @@ class MotorSection:
 
 
 @dataclass(frozen=True)
-class MoveSection:
+class MoveTable:
     """[move]: a setpoint of third or fourth order, made over and over."""
 
     distance: float | None = key(POSITIVE, None, says="from rest to rest", unit="m")
@@ -51,12 +51,12 @@ class MoveSection:
 
 
 def check_motion(
-    sections: Mapping[str, Any], theta: Mapping[str, Any], fail: Callable[[str, str], Exception]
+    tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Callable[[str, str], Exception]
 ) -> None:
     """Raise where [move] and [motor] do not go together, or with the rest of the case."""
-    move, motor = sections["move"], sections["motor"]
-    given, timed = motor != MotorSection(), sections["inner"].minimise == "move_time"
-    if move == MoveSection():
+    move, motor = tables["move"], tables["motor"]
+    given, timed = motor != MotorTable(), tables["inner"].minimise == "move_time"
+    if move == MoveTable():
         if given or timed:
             words = 'is missing: [motor] and minimise = "move_time" are about one; add a table'
             raise fail("move", f"{words} [move]")
@@ -64,7 +64,7 @@ def check_motion(
     for name in ("distance", "velocity", "jerk", "settle_band"):
         if getattr(move, name) is None:
             raise fail(f"move.{name}", "is missing; add it")
-    if timed and sections["loop"].rate_hz is None:
+    if timed and tables["loop"].rate_hz is None:
         raise fail("loop.rate_hz", 'is missing: minimise = "move_time" counts samples; add it')
     if move.acceleration is None and not (motor.peak_current or motor.rms_power):
         words = "is missing, and neither peak_current nor rms_power of [motor] bounds it"
@@ -89,9 +89,9 @@ def check_motion(
         raise fail(f"theta.{motor.size}", f"{words}; narrow it")
 
 
-def motion_problem(move: MoveSection, motor: MotorSection, rate_hz: float | None) -> Motion | None:
+def motion_problem(move: MoveTable, motor: MotorTable, rate_hz: float | None) -> Motion | None:
     """The move and its motor in SI; None for a case without a move."""
-    if move == MoveSection():
+    if move == MoveTable():
         return None
     given = {item.name: getattr(move, item.name) for item in fields(move)}
     shortest = SHORTEST if rate_hz is None else 1.0 / rate_hz
@@ -100,7 +100,7 @@ def motion_problem(move: MoveSection, motor: MotorSection, rate_hz: float | None
         move.snap or given["jerk"] / shortest,
     )  # fmt: skip
     k, current = _listed(motor.force_constant), _listed(motor.peak_current)
-    made = None if motor == MotorSection() else Motor(
+    made = None if motor == MotorTable() else Motor(
         k, _listed(motor.resistance), current or (UNLIMITED,) * len(k),
         _listed(motor.moving_mass) or (0.0,), motor.rms_power, motor.size,
     )  # fmt: skip

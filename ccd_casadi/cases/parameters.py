@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ccd_casadi.cases.checks import ANY, Check, closest, flag, listed, shown, text
-from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.cases.tables import Parameter
 
 MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
 

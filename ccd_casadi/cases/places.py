@@ -6,46 +6,46 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from ccd_casadi.cases.checks import shown
-from ccd_casadi.cases.sections import PlacesSection
+from ccd_casadi.cases.tables import PlacesTable
 from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.plants.places import Places
 
 Fail = Callable[[str, str], Exception]
 
 
-def checked_places(section: PlacesSection, folder: Path, fail: Fail) -> PlacesSection:
-    """The section with its nodes as numbers, so that a run's own case needs no other file."""
-    if section == PlacesSection():
-        return section
+def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
+    """The table with its nodes as numbers, so that a run's own case needs no other file."""
+    if table == PlacesTable():
+        return table
     for name in ("nodes", "actuators"):
-        if not getattr(section, name):
+        if not getattr(table, name):
             raise fail(f"places.{name}", "is missing; add it")
-    if (section.quiet or section.damped) and not section.axes:
+    if (table.quiet or table.damped) and not table.axes:
         raise fail("places.axes", "is false, and quiet and damped modes are of axes; give true")
-    rows = section.nodes
+    rows = table.nodes
     if isinstance(rows, str):
         try:
             text = (folder / rows).read_text(encoding="utf-8-sig")
             rows = tuple(tuple(map(float, row)) for row in list(csv.reader(text.splitlines()))[1:])
         except (OSError, ValueError, csv.Error) as error:
-            words = f"{shown(section.nodes)}: {error}; name a CSV file of numbers after a header"
+            words = f"{shown(table.nodes)}: {error}; name a CSV file of numbers after a header"
             raise fail("places.nodes", words) from None
     numbers = tuple(tuple(map(float, row)) for row in rows)
     if not numbers or len({len(row) for row in numbers}) != 1 or len(numbers[0]) not in (1, 2, 3):
         raise fail("places.nodes", "are not rows of as many coordinates, 1 to 3; correct them")
-    return replace(section, nodes=numbers)
+    return replace(table, nodes=numbers)
 
 
-def place_names(section: PlacesSection) -> tuple[str, ...]:
+def place_names(table: PlacesTable) -> tuple[str, ...]:
     """The parameters that it names."""
-    return names_in((*section.actuators, *section.sensors))
+    return names_in((*table.actuators, *table.sensors))
 
 
-def places_of(section: PlacesSection) -> Places | None:
+def places_of(table: PlacesTable) -> Places | None:
     """Its places as plain values; None where the case has none."""
-    if section == PlacesSection():
+    if table == PlacesTable():
         return None
-    values = {item.name: getattr(section, item.name) for item in fields(Places)}
+    values = {item.name: getattr(table, item.name) for item in fields(Places)}
     for name in ("actuators", "sensors"):
         values[name] = tuple(map(tuple, values[name]))
     return Places(**values)

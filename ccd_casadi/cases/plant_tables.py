@@ -20,7 +20,7 @@ from ccd_casadi.cases.checks import (
     too_large,
 )
 from ccd_casadi.cases.parameters import parameters_of
-from ccd_casadi.cases.sections import Parameter, PlantSection
+from ccd_casadi.cases.tables import Parameter, PlantTable
 from ccd_casadi.plants.registry import model_named, model_names
 
 # What the models of the package take, as far as a function's signature does not say it.
@@ -47,7 +47,7 @@ _MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
 
 def plant_table(
     table: Mapping[str, Any], path: Path, fail: Callable[[str, str], Exception]
-) -> PlantSection:
+) -> PlantTable:
     """[plant], files in it as absolute paths."""
     model, function = table.get("model"), table.get("function")
     if (model is None) == (function is None):
@@ -96,7 +96,7 @@ def plant_table(
             words = f"there is no {shown(options[data])}; give its path relative to the case file"
             raise fail(f"plant.{data}", words)
         options[data] = str(place)  # absolute, as a function's file
-    return PlantSection(model, function, options)
+    return PlantTable(model, function, options)
 
 
 def _option(value: Any) -> str | None:

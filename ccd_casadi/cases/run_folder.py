@@ -15,15 +15,15 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
-from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
-from ccd_casadi.inner_problem.sections_robustness import judged_corners
-from ccd_casadi.inner_problem.sections_search import joined, with_range
+from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
+from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
+from ccd_casadi.inner_problem.structured_robustness import judged_corners
+from ccd_casadi.inner_problem.structured_search import joined, with_range
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -140,7 +140,7 @@ def _read_mixed(
     return FinishedRun(folder, case, problem, theta, plant, weights, controller, figures, result)
 
 
-def _read_sections(
+def _read_structured(
     folder: Path,
     case: Case,
     problem: CoDesignProblem,
@@ -177,7 +177,7 @@ def with_function(
 
     Raises UserError where result.json holds others.
     """
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     if "anchors" not in result:
         return problem  # of an earlier version
     try:
@@ -194,7 +194,7 @@ def with_function(
     own = len(structure_of(problem).names)
     if any(len(kappa) != own for kappa in (*anchors, *slower)):
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
-    found = replace(sections, anchors=anchors, members=members, seed=seed, error_anchors=slower)
+    found = replace(structured, anchors=anchors, members=members, seed=seed, error_anchors=slower)
     return with_range(replace(problem, controller=found))
 
 
@@ -216,14 +216,14 @@ def _with_directions(
     problem: CoDesignProblem, table: Mapping[str, Any] | None, path: Path
 ) -> CoDesignProblem:
     """The problem with the directions of channels that the controller was designed in."""
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     if not isinstance(table, Mapping) or "channels" not in table:
         return problem
-    own = {channel.name: channel for channel in sections.channels}
+    own = {channel.name: channel for channel in structured.channels}
     try:
         channels = tuple(
             replace(
-                own.get(str(item["name"]), ChannelProblem(str(item["name"]), sections.structure)),
+                own.get(str(item["name"]), ChannelProblem(str(item["name"]), structured.structure)),
                 outputs=tuple(map(float, item["outputs"])),
                 inputs=tuple(map(float, item["inputs"])),
             )
@@ -232,17 +232,17 @@ def _with_directions(
     except (KeyError, TypeError, ValueError):
         words = "sections.channels: names no directions; solve the case again"
         raise UserError(f"{path}: {words}") from None
-    return replace(problem, controller=replace(sections, channels=channels))
+    return replace(problem, controller=replace(structured, channels=channels))
 
 
 Reader = Callable[[Path, Case, CoDesignProblem, tuple[float, ...], Mapping[str, Any]], FinishedRun]
 _READERS: dict[type[ControllerProblem], Reader] = {
     MixedSensitivityProblem: _read_mixed,
-    SectionsProblem: _read_sections,
+    StructuredProblem: _read_structured,
 }
 
 
-def refuse_sections(run: FinishedRun, command: str, remedy: str) -> None:
+def refuse_structured(run: FinishedRun, command: str, remedy: str) -> None:
     """Raise UserError where a command is for mixed sensitivity only."""
     if run.kappa is not None:
         words = f'{command} is for controller.structure = "h_infinity" so far; {remedy}'

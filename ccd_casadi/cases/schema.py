@@ -1,6 +1,6 @@
 """The keys of a case file for an editor (JSON Schema) and for a person (a page), from one source.
 
-Both are made of the definitions that check a case (`sections`), so that they cannot say otherwise.
+Both are made of the definitions that check a case (`tables`), so that they cannot say otherwise.
 The schema lets more pass than the checks do: what hangs on several keys is left to them.
 """
 
@@ -9,10 +9,10 @@ from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
-from ccd_casadi.cases.controller_sections import ChannelSection
+from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.parameters import KEYS as THETA
-from ccd_casadi.cases.sections import SECTIONS
+from ccd_casadi.cases.tables import TABLES
 from ccd_casadi.plants.registry import model_names
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
@@ -55,9 +55,9 @@ def case_schema() -> dict[str, Any]:
             },
         },
     }  # fmt: skip
-    tables |= {name: _table(kind) for name, kind in SECTIONS.items()}
+    tables |= {name: _table(kind) for name, kind in TABLES.items()}
     channels = tables["controller"]["properties"]["channel"]
-    channels["additionalProperties"] = _table(ChannelSection)
+    channels["additionalProperties"] = _table(ChannelTable)
     for kind, units in UNITS.items():
         spectrum = {
             "type": "object",
@@ -68,7 +68,7 @@ def case_schema() -> dict[str, Any]:
         spectrum["properties"]["unit"] = {"enum": list(units)}  # type: ignore[index]
         entry = tables["budget"]["properties"][kind.value]
         entry["anyOf"] = [spectrum, {"type": "array", "items": spectrum}]
-    required = [name for name, kind in SECTIONS.items() if any(_required(f) for f in fields(kind))]
+    required = [name for name, kind in TABLES.items() if any(_required(f) for f in fields(kind))]
     of_data = {"plant": {"properties": {"model": {"const": MEASURED}}, "required": ["model"]}}
     return {
         "$schema": DRAFT,
@@ -108,7 +108,7 @@ def keys_page() -> str:
         "",
         "With `values` or `fixed` no bounds are given; see [own plant](own_plant.md).",
     ]
-    for name, kind in {**SECTIONS, "controller.channel.NAME": ChannelSection}.items():
+    for name, kind in {**TABLES, "controller.channel.NAME": ChannelTable}.items():
         lines += ["", f"## [{name}]", ""]
         lines += _rows(
             [

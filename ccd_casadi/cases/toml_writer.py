@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from ccd_casadi.cases.sections import SECTIONS, Case
+from ccd_casadi.cases.tables import TABLES, Case
 
 
 def case_to_toml(case: Case) -> str:
@@ -17,7 +17,7 @@ def case_to_toml(case: Case) -> str:
     lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
     for parameter in (*case.theta, *case.fixed):
         lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(parameter.table)]
-    for name in SECTIONS:
+    for name in TABLES:
         entries = dict(vars(getattr(case, name)))
         tables = entries.pop("channel", ())
         lines += ["", f"[{name}]", *_pairs(entries)]

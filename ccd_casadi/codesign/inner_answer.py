@@ -21,7 +21,7 @@ from ccd_casadi.codesign.design_entries import (
     loop_of_design,
     move_entry,
 )
-from ccd_casadi.codesign.sections_entries import (
+from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
     proof_dict,
@@ -39,11 +39,11 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     true_design,
 )
-from ccd_casadi.inner_problem.sections_bandwidth import too_slow
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
-from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
-from ccd_casadi.inner_problem.sections_search import least_value_at, prepared, with_range
 from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.inner_problem.structured_bandwidth import too_slow
+from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
+from ccd_casadi.inner_problem.structured_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.inner_problem.structured_search import least_value_at, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.closed_loop import open_alone
@@ -225,7 +225,7 @@ def _looked(task: tuple[Any, ...]) -> tuple[str, Any]:
     return look.__name__, look(*design)
 
 
-def sections_answer(
+def structured_answer(
     problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
 ) -> InnerAnswer:
     """The largest bandwidth (or least of another figure) at θ, judged over its box.
@@ -237,11 +237,11 @@ def sections_answer(
         raise UserError(words)
     begin_at, progress, workers = options.begin_at, options.progress, options.workers
     head = head_of(problem, theta)
-    sections = replace(sections_of_problem(problem), seed=options.seed)
-    asked = replace(with_range(replace(problem, controller=sections)), start=theta)
+    structured = replace(structured_of(problem), seed=options.seed)
+    asked = replace(with_range(replace(problem, controller=structured)), start=theta)
     if begin_at is not None:
         anchors = (sections_kappa(begin_at, structure_of(asked)),)
-        asked = replace(asked, controller=replace(sections_of_problem(asked), anchors=anchors))
+        asked = replace(asked, controller=replace(structured_of(asked), anchors=anchors))
     asked, made = prepared(asked, progress, workers, begin_at is not None)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from ccd_casadi.codesign.outer import Outer
-from ccd_casadi.codesign.sections_entries import bound_words
+from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost

@@ -26,8 +26,8 @@ from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
+from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import ACTIVE, KktCertificate
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
@@ -169,8 +169,8 @@ def _parameters(
             yield _Parameter(f"{name} {end}", value, none, {f"{name} {end}": slope})
 
 
-def sections_responses(
-    problem: CoDesignProblem, sample: BandwidthSample, found: SectionsValue
+def structured_responses(
+    problem: CoDesignProblem, sample: BandwidthSample, found: StructuredValue
 ) -> PostOptimal:
     """Derivatives of the optimum to w1, w2, the bounds on the loop, λ <= 0 and the bounds of θ.
 
@@ -231,14 +231,14 @@ def _loop_bounds(
     problem: CoDesignProblem, mu: Mapping[str, float]
 ) -> list[tuple[str, float, float]]:
     """Bounds on the loop that the case gives: name, value, and d ln ω_b/d ln of it."""
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     effort = sum(value for name, value in mu.items() if kind_and_channel(name)[0] == "KS")
     rows = [
         ("S_max", problem.inner.S_max, mu.get("S_MAX", 0.0)),
         ("S_low", problem.inner.S_low, mu.get("S_LOW", 0.0)),
-        ("shape", sections.shape, mu.get("SHAPE", 0.0)),
-        ("weighted_level", sections.weighted_level, effort + mu.get("T", 0.0)),
-        ("compliance_max", sections.compliance_max, mu.get("GS", 0.0)),
+        ("shape", structured.shape, mu.get("SHAPE", 0.0)),
+        ("weighted_level", structured.weighted_level, effort + mu.get("T", 0.0)),
+        ("compliance_max", structured.compliance_max, mu.get("GS", 0.0)),
     ]
     for own in bounds_of(problem).channels:
         rows += [

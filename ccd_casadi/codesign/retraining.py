@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult

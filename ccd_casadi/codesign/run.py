@@ -16,14 +16,14 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
-from ccd_casadi.codesign.outer_sections import SectionsOuter
+from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.search import concluded, concluded_at, nothing_found, searched
-from ccd_casadi.codesign.sections_lists import ListedSections
 from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -136,7 +136,7 @@ def outer_of(sampler: Sampler) -> Outer:
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
 OUTERS: dict[type[ControllerProblem], type[Outer]] = {
     MixedSensitivityProblem: MixedOuter,
-    SectionsProblem: SectionsOuter,
+    StructuredProblem: StructuredOuter,
 }
 
 
@@ -169,7 +169,9 @@ def require_solvable(problem: CoDesignProblem) -> None:
 
 
 # What searches over lists of values near by, for the kinds that know how.
-LISTED: dict[type[ControllerProblem], type[ListedSections]] = {SectionsProblem: ListedSections}
+LISTED: dict[type[ControllerProblem], type[ListedStructured]] = {
+    StructuredProblem: ListedStructured
+}
 
 
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:

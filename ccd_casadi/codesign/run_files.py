@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.verified import Solution

@@ -27,16 +27,16 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     nearby,
-    sections_of_problem,
     structure_of,
+    structured_of,
     uncertain_plant,
-    with_sections,
+    with_structured,
 )
-from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_robustness import worse_members
+from ccd_casadi.inner_problem.structured_problem import Member
+from ccd_casadi.inner_problem.structured_robustness import worse_members
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
 from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
@@ -164,8 +164,8 @@ def with_members(sampler: Sampler, members: Sequence[Member]) -> Sampler:
     nothing."""
     trace = sampler.trace
     trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
-    known = sections_of_problem(sampler.problem).members
-    return sampler.of(with_sections(sampler.problem, members=(*known, *members)))
+    known = structured_of(sampler.problem).members
+    return sampler.of(with_structured(sampler.problem, members=(*known, *members)))
 
 
 def objectives_beside(problem: CoDesignProblem, sample: BandwidthSample, thetas: Array) -> Array:
@@ -209,8 +209,8 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self, problem: CoDesignProblem, models: Sequence[Evaluate], place: Place, reach: float
     ) -> None:
         self.problem, self.models, self.middle = problem, models, np.array(place.theta)
-        sections = sections_of_problem(problem)
-        known = [(option, np.array(point)) for option, point in sections.members]
+        structured = structured_of(problem)
+        known = [(option, np.array(point)) for option, point in structured.members]
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
         uncertain = self.uncertain((self.middle - lower) / self.width)
@@ -276,10 +276,10 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
             replace(plant, dA=share * plant.dA, dB=share * plant.dB, dC=share * plant.dC)
             for plant in self.uncertain(z, beside).plants(self.members)
         ]
-        sections = sections_of_problem(self.problem)
+        structured = structured_of(self.problem)
         return problem_for(
             [in_units_of(plant, self.first) for plant in plants], structure_of(self.problem),
-            bounds_of(self.problem), sections.sampling, sections.frequencies,
+            bounds_of(self.problem), structured.sampling, structured.frequencies,
         )  # fmt: skip
 
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:

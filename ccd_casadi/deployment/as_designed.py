@@ -12,7 +12,7 @@ from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, structure_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
 from ccd_casadi.support.errors import UserError
 
 DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled

@@ -11,7 +11,7 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
@@ -44,7 +44,7 @@ def judged(
     )  # fmt: skip
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:
-        most = sections_of_problem(run.problem).compliance_max
+        most = structured_of(run.problem).compliance_max
     found = Deployment(
         orders=tuple(orders), rate_hz=rate_hz, delay=delay, conversion=conversion,
         plant=held[nominal], realisation=realisation, sampled=figures.pop(nominal),

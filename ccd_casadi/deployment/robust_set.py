@@ -15,7 +15,7 @@ from ccd_casadi.deployment.channels import Channel, along
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
@@ -79,7 +79,7 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
     `dense`: on as many shifts as a design is verified on.
     """
     if kind_of(run.problem).as_designed:
-        return _of_sections(run, dense)
+        return _of_structured(run, dense)
     robust = run.problem.robust
     if robust is None:
         return ()
@@ -92,9 +92,9 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
     )
 
 
-def _of_sections(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
+def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
     """Of a run with sections: corners of its box, its own set, `dense`: a lattice too."""
-    sections = sections_of_problem(run.problem)
+    sections = structured_of(run.problem)
     uncertain = uncertain_plant(run.problem, run.theta)
     points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.members)]
     if dense:

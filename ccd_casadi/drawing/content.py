@@ -220,7 +220,7 @@ class Words:
 
 @dataclass(frozen=True)
 class Heading:
-    """Of a part of a section."""
+    """Of a part of a chapter."""
 
     text: str
 
@@ -300,7 +300,7 @@ Block = Text | Table | Figure | Picture | Steps
 
 
 @dataclass(frozen=True)
-class Section:
+class Chapter:
     """A heading and what stands under it; `own_page` starts a page in print."""
 
     heading: str
@@ -313,5 +313,5 @@ class Page:
     """A whole page; `index`: the one that links all of the run, empty where there is none."""
 
     head: Head
-    sections: tuple[Section, ...]
+    chapters: tuple[Chapter, ...]
     index: str = INDEX

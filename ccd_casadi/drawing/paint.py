@@ -19,11 +19,11 @@ STANDINGS = {"good": "✓", "warn": "!", "bad": "✕"}
 def painted(page: c.Page) -> str:
     """The whole document."""
     body, contents = [], []
-    for i, section in enumerate(page.sections, 1):
-        heading = escape(section.heading)
+    for i, chapter in enumerate(page.chapters, 1):
+        heading = escape(chapter.heading)
         contents.append(f'<a href="#section-{i}">{heading}</a>')
-        kind = " class=own-page" if section.own_page else ""
-        blocks = blocks_html(section.body, f"s{i}")
+        kind = " class=own-page" if chapter.own_page else ""
+        blocks = blocks_html(chapter.body, f"s{i}")
         body.append(f'<section id="section-{i}"{kind}>\n<h2>{heading}</h2>\n{blocks}\n</section>')
     up = f'<nav><a href="{escape(page.index)}">All pages of this run</a></nav>\n'
     head = (

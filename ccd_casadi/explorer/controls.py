@@ -7,7 +7,7 @@ from bokeh.models import CustomJSTickFormatter
 from bokeh.models.widgets.inputs import Checkbox, Select
 from bokeh.models.widgets.sliders import RangeSlider, Slider
 
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.support.units import shown_unit
 
@@ -70,9 +70,9 @@ class Controls:
 
     def _hide(self) -> None:
         """What does nothing to this kind of controller, or to a loop that is not sampled."""
-        sections = self.structure.value == "sections"
+        structured = self.structure.value == "sections"
         for widget in (self.omega_S, self.omega_T, self.always):
-            widget.visible = not sections
+            widget.visible = not structured
         self.rate.visible = self.delay.visible = bool(self.sampled.active)
 
     def all(self) -> list[Any]:

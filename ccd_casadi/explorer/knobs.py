@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.controller_sections import LoopSection
+from ccd_casadi.cases.controller_tables import LoopTable
 from ccd_casadi.cases.kinds import with_structure
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.units import HZ
 
@@ -61,9 +61,9 @@ def case_at(case: Case, knobs: Knobs) -> Case:
     if knobs.structure != case.controller.structure:
         case = with_structure(case, knobs.structure)
     parameters = zip(case.theta, knobs.theta, strict=True)
-    loop = LoopSection()
+    loop = LoopTable()
     if knobs.structured and knobs.sampled:
-        loop = LoopSection(knobs.rate_hz, knobs.delay_us)
+        loop = LoopTable(knobs.rate_hz, knobs.delay_us)
     return replace(
         case,
         theta=tuple(replace(parameter, start=value) for parameter, value in parameters),

@@ -16,7 +16,7 @@ from bokeh.models.widgets.inputs import Select
 from bokeh.models.widgets.markups import Div
 from bokeh.plotting import figure
 
-from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.svg import GREY, ORANGE

@@ -25,8 +25,8 @@ from ccd_casadi.explorer.message import Message
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure, cursor, legend_html
 from ccd_casadi.explorer.panels import EMPTY, FIGURES, LOOKS, OVER_HZ, Drawn, drawn
 from ccd_casadi.explorer.pins import Kept, Pins
-from ccd_casadi.explorer.sections import Designed, anchored, designed
 from ccd_casadi.explorer.session import Session, searched_exactly
+from ccd_casadi.explorer.structured import Designed, anchored, designed
 from ccd_casadi.explorer.words import machine_html, move_words, standing_html
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import ExitCode
@@ -80,7 +80,7 @@ class Page:
         self.pins.table.tags = [self.answer, self._message]  # so that they are sent
         self.note, self.output = Div(name="note"), Div(name="output")
         self.modes = Div(stylesheets=[WIDE])
-        self.design = _button("Design sections here", "design", self.design_sections)
+        self.design = _button("Design sections here", "design", self.design_structured)
         self.solve_button = _button("Solve from here", "solve", self.start_solve)
         self.stop = _button("Stop the solve", "stop", self.stop_solve)
         self.stop.disabled = True
@@ -146,9 +146,9 @@ class Page:
         search = self._of_search and self.session.quick
         self._of_search = False
         self._kept.knobs = knobs = self.controls.knobs()
-        sections = knobs.structured
-        self.design.disabled = not sections
-        full = (let_go or search or bool(self.controls.always.active)) and not sections
+        structured = knobs.structured
+        self.design.disabled = not structured
+        full = (let_go or search or bool(self.controls.always.active)) and not structured
         behind = full and self.session.known is not None
         try:
             here = full and not behind
@@ -264,7 +264,7 @@ class Page:
         self._newest = None
         self._complain(str(error))
 
-    def design_sections(self) -> None:
+    def design_structured(self) -> None:
         """A controller of fixed structure at this θ."""
         knobs = self.controls.knobs()
         problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
@@ -280,7 +280,7 @@ class Page:
 
     def _designed(self, found: Designed) -> None:
         self.design.disabled, self.note.text = False, ""
-        look = self.session.took_sections(found)
+        look = self.session.took_designed(found)
         if look is None:
             self._complain(found.words)
             return

@@ -15,7 +15,7 @@ from bokeh.models.widgets.tables import (
     TableColumn,
 )
 
-from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.drawing.svg import AMBER, BROWN, GREEN, ORANGE, PURPLE
 from ccd_casadi.explorer.designs import Look
 from ccd_casadi.explorer.knobs import Knobs

@@ -8,7 +8,7 @@ from time import perf_counter
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.explorer.designs import (
     Elements,
@@ -21,7 +21,7 @@ from ccd_casadi.explorer.designs import (
 )
 from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.explorer.known_plant import KnownPlant
-from ccd_casadi.explorer.sections import Designed, anchored, judged_look
+from ccd_casadi.explorer.structured import Designed, anchored, judged_look
 from ccd_casadi.explorer.words import surface_modes_html
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -84,10 +84,10 @@ class Session:
         if self.kappa is None:
             elements = elements_at(problem, knobs.theta)
             words = "no controller yet: design one here"
-            return without_controller(problem, knobs, elements, How.SECTIONS, words)
+            return without_controller(problem, knobs, elements, How.STRUCTURED, words)
         return judged_look(problem, knobs, self.kappa, How.HELD)
 
-    def took_sections(self, found: Designed) -> Look | None:
+    def took_designed(self, found: Designed) -> Look | None:
         """A design of a fixed structure ended: into the store, and the controller of looks to come.
 
         None where no controller was found.
@@ -98,7 +98,7 @@ class Session:
         if found.kappa is None:
             return None
         self.kappa, self.designed_for = found.kappa, found.problem
-        return judged_look(found.problem, found.knobs, found.kappa, How.SECTIONS)
+        return judged_look(found.problem, found.knobs, found.kappa, How.STRUCTURED)
 
     def full(self, knobs: Knobs) -> Look:
         """The inner problem at θ on the model itself."""
@@ -130,7 +130,7 @@ class Session:
         """
         for look in looks:
             problem = look.problem.identity()
-            if look.how is How.SECTIONS:
+            if look.how is How.STRUCTURED:
                 continue  # with its unit, or there is none
             if look.kappa is not None:
                 problem = problem | {"held": [float(v) for v in look.kappa]}

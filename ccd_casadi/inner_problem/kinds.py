@@ -21,10 +21,10 @@ from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.inner_problem.sections_robustness import LOOSE
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of, structured_of
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_robustness import LOOSE
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -138,7 +138,7 @@ class FixedStructure(InnerKind):
     as_designed = True
 
     def value(self, theta: Sequence[float]) -> tuple[float, Array]:
-        found = sections_value(self.problem, theta)
+        found = structured_value(self.problem, theta)
         return found.value, np.array(found.gradient)
 
     def described(self) -> tuple[str, str]:
@@ -147,7 +147,7 @@ class FixedStructure(InnerKind):
         return "of fixed structure", runs
 
     def require_function(self) -> None:
-        if not sections_of_problem(self.problem).anchors:
+        if not structured_of(self.problem).anchors:
             words = "has no anchors yet; take that of a finished run, read_run(folder).problem"
             raise UserError(f"the problem of a fixed structure {words}")
 
@@ -158,22 +158,22 @@ class FixedStructure(InnerKind):
         return bounds_of(self.problem)
 
     def common_shifts(self) -> tuple[float, float]:
-        u = sections_of_problem(self.problem).uncertainty
+        u = structured_of(self.problem).uncertainty
         low, high = (
             (1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) - 1.0 for s in (-1, 1)
         )
         return low, high
 
     def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
-        u = sections_of_problem(self.problem).uncertainty
+        u = structured_of(self.problem).uncertainty
         return u.damping, (1.0 - u.gain, 1.0, 1.0 + u.gain)
 
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         """The shape, and weighted_level/|W| of KS (N/m) and T."""
-        problem, sections = self.problem, sections_of_problem(self.problem)
+        problem, structured = self.problem, structured_of(self.problem)
         level, shape = (
             np.nan if value is None else value
-            for value in (sections.weighted_level, sections.shape)
+            for value in (structured.weighted_level, structured.shape)
         )
 
         def over(hz: Array) -> Array:
@@ -181,7 +181,7 @@ class FixedStructure(InnerKind):
             below = hz <= bandwidth_hz
             rising = shape * hz / bandwidth_hz * 2.0**-0.5
             most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
-            holds = (below | (sections.shape_ends is ShapeEnd.S_MAX)) & (
+            holds = (below | (structured.shape_ends is ShapeEnd.S_MAX)) & (
                 most <= problem.inner.S_max
             )
             return np.array([np.where(holds, most, np.nan), *(level / size[1:])])
@@ -189,7 +189,7 @@ class FixedStructure(InnerKind):
         inner = problem.inner
         words = ("its shape", "weighted_level/|W_KS|", "weighted_level/|W_T|")
         return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words,
-                       sections.compliance_max, True)  # fmt: skip
+                       structured.compliance_max, True)  # fmt: skip
 
 
 def kind_of(problem: CoDesignProblem) -> InnerKind:
@@ -200,7 +200,7 @@ def kind_of(problem: CoDesignProblem) -> InnerKind:
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
 KINDS: dict[type[ControllerProblem], type[InnerKind]] = {
     MixedSensitivityProblem: MixedSensitivity,
-    SectionsProblem: FixedStructure,
+    StructuredProblem: FixedStructure,
 }
 
 

@@ -57,7 +57,7 @@ class CoDesignProblem(Shown):
     robust : RobustSet, optional
         Perturbed plants that the controller has to serve.
     controller : ControllerProblem
-        Mixed sensitivity, or sections.
+        Mixed sensitivity, or a fixed structure.
     budget : ErrorBudget, optional
         What moves the stage: judged, no part of a synthesis.
     cost_unit : str
@@ -300,7 +300,7 @@ def frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[f
 
 def _require_mixed(problem: CoDesignProblem) -> None:
     if not isinstance(problem.controller, MixedSensitivityProblem):
-        words = "the problem is not one of mixed sensitivity; use sections_value(problem, theta)"
+        words = "the problem is not one of mixed sensitivity; use structured_value(problem, theta)"
         raise UserError(words)
 
 

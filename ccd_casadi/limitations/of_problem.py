@@ -1,4 +1,4 @@
-"""The bound on every controller for a problem with sections, at one θ."""
+"""The bound on every controller for a structured problem, at one θ."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,13 +9,13 @@ import numpy as np
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
-    sections_of_problem,
     structure_of,
+    structured_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.limitations.bound import inside, outside, pointwise
 from ccd_casadi.limitations.limits import Limits, limits_of
 from ccd_casadi.support.errors import UserError
@@ -82,13 +82,13 @@ def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
 
 def limits_of_problem(problem: CoDesignProblem, theta: Sequence[float]) -> list[Limits]:
     """One loop of a plant with one output; else one for each channel's direction of outputs."""
-    if not isinstance(problem.controller, SectionsProblem):
+    if not isinstance(problem.controller, StructuredProblem):
         raise UserError('gap: is known for controller.structure = "sections" alone')
     if problem.figure is not BANDWIDTH:
         raise UserError("gap: is known for the bandwidth alone; drop inner.minimise")
     uncertain, structure = uncertain_plant(problem, theta), structure_of(problem)
     plant = uncertain.plant(uncertain.nominal).plant_si()
-    bounds, sampling = bounds_of(problem), sections_of_problem(problem).sampling
+    bounds, sampling = bounds_of(problem), structured_of(problem).sampling
     if not isinstance(structure, ChannelStructure):
         return [limits_of(plant, bounds, sampling, integrator=structure.integrator)]
     whole = bounds.weights  # a channel's own M_K bounds one direction of its forces alone

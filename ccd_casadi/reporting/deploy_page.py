@@ -12,13 +12,13 @@ from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.words import figure_rows, order_words, reason_words, short_status
 from ccd_casadi.drawing.content import (
     Block,
+    Chapter,
     Curve,
     Facts,
     Figure,
     Lines,
     Page,
     Panel,
-    Section,
     Source,
     Table,
     Words,
@@ -33,7 +33,7 @@ from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.robustness_figures import named
-from ccd_casadi.reporting.sections_page import sections_table
+from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.tables import over_frequency, over_time
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number, shown
@@ -52,20 +52,20 @@ def deploy_page(
         short_status(run, found), reason_words(run, found), meta, _conclusion(run, found),
         run.result,
     )  # fmt: skip
-    sections = [Section("The loop", (_loop(run, found),)), Section("Figures", _facts(run, found))]
+    chapters = [Chapter("The loop", (_loop(run, found),)), Chapter("Figures", _facts(run, found))]
     if found.sampled.stable:
-        sections.append(Section("Step of the reference", (_step(run, found),)))
+        chapters.append(Chapter("Step of the reference", (_step(run, found),)))
     if moved is not None:
-        sections.append(Section("A move on the machine", move_blocks(moved)))
-    sections += [
-        Section("Sampling rate", (_rates(found),)),
-        Section("Orders", tuple(block for item in found.orders for block in _orders(item, run))),
-        Section("As sections",
+        chapters.append(Chapter("A move on the machine", move_blocks(moved)))
+    chapters += [
+        Chapter("Sampling rate", (_rates(found),)),
+        Chapter("Orders", tuple(block for item in found.orders for block in _orders(item, run))),
+        Chapter("As sections",
                 tuple(block for item in found.orders for block in _sections(item, run))),
     ]  # fmt: skip
     if found.stable:
-        sections.append(Section("The code", _code(found)))
-    return Page(head, tuple(sections), index)
+        chapters.append(Chapter("The code", _code(found)))
+    return Page(head, tuple(chapters), index)
 
 
 def _conclusion(run: FinishedRun, found: Deployment) -> str:
@@ -189,7 +189,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
             f"Channel {item.channel.name}: gain {shown(gain_of(kappa), 'N/m', 4)}; the sections as "
             "they were designed."
         )
-        return Words(words), sections_table(section_words(structure, kappa))
+        return Words(words), structured_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), number(s.depth_db, 4)) for s in found.sections

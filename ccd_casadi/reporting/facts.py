@@ -18,7 +18,7 @@ def conclusion(result: Mapping[str, Any]) -> str:
     begins = f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}"
     hz = f"{number(result['bandwidth_hz'])} Hz"
     cost = f"a hardware cost of {cost_words(result)} (J = {number(result['objective'], 6)})"
-    if "race" in result:  # sections
+    if "race" in result:  # a fixed structure
         order = f"a controller of order {result['controller']['order']}"
         return f"{begins}: {order} with a bandwidth of {hz} on {_plants(result)}, at {cost}."
     certificate = result["certificate"]

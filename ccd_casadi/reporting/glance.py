@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.drawing.content import Figure, Lines, Modes, Picture, Place, Section, Table
+from ccd_casadi.drawing.content import Chapter, Figure, Lines, Modes, Picture, Place, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
@@ -20,7 +20,7 @@ HEIGHT = 3.0  # inches of a row
 
 def glance(
     problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: Figure
-) -> Section:
+) -> Chapter:
     """Of a design on the plants that it is made for."""
     assert isinstance(move.drawing, Lines)
     S_max, several = problem.inner.S_max, len(view.open) > 1
@@ -46,7 +46,7 @@ def glance(
         head, columns = [*head, "Re L", "Im L"], [*columns, L.real, L.imag]
     table = over_frequency(head, view.hz, *columns, special=marked(view))
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
-    return Section("At a glance", (Figure(lines, words, (table, *move.tables)),))
+    return Chapter("At a glance", (Figure(lines, words, (table, *move.tables)),))
 
 
 def loci(view: LoopView) -> list[np.ndarray]:

@@ -6,7 +6,7 @@ from html import unescape
 from pathlib import Path
 from urllib.parse import quote
 
-from ccd_casadi.drawing.content import INDEX, Links, Page, Section
+from ccd_casadi.drawing.content import INDEX, Chapter, Links, Page
 from ccd_casadi.drawing.paint import painted
 from ccd_casadi.drawing.stored import write_page
 from ccd_casadi.reporting.facts import conclusion
@@ -68,8 +68,8 @@ def write_index(folder: Path) -> None:
     name = folder.resolve().name
     lead = conclusion(result)
     head = run_head(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
-    sections = (Section("Pages", (Links(links),)), Section("Files", (Links(files),)))
-    write_whole(folder / INDEX, painted(Page(head, sections, index="")))
+    chapters = (Chapter("Pages", (Links(links),)), Chapter("Files", (Links(files),)))
+    write_whole(folder / INDEX, painted(Page(head, chapters, index="")))
 
 
 def _pages(folder: Path) -> dict[Path, str]:

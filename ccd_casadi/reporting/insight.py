@@ -12,13 +12,13 @@ from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.drawing.content import (
     Block,
     Bullets,
+    Chapter,
     Curve,
     Figure,
     Lines,
     Mark,
     Page,
     Panel,
-    Section,
     Table,
     Words,
 )
@@ -29,7 +29,7 @@ from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_axes, theta_
 from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
-from ccd_casadi.reporting.sections_page import binding_words
+from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number, shown_unit
 
@@ -59,15 +59,15 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     own = v.factor * float(run.result.get(f"{v.entry}_of_set", bandwidth_of(run)))
     drawn = front_figure(problem, front, (cost, own, "this run's design"))
     answers = [Words(text) for text in response_sentences(responses)]
-    sections = (
-        Section(f"Weight against {v.words}", (drawn, *front_walk(run, front))),
-        Section(
+    chapters = (
+        Chapter(f"Weight against {v.words}", (drawn, *front_walk(run, front))),
+        Chapter(
             "What each parameter of the case would change",
             (*answers, table_responses(problem, responses)),
         ),
-        Section("What limits the bandwidth", _limits(run, rule)),
+        Chapter("What limits the bandwidth", _limits(run, rule)),
     )
-    return Page(head, sections, index)
+    return Page(head, chapters, index)
 
 
 def _limits(run: FinishedRun, rule: str) -> tuple[Block, ...]:

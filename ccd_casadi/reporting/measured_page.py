@@ -9,6 +9,7 @@ import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.drawing.content import (
+    Chapter,
     Curve,
     Facts,
     Figure,
@@ -16,7 +17,6 @@ from ccd_casadi.drawing.content import (
     Level,
     Lines,
     Page,
-    Section,
     Words,
 )
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
@@ -26,7 +26,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
-from ccd_casadi.reporting.sections_page import controller_blocks
+from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.reporting.verdict import advice
 from ccd_casadi.support.units import HZ, number, shown
@@ -53,12 +53,12 @@ def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[st
         lead, decision=advice(answer),
     )  # fmt: skip
     figures = Facts(tuple(_facts(case, answer))), Words(f"What this rests on: {answer['words']}.")
-    sections = (
-        Section("The loop on the lines", (_loop(case, controller, answer),)),
-        Section("The figures", figures),
-        Section("The controller", controller_blocks(answer)),
+    chapters = (
+        Chapter("The loop on the lines", (_loop(case, controller, answer),)),
+        Chapter("The figures", figures),
+        Chapter("The controller", controller_blocks(answer)),
     )
-    return Page(head, sections, index="")
+    return Page(head, chapters, index="")
 
 
 def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> Figure:

@@ -14,12 +14,12 @@ from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
 from ccd_casadi.drawing.content import (
     Band,
+    Chapter,
     Curve,
     Figure,
     Level,
     Lines,
     Panel,
-    Section,
     Table,
     Words,
 )
@@ -84,9 +84,9 @@ def move_figure(
     return ways_figure(dict(zip(ways, found, strict=True)), words)
 
 
-def cycle_section(
+def cycle_chapter(
     problem: CoDesignProblem, theta: Sequence[float], result: Mapping[str, Any]
-) -> list[Section]:
+) -> list[Chapter]:
     """Force and heat over a cycle of the case's move, what limits it, and its time over the heat
     that is allowed; nothing for a case without a motor."""
     own, told = problem.source.motion, result.get("move")
@@ -127,7 +127,7 @@ def cycle_section(
     )
     table = over_time(("ms", "N", "W"), ms, force[:, 0], heat)
     lines = Lines((tuple(panels),), "A cycle of the motor", (3.0,))
-    return [Section("The motor", (Figure(lines, words, (table,)),))]
+    return [Chapter("The motor", (Figure(lines, words, (table,)),))]
 
 
 def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:

@@ -8,7 +8,7 @@ from typing import Any
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
 from ccd_casadi.drawing.page import CSS
@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
 from ccd_casadi.reporting.facts import conclusion, theta_axes, theta_table
 from ccd_casadi.reporting.loops import gains, run_view, view_of
-from ccd_casadi.reporting.sections_page import controller_blocks
+from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.derivatives import Sensitivities

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Facts, Heading, Page, Section, Table, Words
+from ccd_casadi.drawing.content import Chapter, Facts, Heading, Page, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.moves import way_words, ways_figure
@@ -31,8 +31,8 @@ def robustness_page(
         f"{theta_words(run.result)} · seed {seed}", lead, run.result if own else {},
         "" if own else given_decision(found),
     )  # fmt: skip
-    sections = (
-        Section("In short", tuple(map(Words, others))),
+    chapters = (
+        Chapter("In short", tuple(map(Words, others))),
         _margins(found),
         _gains(run, found),
         _perturbed(run, found),
@@ -40,7 +40,7 @@ def robustness_page(
         *_structured(found),
         *([_move(found)] if found.moves else []),
     )
-    return Page(head, sections, index)
+    return Page(head, chapters, index)
 
 
 def given_decision(found: Study) -> str:
@@ -139,7 +139,7 @@ def _outcome(item: Judged) -> str:
     return f"peak of S {item.peak:.4g}, ω_b {item.bandwidth / HZ:.4g} Hz"
 
 
-def _margins(found: Study) -> Section:
+def _margins(found: Study) -> Chapter:
     head = (
         "loop broken at", "gain up", "gain down", "phase °", "crossover Hz", "disk α", "at Hz",
         "disk gain", "disk phase °",
@@ -159,10 +159,10 @@ def _margins(found: Study) -> Section:
         "Gains are factors: the nearest above and below 1 at which stability is lost. A disk "
         "margin covers gain and phase errors at once."
     )
-    return Section("Margins", (Table(head, tuple(rows)), Words(words)))
+    return Chapter("Margins", (Table(head, tuple(rows)), Words(words)))
 
 
-def _gains(run: FinishedRun, found: Study) -> Section:
+def _gains(run: FinishedRun, found: Study) -> Chapter:
     shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
         (figures.named(run, name),
@@ -188,10 +188,10 @@ def _gains(run: FinishedRun, found: Study) -> Section:
     )  # fmt: skip
     white = (Heading("White noise (one-sided density)"), Facts(facts))
     body = (drawn, Facts(tuple(tops)), *white)  # at rest: in short
-    return Section("Disturbance and noise", body)
+    return Chapter("Disturbance and noise", body)
 
 
-def _perturbed(run: FinishedRun, found: Study) -> Section:
+def _perturbed(run: FinishedRun, found: Study) -> Chapter:
     caption = (
         "Above: all flexible frequencies shifted together, mode shapes kept. Below: all damping "
         "multiplied. The controller stays the same. A gap in a curve is an unstable loop; where it "
@@ -204,10 +204,10 @@ def _perturbed(run: FinishedRun, found: Study) -> Section:
     )  # fmt: skip
     head = ("mode Hz", "shift %", "stable", "ω_b Hz", "‖S‖∞")
     modes = (Heading("One mode at a time"), Table(head, rows)) if rows else ()
-    return Section("Plants off the model", (drawn, *modes))
+    return Chapter("Plants off the model", (drawn, *modes))
 
 
-def _tolerances(run: FinishedRun, found: Study) -> Section:
+def _tolerances(run: FinishedRun, found: Study) -> Chapter:
     hard, shown = found.tolerances, figures.shown_peak(run, found)
     count = len(hard.judged)
     lost, beyond = hard.unstable, hard.above(shown)
@@ -228,10 +228,10 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
         f"Worst found, by a local search from the worst of them: {theta}: {_outcome(hard.worst)}."
     )
     drawn = figures.tolerances(run, found, caption)
-    return Section("Hardware tolerances", (drawn, Words(words)))
+    return Chapter("Hardware tolerances", (drawn, Words(words)))
 
 
-def _structured(found: Study) -> list[Section]:
+def _structured(found: Study) -> list[Chapter]:
     bound = found.structured
     if bound is None:
         return []
@@ -241,10 +241,10 @@ def _structured(found: Study) -> list[Section]:
         "for |δ_i| < 1/μ. Real errors are allowed to be larger: up to the inverse of the level "
         f"shown, {bound.stiffness:.4g}."
     )
-    return [Section("Structured singular value", (figures.structured(bound, caption),))]
+    return [Chapter("Structured singular value", (figures.structured(bound, caption),))]
 
 
-def _move(found: Study) -> Section:
+def _move(found: Study) -> Chapter:
     plant = (
         "with its rigid bodies free"
         if found.moves[0].free
@@ -257,4 +257,4 @@ def _move(found: Study) -> Section:
         f"plant {plant}. It reaches {number(found.setpoint.velocity)} m/s, "
         f"{number(found.setpoint.acceleration)} m/s² and {number(found.setpoint.jerk)} m/s³."
     )
-    return Section("A move", (Words(words), ways_figure(ways, "The loop is simulated exactly.")))
+    return Chapter("A move", (Words(words), ways_figure(ways, "The loop is simulated exactly.")))

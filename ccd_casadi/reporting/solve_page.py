@@ -12,20 +12,20 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.drawing.content import (
     Bullets,
+    Chapter,
     Facts,
     Figure,
     Head,
     Heading,
     Page,
-    Section,
     Source,
     Table,
     ThetaPath,
@@ -35,7 +35,7 @@ from ccd_casadi.inner_problem.design_loops import design_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import bode
-from ccd_casadi.reporting.budget_section import budget_section
+from ccd_casadi.reporting.budget_chapter import budget_chapter
 from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table
 from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
@@ -50,16 +50,16 @@ from ccd_casadi.reporting.landscape import (
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
-from ccd_casadi.reporting.moves import cycle_section, force_step, move_figure
-from ccd_casadi.reporting.sections_page import (
+from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_figure
+from ccd_casadi.reporting.slices import slices_figure
+from ccd_casadi.reporting.start import start_chapter
+from ccd_casadi.reporting.structured_page import (
     bandwidths_table,
     binding_words,
     controller_blocks,
     limits_blocks,
-    sections_facts,
+    structured_facts,
 )
-from ccd_casadi.reporting.slices import slices_figure
-from ccd_casadi.reporting.start import start_section
 from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import table_trust, trust_figure
 from ccd_casadi.reporting.verdict import run_head
@@ -74,7 +74,7 @@ ORDER = (
 )  # fmt: skip
 
 
-Part = Callable[[], list[Section]]
+Part = Callable[[], list[Chapter]]
 
 
 def write_report(
@@ -91,29 +91,29 @@ def solve_page(
 ) -> Page:
     """What the report shows; the bar counts its sections."""
     parts = _parts(folder, case, problem, solution)
-    sections: list[Section] = []
+    chapters: list[Chapter] = []
     with Progress(len(parts), "drawing the report", quiet) as bar:
         for part in parts:
-            sections += part()
+            chapters += part()
             bar.advance()
-    return Page(solve_head(case, solution.result), (*sections, provenance(case, solution.result)))
+    return Page(solve_head(case, solution.result), (*chapters, provenance(case, solution.result)))
 
 
 def page_of_run(run: FinishedRun) -> Page:
     """The report of a run that kept none, as far as its folder holds it: the design by itself."""
     view = cache(partial(run_view, run))
     parts = design_parts(run.problem, run.problem, run.theta, run.controller, view, run.result)
-    sections = []
+    chapters = []
     for name in (name for name in ORDER if name in parts):
         with suppress(KeyError):  # a result.json of an earlier version knows less
-            sections += parts[name]()
+            chapters += parts[name]()
     words = (
         "Drawn from case.toml, controller.json and result.json alone: how the design was found was "
         "not kept."
     )
     head = solve_head(run.case, run.result)
-    note = Section("About this page", (Words(words),))
-    return Page(head, (*sections, note, provenance(run.case, run.result)))
+    note = Chapter("About this page", (Words(words),))
+    return Page(head, (*chapters, note, provenance(run.case, run.result)))
 
 
 def solve_head(case: Case, result: Mapping[str, Any]) -> Head:
@@ -133,13 +133,13 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
     own, theta, K = verified.problem, verified.theta, verified.controller
     view = cache(partial(view_of, verified))
     parts = design_parts(problem, own, theta, K, view, result)
-    if isinstance(verified, VerifiedSections):
+    if isinstance(verified, VerifiedStructured):
         table = bandwidths_table(verified)
         parts["loop"] = lambda: _loop(own, theta, K, view(), table)
     elif isinstance(verified, VerifiedDesign):
         truths = read_truths(folder / "samples.sqlite", problem)
         parts |= {
-            "start": lambda: start_section(problem, verified),
+            "start": lambda: start_chapter(problem, verified),
             "theta": lambda: [_theta(problem, solution, verified, truths)],
             "history": lambda: [_history(case, problem, solution, verified)],
             "trust": lambda: _trust(solution),
@@ -164,29 +164,31 @@ def design_parts(
 
     parts: dict[str, Part] = {
         "glance": lambda: [glance(own, theta, view(), move())],
-        "design": lambda: [design_section(problem, result)],
-        "move": lambda: [Section("A move", (move(),))],
-        "motor": lambda: cycle_section(own, theta, result),
-        "force": lambda: [Section("A step of force", (force_step(loops(), view().bandwidth_hz),))],
-        "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
-        "budget": lambda: budget_section(own, theta, K),
+        "design": lambda: [design_chapter(problem, result)],
+        "move": lambda: [Chapter("A move", (move(),))],
+        "motor": lambda: cycle_chapter(own, theta, result),
+        "force": lambda: [Chapter("A step of force", (force_step(loops(), view().bandwidth_hz),))],
+        "stage": lambda: stage_chapters(problem, {"start": problem.start, "optimum": theta}),
+        "budget": lambda: budget_chapter(own, theta, K),
     }
     parts["loop"] = lambda: _loop(own, theta, K, view())
     if "proof" not in result:  # of mixed sensitivity
         return parts
     return parts | {
-        "controller": lambda: [Section("The controller", controller_blocks(result))],
+        "controller": lambda: [Chapter("The controller", controller_blocks(result))],
         "limits": lambda: (
-            [Section("What limits the bandwidth", limits_blocks(problem, result))]
+            [Chapter("What limits the bandwidth", limits_blocks(problem, result))]
             if "costs" in result
             else []
         ),
     }
 
 
-def design_section(problem: CoDesignProblem, result: Mapping[str, Any]) -> Section:
+def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> Chapter:
     """What result.json says of the design."""
-    words, facts = (binding_words, sections_facts) if "proof" in result else (binding, design_facts)
+    words, facts = (
+        (binding_words, structured_facts) if "proof" in result else (binding, design_facts)
+    )
     binds = words(problem, result)
     body = (
         theta_table(problem, result),
@@ -195,12 +197,12 @@ def design_section(problem: CoDesignProblem, result: Mapping[str, Any]) -> Secti
         Bullets(tuple(binds)) if binds else Words("Nothing binds: an interior optimum."),
         *(Words(f"Note: {words}.") for words in result.get("notes", ())),
     )
-    return Section("The design", body)
+    return Chapter("The design", body)
 
 
 def _theta(
     problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign", truths: Truths
-) -> Section:
+) -> Chapter:
     iterates = solution.outcome.iterates
     process = bandwidth_process(solution.outcome.surrogates)
     best = float(solution.result["bandwidth_hz"])
@@ -212,43 +214,43 @@ def _theta(
         paths = (ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
         figure = Figure(land, caption_landscape(land, best) + extra, tables_landscape(land))
-        return Section("Bandwidth over the hardware", (figure,))
+        return Chapter("Bandwidth over the hardware", (figure,))
     slices = slices_figure(problem, process, truths, verified.theta, best, extra)
     words = "There is no surrogate, and no design near the optimum to show in its place."
-    return Section("Bandwidth over the hardware", (slices or Words(words),))
+    return Chapter("Bandwidth over the hardware", (slices or Words(words),))
 
 
-def stage_sections(
+def stage_chapters(
     problem: CoDesignProblem, thetas: Mapping[str, Sequence[float]]
-) -> list[Section]:
+) -> list[Chapter]:
     """The plant's drawing and its mode shapes at the last of `thetas`, where it has them."""
     plant, found = plant_of(problem), []
     if plant.drawing is not None and thetas:
-        found.append(Section("The stage, before and after", (plant.drawing(thetas),)))
+        found.append(Chapter("The stage, before and after", (plant.drawing(thetas),)))
     if plant.shapes is not None and thetas:
         name, theta = list(thetas.items())[-1]
         figure = mode_shape_figure(plant.shapes(theta, SHOWN))
-        found.append(Section(f"Mode shapes: {name}", (figure,)))
+        found.append(Chapter(f"Mode shapes: {name}", (figure,)))
     return found
 
 
 def _loop(
     problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView, *more: Table
-) -> list[Section]:
+) -> list[Chapter]:
     channels = split(scaled_plant(problem, theta), K)
-    plots = Section("Loop, plant and controller", (bode(loop, channels),))
+    plots = Chapter("Loop, plant and controller", (bode(loop, channels),))
     if loop.bounded.asked:  # of a fixed structure
-        return [Section("Closed loop on every plant", (*more, gains(loop))), plots]
+        return [Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
-        Section("Closed loop: S, KS and T against their bounds", (gains(loop),)),
-        Section("What limits the bandwidth", limit_blocks(loop)),
+        Chapter("Closed loop: S, KS and T against their bounds", (gains(loop),)),
+        Chapter("What limits the bandwidth", limit_blocks(loop)),
         plots,
     ]
 
 
 def _history(
     case: Case, problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign"
-) -> Section:
+) -> Chapter:
     heading = "Prediction against truth"
     outcome, result = solution.outcome, solution.result
     if not outcome.iterates:
@@ -257,24 +259,24 @@ def _history(
             + ("IPOPT worked on the true quantities, nothing was predicted."
                if result["formulation"] == "direct" else (result["reason"] or "none was run."))
         )  # fmt: skip
-        return Section(heading, (Words(words),))
+        return Chapter(heading, (Words(words),))
     blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
         lifted=len(outcome.surrogates) > 1,
     )  # fmt: skip
-    return Section(heading, blocks)
+    return Chapter(heading, blocks)
 
 
-def _trust(solution: "Solution") -> list[Section]:
+def _trust(solution: "Solution") -> list[Chapter]:
     """Nothing where nothing was predicted."""
     qualities = solution.quality
     if not qualities:
         return []
     body = (Words(recommendation(qualities)), table_trust(qualities), trust_figure(qualities))
-    return [Section("Can the surrogate be trusted?", body)]
+    return [Chapter("Can the surrogate be trusted?", body)]
 
 
-def provenance(case: Case, result: Mapping[str, Any]) -> Section:
+def provenance(case: Case, result: Mapping[str, Any]) -> Chapter:
     """Seed, versions, and the case file."""
     rows = [("seed", str(result["seed"])), *result["versions"].items()]
     body = (
@@ -283,4 +285,4 @@ def provenance(case: Case, result: Mapping[str, Any]) -> Section:
         Heading("The resolved case file"),
         Source(case_to_toml(case)),
     )
-    return Section("Provenance", body, own_page=True)
+    return Chapter("Provenance", body, own_page=True)

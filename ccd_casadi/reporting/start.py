@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
-from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Section, Table, Words
+from ccd_casadi.drawing.content import Chapter, Curve, Figure, Level, Lines, Panel, Table, Words
 from ccd_casadi.drawing.svg import CYCLE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
 from ccd_casadi.lti.closed_loop import largest
@@ -24,7 +24,7 @@ SAME = 1e-6  # of the box: an optimum this close to the start is the start
 HEIGHTS = (3.0, 3.0)  # inches
 
 
-def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[Section]:
+def start_chapter(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[Chapter]:
     """Both as figures, poles and a table; nothing where the run did not leave its start.
 
     At the start the true inner problem is solved, so that each hardware has its best controller.
@@ -35,7 +35,7 @@ def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
     found = true_inner(problem, problem.start)
     if found.optimum is None:
         words = f"The hardware that the run began with has no feasible loop: {found.shortfall}."
-        return [Section(HEADING, (Words(words),))]
+        return [Chapter(HEADING, (Words(words),))]
     f = found.optimum.figures
     start = synthesised_loop(problem, problem.start, f.omega_S, f.omega_T, "start")
     loops = (start, replace(view_of(verified), label="optimum"))
@@ -58,7 +58,7 @@ def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
         f"ratio; the least damped one has {least[0]} at the start and {least[1]} at the optimum."
     )
     beside = _table(problem, thetas, loops, costs)
-    return [Section(HEADING, (Figure(lines, words, (table,)), beside))]
+    return [Chapter(HEADING, (Figure(lines, words, (table,)), beside))]
 
 
 def _roots(loop: LoopView) -> tuple[np.ndarray, np.ndarray]:

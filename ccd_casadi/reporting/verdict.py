@@ -26,7 +26,7 @@ USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.m
 )
 SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
 OVERSHOOT = 0.5  # of a step without feedforward
-NO_SET = "[robust] names no plant"  # as verified_sections says it
+NO_SET = "[robust] names no plant"  # as verified_structured says it
 STATUS = {
     "verified": "verified",
     "not_verified": "not verified",

@@ -16,8 +16,8 @@ import numpy as np
 
 from ccd_casadi.inner_problem.objective import objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
-from ccd_casadi.inner_problem.sections_search import joined
+from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_search import joined
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 
@@ -45,8 +45,8 @@ def begun(
 
 def alone(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
     """The problem whose value is that of the climb from one controller, κ in SI."""
-    sections = sections_of_problem(problem).with_anchor(tuple(map(float, kappa)), 1)
-    return replace(problem, controller=replace(sections, starts=0))
+    structured = structured_of(problem).with_anchor(tuple(map(float, kappa)), 1)
+    return replace(problem, controller=replace(structured, starts=0))
 
 
 def promised(

@@ -11,8 +11,8 @@ import numpy as np
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, true_design, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
 from ccd_casadi.sampling.rows import Sample, sample_key
 from ccd_casadi.sampling.samples import sample_of
@@ -66,11 +66,11 @@ def unit_of(
     return list(rows.values()), payload
 
 
-def sections_unit(
+def structured_unit(
     problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]
 ) -> Unit:
     """The best design of a fixed structure at one θ: one row, without weights' frequencies."""
-    value = sections_value(problem, theta)
+    value = structured_value(problem, theta)
     design, judged = value.design, value.design.certificate
     worst = None if judged is None or not judged.worst else max(judged.worst.values())
     peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]
@@ -106,7 +106,7 @@ def sections_unit(
 
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
 UNITS: dict[type[ControllerProblem], Callable[[CoDesignProblem, str, str, tuple[float, ...]], Unit]]
-UNITS = {MixedSensitivityProblem: mixed_unit, SectionsProblem: sections_unit}
+UNITS = {MixedSensitivityProblem: mixed_unit, StructuredProblem: structured_unit}
 
 
 def design_unit(

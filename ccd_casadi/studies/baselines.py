@@ -16,12 +16,12 @@ import numpy as np
 from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.design_entries import figures_dict
-from ccd_casadi.codesign.sections_entries import active_of, design_dict
+from ccd_casadi.codesign.structured_entries import active_of, design_dict
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
-from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -127,7 +127,7 @@ class MixedBaseline(Baseline):
         return made.controller
 
 
-class SectionsBaseline(Baseline):
+class StructuredBaseline(Baseline):
     """Climbs from the anchors; climbs and multi-start searches are what it spends."""
 
     gradients = (Gradient.TOTAL,)
@@ -136,14 +136,14 @@ class SectionsBaseline(Baseline):
     def answer(
         self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
     ) -> tuple[Answer | None, int]:
-        value = sections_value(self.problem, theta.tolist())
+        value = structured_value(self.problem, theta.tolist())
         if not value.feasible:
             return None, value.syntheses
         slope = np.array(value.gradient)
         return Answer(value.design, value.bandwidth, value.value, slope), value.syntheses
 
     def design_of(self, sample: BandwidthSample) -> SectionsDesign:
-        return sections_value(self.problem, sample.theta).design
+        return structured_value(self.problem, sample.theta).design
 
     def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
         entries = design_dict(self.problem, theta, design)
@@ -176,7 +176,7 @@ def baseline_of(problem: CoDesignProblem) -> Baseline:
 
 BASELINES: dict[type[ControllerProblem], type[Baseline]] = {
     MixedSensitivityProblem: MixedBaseline,
-    SectionsProblem: SectionsBaseline,
+    StructuredProblem: StructuredBaseline,
 }
 
 

@@ -8,14 +8,14 @@ from typing import Any
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.drawing.content import Figure, Head, Page, Section, Source, Table, Verdict, Words
+from ccd_casadi.drawing.content import Chapter, Figure, Head, Page, Source, Table, Verdict, Words
 from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, table_gains
-from ccd_casadi.reporting.solve_page import stage_sections
+from ccd_casadi.reporting.solve_page import stage_chapters
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
@@ -29,18 +29,18 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     """report.html of a comparison; reads the folder's samples."""
     problem, found = comparison.problem, answer["conclusions"]
     best = found["best"]
-    sections = [
-        Section("The methods", _methods(problem, answer)),
-        Section("What it shows", tuple(map(Words, found["sentences"]))),
-        Section("Cost", (cost_figure(comparison.methods),)),
+    chapters = [
+        Chapter("The methods", _methods(problem, answer)),
+        Chapter("What it shows", tuple(map(Words, found["sentences"]))),
+        Chapter("Cost", (cost_figure(comparison.methods),)),
     ]
     if len(problem.names) == 2:
         paths = _paths(folder, comparison, best)
-        sections.append(Section("Paths over the landscape", (paths,)))
+        chapters.append(Chapter("Paths over the landscape", (paths,)))
     if best is not None:
         loops = _loops(comparison, best)
-        sections.append(Section("Sensitivity, baseline against co-design", (loops,)))
-        sections += stage_sections(
+        chapters.append(Chapter("Sensitivity, baseline against co-design", (loops,)))
+        chapters += stage_chapters(
             problem,
             {
                 LABELS[name]: tuple(comparison.method(name).figures["theta"].values())
@@ -48,14 +48,14 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
                 if comparison.method(name).figures.get("theta")
             },
         )
-    sections += [
-        Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
+    chapters += [
+        Chapter(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
         for method in comparison.methods
         if lines_of(method.figures)
     ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
-    sections += [
-        Section(
+    chapters += [
+        Chapter(
             "The case",
             (Words(f"{versions}; seed {answer['seed']}."), Source(case_to_toml(comparison.case))),
         )
@@ -70,7 +70,7 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
         " ".join(found["sentences"][1:2]), decision=found["sentences"][0],
     )  # fmt: skip
-    return Page(head, tuple(sections), index="")
+    return Page(head, tuple(chapters), index="")
 
 
 def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, Words]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design

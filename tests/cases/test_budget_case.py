@@ -12,12 +12,12 @@ from ccd_casadi.budget import Kind, ShapedSpectrum, TabulatedSpectrum
 from ccd_casadi.budget.frequency import integrate
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.design_entries import budget_entry, budget_lines
 from ccd_casadi.drawing.paint import blocks_html
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.reporting.budget_section import budget_section
+from ccd_casadi.reporting.budget_chapter import budget_chapter
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import synthesise
@@ -120,12 +120,12 @@ def test_the_budget_of_a_design_in_result_terminal_and_page(tmp_path: Path) -> N
     assert budget["disagreement"] < 1e-5
     (line,) = budget_lines({"budget": budget})
     assert "cables has" in line
-    (section,) = budget_section(problem, (55.0, 55.0), made.controller)
+    (section,) = budget_chapter(problem, (55.0, 55.0), made.controller)
     for name in ("cables", "amplifier", "floor motion", "sensor noise", "setpoint", "together"):
         assert name in blocks_html(section.body, "s")
     none = replace(problem, budget=None)
     assert budget_entry(none, (55.0, 55.0), made.controller) == {}
-    assert budget_section(none, (55.0, 55.0), made.controller) == []
+    assert budget_chapter(none, (55.0, 55.0), made.controller) == []
     assert budget_lines({}) == []
 
 

@@ -13,7 +13,7 @@ from case_documents import DROP, PLANT, TWO_MASS, edited, message
 from ccd_casadi.cases import plant_tables
 from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants import registry

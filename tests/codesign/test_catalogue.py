@@ -18,19 +18,19 @@ from scipy.optimize import lsq_linear
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign import outer_sections
+from ccd_casadi.codesign import outer_structured
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted
-from ccd_casadi.codesign.outer_sections import SectionsOuter
+from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
 from ccd_casadi.codesign.run_files import write_run
 from ccd_casadi.codesign.search import searched
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import Spent
@@ -329,14 +329,14 @@ def test_what_sections_spend_is_counted_over_all_nodes(
 ) -> None:
     """They were solved on a sampler of their own, and a catalogue said "syntheses": 0."""
 
-    def formulated(outer: SectionsOuter, *_: object) -> FormulationResult:
+    def formulated(outer: StructuredOuter, *_: object) -> FormulationResult:
         outer.sampler._spend("a design", 5, (60.0, 60.0), 12.0)
         return FormulationResult(message="nothing is feasible")
 
-    monkeypatch.setattr(SectionsOuter, "formulated", formulated)
-    monkeypatch.setattr(outer_sections, "seeded_and_prepared", lambda _, own, *__: (own, ""))
-    own = problem(controller=SectionsProblem())
+    monkeypatch.setattr(StructuredOuter, "formulated", formulated)
+    monkeypatch.setattr(outer_structured, "seeded_and_prepared", lambda _, own, *__: (own, ""))
+    own = problem(controller=StructuredProblem())
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(own, store, Workers(1))
-        searched(SectionsOuter(sampler.of(own)), Direct(), 0)
+        searched(StructuredOuter(sampler.of(own)), Direct(), 0)
         assert sampler.syntheses == 6  # five designs and a multi-start search

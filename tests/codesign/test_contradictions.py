@@ -19,7 +19,7 @@ from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
 
 
 def boxed(case: CoDesignProblem, rng: np.random.Generator) -> CoDesignProblem:
@@ -53,13 +53,13 @@ def test_mixed_sensitivity_agrees_with_itself(seed: int) -> None:
     assert contradictions(json.loads(json.dumps(result)), case) == []
 
 
-@pytest.mark.slow  # CI has the run of test_sections_commands
+@pytest.mark.slow  # CI has the run of test_structured_commands
 @pytest.mark.parametrize("seed", range(3))
 def test_sections_agree_with_themselves(seed: int) -> None:
     rng = np.random.default_rng(seed)
     shift = float(rng.uniform(0.0, 0.05))
     uncertainty = (Uncertainty(), Uncertainty(shift), Uncertainty(shift, damping=(0.5, 2.0)))
-    sections = SectionsProblem(
+    sections = StructuredProblem(
         structure=Structure(biquads=0),
         weighted_level=float(rng.uniform(8.0, 12.0)),
         sampling=Sampling(4000.0, float(rng.uniform(0.0, 200.0))) if seed % 2 else None,

@@ -20,7 +20,7 @@ from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.drawing.content import Lines
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.insight import main
 from ccd_casadi.reporting.insight import front_answer, front_figure
 from ccd_casadi.sampling.sampler import Sampler
@@ -185,7 +185,7 @@ class ErrorOverMasses:
 
 
 def test_a_front_of_an_error_goes_down_with_the_cost() -> None:
-    least = SectionsProblem(minimise="rms_error")
+    least = StructuredProblem(minimise="rms_error")
     problem = replace(problem_of(load_case(TWO_MASS)), controller=least, w2=1.0)
     front = pareto_front(lambda each: each, ErrorOverMasses(problem), (60.0, 60.0), points=8)
     cost, error = (np.array([getattr(point, name) for point in front.points])

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.verdict import State, optimal
-from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.optim.pieces import Local, descend
 from ccd_casadi.sampling.sampler import Sampler
@@ -197,14 +197,14 @@ def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate
 
 
 def case() -> CoDesignProblem:
-    sections = SectionsProblem(structure=Structure(biquads=0))
+    sections = StructuredProblem(structure=Structure(biquads=0))
     return replace(problem(controller=sections), w1=0.0, w2=-1.0)
 
 
 def line(kkt: KktCertificate) -> Any:
     """The verdict's."""
     return optimal(
-        kkt, level=VerifiedSections.kkt_level, gap=0.0, tolerance=1e-3, better="", known=""
+        kkt, level=VerifiedStructured.kkt_level, gap=0.0, tolerance=1e-3, better="", known=""
     )
 
 
@@ -273,4 +273,4 @@ def test_where_one_gradient_is_enough_there_is_no_kink() -> None:
     assert found.stationarity == pytest.approx(1.0)
     smooth = certificate(told, of.minimiser, np.zeros((2, 2)))
     assert smooth.kink is None
-    assert smooth.stationarity <= VerifiedSections.kkt_level
+    assert smooth.stationarity <= VerifiedStructured.kkt_level

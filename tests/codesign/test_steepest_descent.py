@@ -8,8 +8,8 @@ import pytest
 from helpers import problem
 
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.studies import baselines as module
 from ccd_casadi.studies.steepest_descent import steepest_descent
 
@@ -21,17 +21,17 @@ def test_a_step_is_accepted_by_what_its_gradient_is_of(
     """A step that lowers the error lowers what the bandwidth falls by: by that none is accepted."""
     best = np.array([70.0, 70.0]) if of_error else np.array([55.0, 55.0])
 
-    def value(_: object, theta: list[float]) -> SectionsValue:
+    def value(_: object, theta: list[float]) -> StructuredValue:
         away = np.array(theta) - best
         size = 1.0 + float(away @ away)
         slope = tuple(2.0 * away * (1.0 if of_error else -1.0))
         known = {"bandwidth": 1000.0 - size} | ({"error": size} if of_error else {})
         design = cast(SectionsDesign, SimpleNamespace(certified=True))
-        return SectionsValue(tuple(theta), gradient=slope, design=design, syntheses=1, **known)
+        return StructuredValue(tuple(theta), gradient=slope, design=design, syntheses=1, **known)
 
-    monkeypatch.setattr(module, "sections_value", value)
+    monkeypatch.setattr(module, "structured_value", value)
     case = problem(
-        controller=SectionsProblem(minimise="rms_error") if of_error else SectionsProblem(),
+        controller=StructuredProblem(minimise="rms_error") if of_error else StructuredProblem(),
         w1=0.0, w2=1.0 if of_error else -1.0,
     )  # fmt: skip
     found = steepest_descent(case, (62.0, 61.0), first_step=0.2)

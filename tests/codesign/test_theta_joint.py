@@ -15,8 +15,8 @@ from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import nearby, uncertain_plant, with_sections
-from ccd_casadi.inner_problem.sections_search import with_range
+from ccd_casadi.inner_problem.structured_plant_set import nearby, uncertain_plant, with_structured
+from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -32,7 +32,7 @@ def built(start: tuple[float, float] = (55.0, 55.0)) -> CoDesignProblem:
     corners = uncertain_plant(problem, problem.start).corners()
     members = tuple((option, tuple(map(float, point))) for option, point in corners)
     kappa = tuple(STORED["sections"]["kappa"])
-    return replace(with_sections(problem, anchors=(kappa,), members=members), start=start)
+    return replace(with_structured(problem, anchors=(kappa,), members=members), start=start)
 
 
 def test_what_the_first_order_leaves_out_is_of_second_order() -> None:

@@ -20,7 +20,7 @@ from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.robust import demands
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -79,7 +79,7 @@ def test_a_new_stage_is_a_case_that_can_be_solved(
     problem = problem_of(load_case(case))
     assert scaled_plant(problem, (19.0, 8.0)).B.shape[1] == 1
     assert main(["check", str(case), "--quiet"]) == 0
-    assert isinstance(problem.controller, SectionsProblem)
+    assert isinstance(problem.controller, StructuredProblem)
     schema = json.loads((folder / "case.schema.json").read_text())
     jsonschema.validate(tomllib.loads(case.read_text()), schema)
 

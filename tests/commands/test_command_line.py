@@ -146,7 +146,7 @@ def test_a_wrong_case_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     path = tmp_path / "x.toml"
     path.write_text("[plants]\n")
     assert run(main, parser("a.command", ""), [str(path)]) == ExitCode.BAD_INPUT
-    assert capsys.readouterr() == ("", f"{path}: plants: unknown section; did you mean plant?\n")
+    assert capsys.readouterr() == ("", f"{path}: plants: unknown table; did you mean plant?\n")
 
 
 def test_a_bug_is_not_hidden() -> None:

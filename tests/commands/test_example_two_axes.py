@@ -12,16 +12,16 @@ import pytest
 
 from ccd_casadi.cases.case import parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.sections_entries import active_of, design_dict
+from ccd_casadi.codesign.structured_entries import active_of, design_dict
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.deployment.as_designed import require_own_bounds
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_search import prepared
 from ccd_casadi.inner_problem.sections_words import channel_words
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.errors import UserError
 
@@ -85,7 +85,7 @@ def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
     problem = as_shipped()[0]
 
     def at(h: float) -> tuple[BandwidthSample, Envelope | None]:
-        value = sections_value(problem, (h,))
+        value = structured_value(problem, (h,))
         own = BandwidthSample((h,), value.bandwidth, value.gradient, np.nan, np.nan, (), "", 0.0, 1)
         return own, value.envelope
 

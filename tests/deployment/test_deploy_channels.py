@@ -20,7 +20,7 @@ from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.drawing.paint import painted
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import structure_of, uncertain_plant
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.reporting.deploy_page import deploy_page

@@ -13,20 +13,20 @@ from helpers import HZ, first_crossing, reference_plant, sensitivity_gain, state
 from helpers import two_mass_model as model
 from kinds import kinds
 from test_measured_case import written
-from test_sections_error import CABLES
+from test_structured_error import CABLES
 
 from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
-from ccd_casadi.codesign import outer_mixed, outer_sections
+from ccd_casadi.codesign import outer_mixed, outer_structured
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.inner_answer import measured_answer
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.inner_problem import sections_bandwidth
+from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.sampling import sampler
@@ -37,10 +37,10 @@ from ccd_casadi.synthesis import derivatives, synthesis
 KINDS = kinds()
 SYNTHESISE = [  # every way to a controller
     (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design"),
-    (sections_bandwidth, "synthesise"), (sections_bandwidth, "least_value"),
+    (structured_bandwidth, "synthesise"), (structured_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design
-    "mixed": (outer_mixed, "kkt_certificate"), "sections": (outer_sections, "worst_members"),
+    "mixed": (outer_mixed, "kkt_certificate"), "sections": (outer_structured, "worst_members"),
 }  # fmt: skip
 EVERY = {  # beside the schema's
     "compliance_max", "compliance_words", "cost_unit", "force_step_max", "globality", "iterates",
@@ -102,7 +102,7 @@ def test_the_value_is_that_of_the_controller(run: Run) -> None:
     hz = np.geomspace(0.1, 1e3, 4000)
     found = first_crossing(lambda w: sensitivity_gain(G, K, w), HZ * hz, np.sqrt(0.5)) / HZ
     # ω_b is the largest that the shape allows
-    if isinstance(run.problem.controller, SectionsProblem):
+    if isinstance(run.problem.controller, StructuredProblem):
         shape = run.problem.controller.shape
         gain = sensitivity_gain(G, K, HZ * hz)
         found = min(found, float((shape * hz / gain).min()) * np.sqrt(0.5))

@@ -19,9 +19,9 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.figure import MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
-from ccd_casadi.inner_problem.sections_search import least_from, prepared
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_search import least_from, prepared
 from ccd_casadi.lti.hold import Sampling, sampled, tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -186,7 +186,7 @@ def test_a_catalogue_is_met_at_its_motors() -> None:
 def small() -> CoDesignProblem:
     """The example with one plant beside the model's, and a PID."""
     problem = problem_of(load_case(EXAMPLE))
-    sections = sections_of_problem(problem)
+    sections = structured_of(problem)
     structure = replace(sections.structure, biquads=1)
     uncertainty = replace(sections.uncertainty, resonance_shift=0.0)
     few = replace(sections, structure=structure, uncertainty=uncertainty, starts=2)
@@ -215,10 +215,10 @@ def test_the_envelope_gradient_is_the_slope_of_the_least_time() -> None:
     problem, made = least_from(problem, problem.start, made)
     assert made.certified
     theta = np.array([0.0155, 0.85])
-    value = sections_value(problem, theta)
+    value = structured_value(problem, theta)
     assert value.feasible
     for i, h in enumerate((2e-6, 1e-4)):
-        ends = [sections_value(problem, theta + sign * h * np.eye(2)[i]) for sign in (1.0, -1.0)]
+        ends = [structured_value(problem, theta + sign * h * np.eye(2)[i]) for sign in (1.0, -1.0)]
         numeric = (ends[0].value - ends[1].value) / (2.0 * h)
         assert value.gradient[i] == pytest.approx(numeric, rel=5e-3)
 

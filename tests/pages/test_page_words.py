@@ -13,7 +13,7 @@ from ccd_casadi.deployment.words import against
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.reporting.facts import conclusion, theta_table, theta_words
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
@@ -29,7 +29,7 @@ def test_the_bounds_drawn_of_sections_are_those_that_they_are_judged_by() -> Non
     problem = problem_of(load_case("runs/two_mass_built.toml"))
     hz = np.geomspace(0.1, 5000.0, 300)
     S, KS, T = kind_of(problem).bounded(problem.weights, np.nan, 50.0).over(hz)
-    assert isinstance(problem.controller, SectionsProblem)
+    assert isinstance(problem.controller, StructuredProblem)
     ended = replace(problem, controller=replace(problem.controller, shape_ends=ShapeEnd.CROSSING))
     short = kind_of(ended).bounded(problem.weights, np.nan, 50.0).over(hz)[0]
     _, W_KS, W_T = np.abs(problem.weights.responses(HZ * hz))

@@ -16,7 +16,7 @@ from html_document import Document
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design

@@ -10,6 +10,7 @@ import pytest
 from html_document import Document
 
 from ccd_casadi.drawing.content import (
+    Chapter,
     Curve,
     Head,
     Landscape,
@@ -17,7 +18,6 @@ from ccd_casadi.drawing.content import (
     Page,
     Panel,
     Picture,
-    Section,
     Table,
     ThetaPath,
     Words,
@@ -65,7 +65,7 @@ def test_tables_round_and_escape() -> None:
     assert '<td class="n">0.33333</td>' in html
     assert '<td class="n">–</td>' in html
     head = Head("t", "good", "", "", "", "")
-    Document(painted(Page(head, (Section("<h>", (Words("x"),)),))))
+    Document(painted(Page(head, (Chapter("<h>", (Words("x"),)),))))
 
 
 @pytest.mark.parametrize(

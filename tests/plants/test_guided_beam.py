@@ -10,14 +10,14 @@ from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.outer_sections import polish_sections
-from ccd_casadi.codesign.post_optimal import sections_responses
+from ccd_casadi.codesign.outer_structured import polish_structured
+from ccd_casadi.codesign.post_optimal import structured_responses
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.inner_problem.sections_search import prepared
+from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.sampler import Sampler
@@ -64,7 +64,7 @@ def test_a_double_pole_does_not_spoil_the_judge() -> None:
 @pytest.fixture(scope="module")
 def anchored() -> CoDesignProblem:
     problem = problem_of(load_case(CASE))
-    assert isinstance(problem.controller, SectionsProblem)
+    assert isinstance(problem.controller, StructuredProblem)
     # where |S| may leap at ω_b the optimum lies on a kink
     few = replace(problem.controller, starts=4, shape_ends=ShapeEnd.CROSSING)
     found, made = prepared(replace(problem, controller=few))
@@ -72,11 +72,11 @@ def anchored() -> CoDesignProblem:
     return found
 
 
-def kink(problem: CoDesignProblem, total: float) -> SectionsValue:
+def kink(problem: CoDesignProblem, total: float) -> StructuredValue:
     """The largest bandwidth of all beams with this sum of heights, in m; it lies on a kink."""
 
-    def at(tip: float) -> tuple[SectionsValue, float]:
-        found = sections_value(problem, (total - tip, tip))
+    def at(tip: float) -> tuple[StructuredValue, float]:
+        found = structured_value(problem, (total - tip, tip))
         return found, found.gradient[1] - found.gradient[0]
 
     low, high = 0.005, 0.006
@@ -95,8 +95,8 @@ def test_the_co_design_ends_on_a_kink_that_is_an_optimum(
     """Both ways along the bound on the volume J rises, and only both sides together say why."""
     with Workers(1) as pool, SampleStore(tmp_path / "samples.sqlite") as store:
         sampler = Sampler(anchored, store, pool)
-        best = polish_sections(sampler, np.array([0.0546, 0.0054]))[1]
-        found = sections_value(anchored, best.theta)
+        best = polish_structured(sampler, np.array([0.0546, 0.0054]))[1]
+        found = structured_value(anchored, best.theta)
         assert best.bandwidth / HZ == pytest.approx(118.3463, abs=2e-4)
         certificate = theta_kkt(anchored, best, sampler, found.envelope)
     assert certificate.active == ("volume",)
@@ -106,7 +106,7 @@ def test_the_co_design_ends_on_a_kink_that_is_an_optimum(
     ((one, other),) = certificate.kink.slopes
     assert min(one, other) > 0.1
     # what the optimum answers to: S_max moves the kink, and J with it
-    answers = sections_responses(anchored, best, found)
+    answers = structured_responses(anchored, best, found)
     told = {item.parameter: item.objective for item in answers.responses}["S_max"]
     ends = []
     for sign in (1.0, -1.0):

@@ -16,7 +16,7 @@ from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.plants.nodes import Between
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, mechanics

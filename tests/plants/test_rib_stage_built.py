@@ -15,7 +15,7 @@ from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main
-from ccd_casadi.inner_problem.sections_plant_set import structure_of
+from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.plants.modal import Suspension

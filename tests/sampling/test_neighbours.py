@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.sampling import sampler as module
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -29,7 +29,7 @@ def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
     def unit(task: tuple[CoDesignProblem, str, str, tuple[float, ...]]) -> tuple[list, tuple]:
         case, _, key, theta = task
         sections, z = case.controller, (theta[0] - 55.0) / 15.0
-        assert isinstance(sections, SectionsProblem)
+        assert isinstance(sections, StructuredProblem)
         known = {*sections.anchors, *sections.error_anchors}
         kappa = GOOD if GOOD in known or z < cliff else POOR
         value, slope = 250.0 + 10.0 * z, 10.0
@@ -48,7 +48,7 @@ def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
 
 
 def two_branches(**changes: object) -> CoDesignProblem:
-    sections = replace(SectionsProblem(anchors=(POOR,)), **changes)  # type: ignore[arg-type]
+    sections = replace(StructuredProblem(anchors=(POOR,)), **changes)  # type: ignore[arg-type]
     return problem(controller=sections, w1=0.0, w2=-1.0 if "minimise" not in changes else 1e6)
 
 

@@ -7,8 +7,8 @@ from typing import Any
 from ccd_casadi.codesign.verdict import LEAST_SHIFT
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.inner_problem.sections_robustness import LOOSE
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_robustness import LOOSE
 
 CLOSE = 1e-6
 
@@ -23,7 +23,7 @@ def contradictions(result: Mapping[str, Any], problem: CoDesignProblem) -> list[
 def _claims(r: Mapping[str, Any], problem: CoDesignProblem) -> Iterator[tuple[bool, str]]:
     checks, lines = r["checks"], r["verdict"]
     failed = {name: line["state"] == "failed" for name, line in lines.items()}
-    sections = isinstance(problem.controller, SectionsProblem)
+    sections = isinstance(problem.controller, StructuredProblem)
     yield (r["status"] == "verified") == all(checks.values()), "status and checks"
     yield (r["status"] == "verified") == (not any(failed.values())), "status and lines"
     yield sum(r["spent"].values()) == r["syntheses"], "spent and syntheses"
@@ -75,7 +75,7 @@ def _survives(
         yield whole * modulus >= 1.0 - CLOSE, "the model's peak above the set's"
         nominal = r["robust"]["nominal_sensitivity_peak"]
         yield abs(nominal * modulus - 1.0) <= CLOSE, "two peaks of S on the model"
-    elif isinstance(problem.controller, SectionsProblem):
+    elif isinstance(problem.controller, StructuredProblem):
         u = problem.controller.uncertainty
         ends = [(1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) - 1.0 for s in (-1, 1)]
         yield kept <= (within[0] <= ends[0] and ends[1] <= within[1]), "the box is kept, not along"

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 from helpers import problem
-from test_sections_codesign import PID, quick
-from test_sections_error import least
+from test_structured_codesign import PID, quick
+from test_structured_error import least
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_problem import Uncertainty
+from ccd_casadi.inner_problem.structured_problem import Uncertainty
 
 
 def kinds() -> dict[str, CoDesignProblem]:

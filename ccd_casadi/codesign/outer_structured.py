@@ -21,35 +21,41 @@ import numpy as np
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End, dear
 from ccd_casadi.codesign.outer_theta import ThetaOuter
-from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
+from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import objectives_beside, together, with_members
 from ccd_casadi.codesign.theta_kkt import theta_kkt
-from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
+from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import told_time
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value, valued
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value, valued
+from ccd_casadi.inner_problem.structured_plant_set import (
     plants_of,
-    sections_of_problem,
     structure_of,
+    structured_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_robustness import (
+from ccd_casadi.inner_problem.structured_problem import Member
+from ccd_casadi.inner_problem.structured_robustness import (
     fresh_yield,
     judged_widely,
     proof_of,
     tolerance_prices,
     worst_members,
 )
-from ccd_casadi.inner_problem.sections_search import joined, least_from, prepared, race, with_range
+from ccd_casadi.inner_problem.structured_search import (
+    joined,
+    least_from,
+    prepared,
+    race,
+    with_range,
+)
 from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.neighbours import WORTH, alone
@@ -84,7 +90,7 @@ def seeded_and_prepared(
 
     Second, in words, why there are no anchors; empty where there are.
     """
-    own = replace(sections_of_problem(problem), seed=seed)
+    own = replace(structured_of(problem), seed=seed)
     problem = with_range(replace(problem, controller=own))
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
@@ -92,43 +98,43 @@ def seeded_and_prepared(
         tell = teller("search at the start", quiet)
         anchored, made = prepared(problem, tell, workers)
         anchored, made = least_from(anchored, problem.start, made, tell)
-        own, start = sections_of_problem(anchored), problem.start
+        own, start = structured_of(anchored), problem.start
         words = "" if made.certified else made.words
         alone = len(own.members) == len(uncertain_plant(problem, start).corners())
         if made.certified and alone and problem.figure is BANDWIDTH:
             # No plant was found worse: this is the search that an end at the start would ask for.
             value = valued(anchored, start, plants_of(anchored, start), made, 1)
-            Sampler(anchored, store, Workers(1)).kept("race", start, SectionsValue, lambda: value)
+            Sampler(anchored, store, Workers(1)).kept("race", start, StructuredValue, lambda: value)
         return Seeds(own.anchors, own.members, own.error_anchors, words)
 
     key = sample_key(owner, problem.start, 0.0, 0.0)
     seeds = store.kept(key, owner, problem.start, Seeds, found)
-    sections = replace(
-        sections_of_problem(problem), anchors=seeds.anchors, members=seeds.members,
+    structured = replace(
+        structured_of(problem), anchors=seeds.anchors, members=seeds.members,
         error_anchors=seeds.error_anchors,
     )  # fmt: skip
-    return replace(problem, controller=sections), seeds.words
+    return replace(problem, controller=structured), seeds.words
 
 
-def raced_at(sampler: Sampler, best: BandwidthSample) -> SectionsValue:
+def raced_at(sampler: Sampler, best: BandwidthSample) -> StructuredValue:
     """A multi-start search at the θ of a sample, from its controller too, with all its optima,
     counted; from the store if it is there."""
     problem, theta = joined(sampler.problem, np.array(best.kappa), ()), best.theta
 
-    def raced() -> SectionsValue:
+    def raced() -> StructuredValue:
         made = race(problem, theta, teller("search at the end", sampler.quiet), sampler.workers)
         found = valued(problem, theta, plants_of(problem, theta), made, 1)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
     sampler.raced(sample_key(sampler.hash, theta, 0.0, 0.0))
-    return sampler.kept("race", theta, SectionsValue, raced)
+    return sampler.kept("race", theta, StructuredValue, raced)
 
 
-def value_at(sampler: Sampler, best: BandwidthSample) -> SectionsValue:
+def value_at(sampler: Sampler, best: BandwidthSample) -> StructuredValue:
     """A sample with its design and envelope, from the store where it was made before."""
     problem = alone(sampler.problem, best.kappa) if best.kappa else sampler.problem
-    make = partial(sections_value, problem, best.theta)
-    return sampler.of(problem).kept("value", best.theta, SectionsValue, make)
+    make = partial(structured_value, problem, best.theta)
+    return sampler.of(problem).kept("value", best.theta, StructuredValue, make)
 
 
 def teller(label: str, quiet: bool) -> Callable[[str], None]:
@@ -150,23 +156,23 @@ TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
 @dataclass(frozen=True)
-class SectionsEnd(End):
+class StructuredEnd(End):
     """With the sampler of the problem that has it, its value and that one's design and gradients,
     a multi-start search there (None where plants are to be added first), the worst plant, and those
     to add."""
 
     asked: Sampler
     best: BandwidthSample
-    found: SectionsValue
-    raced: SectionsValue | None
+    found: StructuredValue
+    raced: StructuredValue | None
     worst: Excess
     members: tuple[Member, ...]
 
 
-class SectionsOuter(ThetaOuter):
+class StructuredOuter(ThetaOuter):
     """See the module; `words` say why the search at the start found no anchors."""
 
-    kkt_level = VerifiedSections.kkt_level
+    kkt_level = VerifiedStructured.kkt_level
 
     def __init__(self, sampler: Sampler, words: str = "") -> None:
         super().__init__(sampler)
@@ -176,36 +182,36 @@ class SectionsOuter(ThetaOuter):
     def may_try_again(self) -> bool:
         return not dear(self.problem)
 
-    def prepared(self, seed: int) -> "SectionsOuter":
+    def prepared(self, seed: int) -> "StructuredOuter":
         """Searched at the start for anchors and the plant set, where there are none."""
         sampler = self.sampler
-        if sections_of_problem(sampler.problem).anchors:
+        if structured_of(sampler.problem).anchors:
             return self
         problem, words = seeded_and_prepared(
             sampler.store, sampler.problem, seed, sampler.quiet, sampler.workers
         )
         sampler.raced(sampler.hash)
-        lost = words and not sections_of_problem(problem).anchors
-        return SectionsOuter(sampler.of(problem), words if lost else "")
+        lost = words and not structured_of(problem).anchors
+        return StructuredOuter(sampler.of(problem), words if lost else "")
 
-    def continued(self, folder: Path, seed: int) -> "SectionsOuter":
+    def continued(self, folder: Path, seed: int) -> "StructuredOuter":
         """With the anchors, plants and controller of a run; those of a search where it has none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
             return self.prepared(seed)
         result = read_json(path)
         problem = with_function(path, sampler.problem, result)
-        outer = SectionsOuter(sampler.of(problem)).prepared(seed)
+        outer = StructuredOuter(sampler.of(problem)).prepared(seed)
         if (folder / "controller.json").exists():
             theta = [float(result["theta"][name]) for name in problem.names]
             outer.sampler.climbed(theta, sections_kappa(folder, structure_of(problem)))
         return outer
 
-    def ended(self, x: Array) -> SectionsEnd:
+    def ended(self, x: Array) -> StructuredEnd:
         asked, theta = self.sampler, self.theta_of(x)
         for _ in range(TAKEN):
             with asked.spent.on("polish"):
-                asked, best = polish_sections(asked, theta)
+                asked, best = polish_structured(asked, theta)
             problem, found = asked.problem, value_at(asked, best)
             tell = teller("at the end", asked.quiet)
             worst, members = worst_members(problem, best.theta, found.design, 0, tell)
@@ -215,16 +221,16 @@ class SectionsOuter(ThetaOuter):
                 break
             asked.climbed(best.theta, raced.design.kappa.tolist())
             theta = np.array(best.theta)
-        return SectionsEnd(
+        return StructuredEnd(
             np.array(best.theta), best.value, objective_of(problem, best),
             theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found, raced,
             worst, members,
         )  # fmt: skip
 
-    def joined(self, end: End) -> "SectionsOuter | None":
+    def joined(self, end: End) -> "StructuredOuter | None":
         """With plants that it does not keep, of those searched or drawn for this alone: fresh ones
         judge the answer."""
-        end = cast(SectionsEnd, end)
+        end = cast(StructuredEnd, end)
         problem, theta, members = end.asked.problem, end.best.theta, end.members
         tell = teller("at the end", end.asked.quiet)
         for look in range(1, LOOKS + 1 if end.feasible and not members else 1):
@@ -234,10 +240,10 @@ class SectionsOuter(ThetaOuter):
         if not members:
             return None
         anchored = joined(problem, end.found.design.kappa, ())
-        return SectionsOuter(with_members(end.asked.of(anchored), members))
+        return StructuredOuter(with_members(end.asked.of(anchored), members))
 
-    def verified(self, end: End, rounds: int) -> VerifiedSections:
-        end = cast(SectionsEnd, end)
+    def verified(self, end: End, rounds: int) -> VerifiedStructured:
+        end = cast(StructuredEnd, end)
         asked, best, made, worst = end.asked, end.best, end.found.design, end.worst
         problem = asked.problem
         raced = raced_at(asked, best) if end.raced is None else end.raced
@@ -257,7 +263,7 @@ class SectionsOuter(ThetaOuter):
             if problem.figure is MOVE_TIME:
                 told = told_time(problem, best.theta, made.controller, best.value)
             bar.advance()
-        return VerifiedSections(
+        return VerifiedStructured(
             problem=problem,
             theta=best.theta,
             value=best.value,
@@ -284,14 +290,14 @@ class SectionsOuter(ThetaOuter):
 
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.bandwidths(x, "the run's own design")[0]
-        return sections_responses(self.problem, sample, value_at(self.sampler, sample))
+        return structured_responses(self.problem, sample, value_at(self.sampler, sample))
 
 
-def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: SectionsValue) -> float:
+def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: StructuredValue) -> float:
     return problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
 
 
-def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
+def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more plants, where worse ones were found.
 
@@ -319,4 +325,4 @@ def _stationary(sampler: Sampler, best: BandwidthSample) -> bool:
     """Whether a sample is optimal to first order, by the gradients of several sides of it."""
     envelope = value_at(sampler, best).envelope
     kkt = theta_kkt(sampler.problem, best, envelope=envelope)
-    return kkt.stationarity <= VerifiedSections.kkt_level
+    return kkt.stationarity <= VerifiedStructured.kkt_level

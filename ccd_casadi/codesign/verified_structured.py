@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
-from ccd_casadi.codesign.sections_entries import (
+from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
     proof_dict,
@@ -24,10 +24,10 @@ from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, uncertain_plant
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.inner_problem.sections_search import joined
+from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
+from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_search import joined
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -47,20 +47,21 @@ class Costs:
 
 def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> Costs:
     """The climbs from a certified design with parameters κ (SI)."""
-    sections = replace(sections_of_problem(problem), minimise="bandwidth")
+    structured = replace(structured_of(problem), minimise="bandwidth")
     model = tuple(map(float, uncertain_plant(problem, theta).nominal))
 
-    def climbed(easier: SectionsProblem) -> float:
-        value = sections_value(joined(replace(problem, controller=easier), kappa, ()), theta)
+    def climbed(easier: StructuredProblem) -> float:
+        value = structured_value(joined(replace(problem, controller=easier), kappa, ()), theta)
         return value.bandwidth if value.feasible else float("nan")
 
     return Costs(
-        climbed(replace(sections, members=((0, model),))), climbed(replace(sections, sampling=None))
+        climbed(replace(structured, members=((0, model),))),
+        climbed(replace(structured, sampling=None)),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifiedSections(Verified):
+class VerifiedStructured(Verified):
     """The design of a run, judged on its set and on the whole box of plants.
 
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
@@ -71,7 +72,7 @@ class VerifiedSections(Verified):
     """
 
     design: SectionsDesign
-    raced: SectionsValue
+    raced: StructuredValue
     wide: Certificate
     checked: int
     proof: Proof
@@ -123,36 +124,36 @@ class VerifiedSections(Verified):
         return design_dict(self.problem, self.theta, self.design)
 
     def evidence(self, predicted: float) -> dict[str, Any]:
-        sections = sections_of_problem(self.problem)
+        structured = structured_of(self.problem)
         found: dict[str, Any] = {
-            "surrogate_bandwidth_hz": predicted / HZ if sections.figure is BANDWIDTH else None,
+            "surrogate_bandwidth_hz": predicted / HZ if structured.figure is BANDWIDTH else None,
             "race": [
                 {"bandwidth_hz": optimum.bandwidth / HZ, "searches": optimum.count}
                 for optimum in self.raced.design.local_optima
             ],
             "rounds": self.rounds,
-            "anchors": [list(kappa) for kappa in sections.anchors],
+            "anchors": [list(kappa) for kappa in structured.anchors],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
             "costs": clean({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
             | {"tolerances_hz": {name: 0.01 * w / HZ for name, w in self.prices.items()}},
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
-        if sections.figure is not BANDWIDTH:
-            entry = sections.figure.entry
+        if structured.figure is not BANDWIDTH:
+            entry = structured.figure.entry
             found |= {
                 f"{entry}_of_set": self.value,
                 f"surrogate_{entry}": predicted,
                 f"{entry}_raced": self.raced.value,
-                "error_anchors": [list(kappa) for kappa in sections.error_anchors],
+                "error_anchors": [list(kappa) for kappa in structured.error_anchors],
             }
-        if sections.uncertainty.ranges:
-            found["varies"] = {name: ends for name, *ends in sections.uncertainty.ranges}
+        if structured.uncertainty.ranges:
+            found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
         if self.told is not None:
             time, drawn = self.told
             found |= {"move_time": time,
                       "move_time_fresh": None if drawn is None else drawn.entry}  # fmt: skip
-        if sections.weighted_level is None:
+        if structured.weighted_level is None:
             words = "KS and T are not bounded: the case gives no controller.weighted_level"
             found["notes"] = [*plant_of(self.problem).notes(self.theta), words]
         return found
@@ -160,7 +161,7 @@ class VerifiedSections(Verified):
     def _robust_entry(self) -> dict[str, Any]:
         """The judge on a lattice of the box, and the worst plant that was searched."""
         stable = [plant for plant in self.wide.plants if plant.stable]
-        members = sections_of_problem(self.problem).members
+        members = structured_of(self.problem).members
         return {
             "stable": len(stable) == len(self.wide.plants),
             "plants": self.checked,

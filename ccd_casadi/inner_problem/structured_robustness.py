@@ -1,7 +1,7 @@
 """A controller of fixed structure on the whole box of plants: the worst of them, judge, proof.
 
-The worst plants join the set that `sections_bandwidth` designs for; the judge looks at a lattice of
-the box beside them, branch and bound at all of it.
+The worst plants join the set that `structured_bandwidth` designs for; the judge looks at a lattice
+of the box beside them, branch and bound at all of it.
 """
 
 from collections.abc import Sequence
@@ -20,14 +20,14 @@ from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, wors
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import goal_of
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_bandwidth import goal_of
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
-    sections_of_problem,
     structure_of,
+    structured_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.inner_problem.structured_problem import Member
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -58,7 +58,7 @@ def worst_members(
     worst, found = worse_members(problem, uncertain, made.kappa, made.bandwidth, turn, progress)
     if problem.figure is MOVE_TIME and made.controller is not None:
         value = float(np.exp(goal_of(problem, theta, ()).at(made.kappa)[0]))
-        seed = sections_of_problem(problem).seed + turn
+        seed = structured_of(problem).seed + turn
         time, option, point = latest_plant(problem, theta, made.controller, seed)
         if progress is not None:
             progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms told")
@@ -77,15 +77,15 @@ def worse_members(
     within: float = WITHIN,
 ) -> tuple[Excess, tuple[Member, ...]]:
     """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     heads, count = worst_plants(
-        uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem), sections.sampling,
-        seed=sections.seed + turn,
+        uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem), structured.sampling,
+        seed=structured.seed + turn,
     )  # fmt: skip
     if progress is not None:
         progress(f"{np.exp(heads[0].value):.6g} of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
-    known = list(sections.members)
+    known = list(structured.members)
     found: list[Member] = []
     for head in heads:
         near = [
@@ -109,10 +109,10 @@ def judged_widely(
 
     The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
     """
-    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
-    points = [*lattice(uncertain, CHECKED, sections.seed + 1000), (worst.option, worst.point)]
+    structured, uncertain = structured_of(problem), uncertain_plant(problem, theta)
+    points = [*lattice(uncertain, CHECKED, structured.seed + 1000), (worst.option, worst.point)]
     if not uncertain.names:
-        points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
+        points = uncertain.corners()[: 1 + len(structured.uncertainty.options)]
     return _judged(problem, uncertain.plants(points), controller, workers), len(points)
 
 
@@ -126,11 +126,11 @@ def fresh_yield(
 
     The options are drawn alike often. None where there is no box to draw from.
     """
-    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
+    structured, uncertain = structured_of(problem), uncertain_plant(problem, theta)
     if not uncertain.names or made.controller is None:
         return None
     count = FRESH if plant_of(problem).outputs == 1 else FRESH_OF_SEVERAL
-    rng, (low, high) = np.random.default_rng((sections.seed, FRESH_SEED)), uncertain.box
+    rng, (low, high) = np.random.default_rng((structured.seed, FRESH_SEED)), uncertain.box
     option = rng.integers(len(uncertain.options), size=count).tolist()
     point = rng.uniform(low, high, (count, len(low)))
     plants = uncertain.plants(list(zip(option, point, strict=True)))
@@ -152,10 +152,10 @@ def proof_of(
     workers: Pool | None = None,
 ) -> Proof:
     """Branch and bound over the whole box of plants at θ."""
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     return prove(
         uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
-        bounds_of(problem), sections.sampling, workers=workers,
+        bounds_of(problem), structured.sampling, workers=workers,
     )  # fmt: skip
 
 
@@ -171,12 +171,12 @@ def tolerance_prices(
     uncertain, plants = uncertain_plant(problem, theta), []
     if problem.figure is not BANDWIDTH or not uncertain.names:
         return {}
-    for option, point in sections_of_problem(problem).members or uncertain.corners():
+    for option, point in structured_of(problem).members or uncertain.corners():
         plant = uncertain.sloped(np.array(point), option)
         further = (np.array(point) - uncertain.nominal)[:, None, None]
         slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
         plants.append(replace(plant, **slopes))
-    sampling = sections_of_problem(problem).sampling
+    sampling = structured_of(problem).sampling
     found = bandwidth_envelope(plants, bounds_of(problem), made, sampling)
     gradient = [] if found is None else found.gradient.tolist()
     return dict(zip(uncertain.names, gradient, strict=False))
@@ -196,9 +196,9 @@ def _judged(
     controller: StateSpace,
     workers: Pool | None = None,
 ) -> Certificate:
-    sections, bounds = sections_of_problem(problem), bounds_of(problem)
+    structured, bounds = structured_of(problem), bounds_of(problem)
     integrator = structure_of(problem).integrator
     return certify(
-        plants, controller, bounds.looser(LOOSE), sections.sampling, integrator=integrator,
+        plants, controller, bounds.looser(LOOSE), structured.sampling, integrator=integrator,
         workers=workers,
     )  # fmt: skip

@@ -64,7 +64,7 @@ class ChannelProblem:
 
 
 @dataclass(frozen=True)
-class SectionsProblem(ControllerProblem):
+class StructuredProblem(ControllerProblem):
     """Structure, bounds beyond S_max and S_low, hold and delay, the uncertainty, and the search.
 
     `weighted_level` is of |W_KS KS| and |W_T T|, W_T at the lower end of ω_T; None: no bound, as

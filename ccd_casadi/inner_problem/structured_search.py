@@ -14,17 +14,22 @@ from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_value import LeastValue, least_value
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import goal_of, searched, sections_value, too_slow
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_bandwidth import (
+    goal_of,
+    searched,
+    structured_value,
+    too_slow,
+)
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
-    sections_of_problem,
+    structured_of,
     uncertain_plant,
     with_channels,
-    with_sections,
+    with_structured,
 )
-from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_robustness import worst_members
+from ccd_casadi.inner_problem.structured_problem import Member
+from ccd_casadi.inner_problem.structured_robustness import worst_members
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
@@ -46,9 +51,9 @@ def race(
 
     Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
     """
-    sections, plants = sections_of_problem(problem), plants_of(problem, theta)
-    anchors = [np.array(kappa) for kappa in sections.anchors]
-    starts = None if only_anchors else sections.starts
+    structured, plants = structured_of(problem), plants_of(problem, theta)
+    anchors = [np.array(kappa) for kappa in structured.anchors]
+    starts = None if only_anchors else structured.starts
     made = searched(problem, plants, anchors, starts, progress, workers)
     if made.certified or starts is None or starts >= ENOUGH:
         return made
@@ -62,17 +67,17 @@ def with_range(problem: CoDesignProblem) -> CoDesignProblem:
     A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
     """
     problem = with_channels(problem)
-    sections = sections_of_problem(problem)
-    if sections.frequencies is not None:
+    structured = structured_of(problem)
+    if structured.frequencies is not None:
         return problem
     plant = scaled_plant(problem, problem.start)
     poles = np.abs(np.linalg.eigvals(plant.A))
     fastest = FASTEST * max(1.0, float(poles.max())) * plant.omega_0
     slowest = SLOWEST * plant.omega_0
-    if sections.sampling is not None:
-        fastest = min(fastest, 2.0 / sections.sampling.period)
+    if structured.sampling is not None:
+        fastest = min(fastest, 2.0 / structured.sampling.period)
         slowest = min(slowest, 0.01 * fastest)
-    return with_sections(problem, frequencies=(slowest, fastest))
+    return with_structured(problem, frequencies=(slowest, fastest))
 
 
 def prepared(
@@ -87,22 +92,22 @@ def prepared(
     search's last; where it is not certified the problem has no anchors, and each θ is searched on
     its own. All of it is of the largest bandwidth, whatever the problem minimises.
     """
-    asked = sections_of_problem(problem).minimise
-    problem = with_range(with_sections(problem, minimise="bandwidth"))
+    asked = structured_of(problem).minimise
+    problem = with_range(with_structured(problem, minimise="bandwidth"))
     corners = uncertain_plant(problem, problem.start).corners()
     members = tuple((option, tuple(map(float, point))) for option, point in corners)
-    problem = with_sections(problem, members=members)
+    problem = with_structured(problem, members=members)
 
     made = race(problem, problem.start, progress, workers, only_anchors)
     for turn in range(ROUNDS):
         wider = _wider(problem, problem.start, made, turn, progress) if made.certified else None
         if wider is None:
             break
-        problem = with_sections(wider, anchors=_anchors(made))
-        made = sections_value(problem, problem.start).design
+        problem = with_structured(wider, anchors=_anchors(made))
+        made = structured_value(problem, problem.start).design
     if made.certified:
-        problem = with_sections(problem, anchors=_anchors(made))
-    return with_sections(problem, minimise=asked), made
+        problem = with_structured(problem, anchors=_anchors(made))
+    return with_structured(problem, minimise=asked), made
 
 
 def _wider(
@@ -111,8 +116,8 @@ def _wider(
 ) -> CoDesignProblem | None:  # fmt: skip
     """The problem with the plants that are worse than its own, None where there are none."""
     found = worst_members(problem, theta, made, turn, progress)[1]
-    members = (*sections_of_problem(problem).members, *found)
-    return with_sections(problem, members=members) if found else None
+    members = (*structured_of(problem).members, *found)
+    return with_structured(problem, members=members) if found else None
 
 
 def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
@@ -128,9 +133,9 @@ def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
 
 def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) -> CoDesignProblem:
     """The problem with one more anchor, first, of what it minimises, and more members."""
-    sections = sections_of_problem(problem)
-    sections = sections.with_anchor(tuple(map(float, kappa)), MOST_ANCHORS + 1)
-    return replace(problem, controller=replace(sections, members=(*sections.members, *members)))
+    structured = structured_of(problem)
+    structured = structured.with_anchor(tuple(map(float, kappa)), MOST_ANCHORS + 1)
+    return replace(problem, controller=replace(structured, members=(*structured.members, *members)))
 
 
 def least_value_at(
@@ -146,12 +151,12 @@ def least_value_at(
     """
     wider = problem
     for turn in range(ROUNDS_OF_ERROR):
-        problem, sections = wider, sections_of_problem(wider)
+        problem, structured = wider, structured_of(wider)
         plants = plants_of(problem, theta)
         found = least_value(
             plants, bounds_of(problem), made, goal_of(problem, theta, plants),
-            sampling=sections.sampling, least_bandwidth=sections.bandwidth_least,
-            initial=[np.array(kappa) for kappa in sections.error_anchors], progress=progress,
+            sampling=structured.sampling, least_bandwidth=structured.bandwidth_least,
+            initial=[np.array(kappa) for kappa in structured.error_anchors], progress=progress,
         )  # fmt: skip
         wider = _wider(problem, theta, found.design, turn, progress) or problem
         if wider is problem:

@@ -20,7 +20,7 @@ from ccd_casadi.cases.checks import (
 
 
 @dataclass(frozen=True)
-class ChannelSection:
+class ChannelTable:
     """[controller.channel.NAME] of a plant with several outputs: what differs from [controller].
 
     `outputs`: how the channel's measurement is made of the plant's, `inputs`: how its force acts on
@@ -68,7 +68,7 @@ class ChannelSection:
 
 
 @dataclass(frozen=True)
-class ControllerSection:
+class ControllerTable:
     """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
     of full order with an input disturbance beside the reference, or "sections".
 
@@ -101,13 +101,13 @@ class ControllerSection:
         says="sections: least damping ratio of zeros and poles",
     )
     starts: int = key(count(1), 12, says="sections: number of starts of the search")
-    channel: tuple[tuple[str, ChannelSection], ...] = key(
+    channel: tuple[tuple[str, ChannelTable], ...] = key(
         table, (), says="tables [controller.channel.NAME] for plants with several outputs"
     )
 
 
 @dataclass(frozen=True)
-class LoopSection:
+class LoopTable:
     """[loop]: sampled with a hold at `rate_hz`; `delay_us` from measurement to force."""
 
     rate_hz: float | None = key(
@@ -125,7 +125,7 @@ class LoopSection:
 
 
 @dataclass(frozen=True)
-class SamplingSection:
+class SamplingTable:
     """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
 
     `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
@@ -141,7 +141,7 @@ class SamplingSection:
 
 
 @dataclass(frozen=True)
-class OuterSection:
+class OuterTable:
     """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
 
     `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
@@ -166,7 +166,7 @@ class OuterSection:
 
 
 @dataclass(frozen=True)
-class BaselineSection:
+class BaselineTable:
     """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
 
     `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
@@ -184,7 +184,7 @@ class BaselineSection:
 
 
 @dataclass(frozen=True)
-class LimitsSection:
+class LimitsTable:
     """[limits]: how long a user's plant function may take at each call, in s."""
 
     plant_seconds: float = key(

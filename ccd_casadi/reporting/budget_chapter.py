@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.budget import BudgetFigures
-from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Section, Table, Words
+from ccd_casadi.drawing.content import Chapter, Curve, Figure, Lines, Panel, Table, Words
 from ccd_casadi.drawing.svg import BLACK, CYCLE
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -17,17 +17,17 @@ SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much
 DECADES = 3.5  # of the error's axis
 
 
-def budget_section(
+def budget_chapter(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
-) -> list[Section]:
+) -> list[Chapter]:
     """Nothing for a problem without a budget."""
     found = loop_budget(problem, theta, controller)
     if found is None:
         return []
     if found.model is None:
         words = "The loop with the model is not stable: it has no stationary error."
-        return [Section("Error budget", (Words(words),))]
-    return [Section("Error budget", (*_table(found, found.model), _figure(found.model)))]
+        return [Chapter("Error budget", (Words(words),))]
+    return [Chapter("Error budget", (*_table(found, found.model), _figure(found.model)))]
 
 
 def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:

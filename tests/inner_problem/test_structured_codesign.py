@@ -9,31 +9,31 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.codesign import outer_sections
+from ccd_casadi.codesign import outer_structured
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
-from ccd_casadi.inner_problem import sections_bandwidth
+from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, with_sections
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
-from ccd_casadi.inner_problem.sections_robustness import (
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
+from ccd_casadi.inner_problem.structured_robustness import (
     judged_corners,
     judged_widely,
     tolerance_prices,
     worst_members,
 )
-from ccd_casadi.inner_problem.sections_search import ENOUGH, prepared, with_range
+from ccd_casadi.inner_problem.structured_search import ENOUGH, prepared, with_range
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 
-PID = SectionsProblem(
+PID = StructuredProblem(
     structure=Structure(biquads=0),
     weighted_level=8.426,
     uncertainty=Uncertainty(resonance_shift=0.03),
@@ -41,7 +41,7 @@ PID = SectionsProblem(
 )
 
 
-def quick(sections: SectionsProblem = PID) -> CoDesignProblem:
+def quick(sections: StructuredProblem = PID) -> CoDesignProblem:
     case = problem(controller=sections, start=(60.0, 60.0))
     return replace(case, inner=replace(case.inner, S_low=0.2))
 
@@ -62,10 +62,10 @@ def test_envelope_gradient_is_the_slope_of_the_true_function(
         sections = replace(PID, sampling=Sampling(8000.0, 80.0))
         case = prepared(quick(sections))[0]
     theta, h = np.array([61.0, 58.0]), 1e-3
-    value = sections_value(case, theta)
+    value = structured_value(case, theta)
     assert value.feasible
     for i in range(2):
-        ends = [sections_value(case, theta + sign * h * np.eye(2)[i]) for sign in (1.0, -1.0)]
+        ends = [structured_value(case, theta + sign * h * np.eye(2)[i]) for sign in (1.0, -1.0)]
         numeric = (ends[0].bandwidth - ends[1].bandwidth) / (2.0 * h)
         assert value.gradient[i] == pytest.approx(numeric, rel=1e-4)
 
@@ -80,18 +80,18 @@ def test_the_price_of_a_tolerance_is_what_another_solve_finds(anchored: CoDesign
             damping=(1.0 - 0.4 * damping, 1.0 + 0.5 * damping),
             gain=0.05 * gain,
         )
-        return with_sections(anchored, uncertainty=own, members=())
+        return with_structured(anchored, uncertainty=own, members=())
 
-    here = sections_value(wider(), theta)
+    here = structured_value(wider(), theta)
     prices = tolerance_prices(wider(), theta, here.design)
     assert list(prices) == ["resonance_shift", "damping", "gain"]
     for name, key in zip(prices, ("shift", "damping", "gain"), strict=True):
-        ends = [sections_value(wider(**{key: 1.0 + sign * h}), theta) for sign in (1.0, -1.0)]
+        ends = [structured_value(wider(**{key: 1.0 + sign * h}), theta) for sign in (1.0, -1.0)]
         numeric = (ends[0].bandwidth - ends[1].bandwidth) / (2.0 * h)
         assert prices[name] == pytest.approx(numeric, rel=1e-2, abs=1e-4 * here.bandwidth)
     assert min(prices.values()) < -1e-2 * here.bandwidth
     assert (
-        tolerance_prices(with_sections(anchored, uncertainty=Uncertainty()), theta, here.design)
+        tolerance_prices(with_structured(anchored, uncertainty=Uncertainty()), theta, here.design)
         == {}
     )
 
@@ -146,7 +146,7 @@ def test_three_formulations_agree_and_a_resumed_run_is_the_same(
 def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) -> None:
     """The judge on two hundred plants between and beside those that were designed for."""
     theta = anchored.start
-    made = sections_value(anchored, theta).design
+    made = structured_value(anchored, theta).design
     worst, missing = worst_members(anchored, theta, made)
     assert not missing
     assert made.controller is not None
@@ -160,13 +160,13 @@ def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) 
 def test_the_range_of_frequencies_is_that_of_the_start() -> None:
     """Alike at every θ, or ω_b* would move with it where it binds."""
     case = with_range(quick())
-    assert isinstance(case.controller, SectionsProblem)
+    assert isinstance(case.controller, StructuredProblem)
     assert case.controller.frequencies is not None
     assert with_range(replace(case, start=(70.0, 70.0))) == replace(case, start=(70.0, 70.0))
 
 
 def test_mixed_sensitivity_is_not_answered_for_sections() -> None:
-    with pytest.raises(UserError, match="sections_value"):
+    with pytest.raises(UserError, match="structured_value"):
         true_inner(quick(), (60.0, 60.0))
 
 
@@ -181,15 +181,15 @@ def test_an_impossible_case_says_what_falls_short(tmp_path: Path) -> None:
 def test_a_search_that_ended_early_goes_on_until_there_is_a_gradient(
     anchored: CoDesignProblem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest, initial = sections_bandwidth.synthesise, []
+    honest, initial = structured_bandwidth.synthesise, []
 
     def early(*arguments: Any, **more: Any) -> SectionsDesign:
         made = honest(*arguments, **more)
         initial.append(more["initial"])
         return replace(made, kkt_residual=2.5e-2) if len(initial) == 1 else made
 
-    monkeypatch.setattr(sections_bandwidth, "synthesise", early)
-    value = sections_value(anchored, (61.0, 58.0))
+    monkeypatch.setattr(structured_bandwidth, "synthesise", early)
+    value = structured_value(anchored, (61.0, 58.0))
     assert value.feasible
     assert np.isfinite(value.gradient).all()
     assert value.design.kkt_residual < 1e-3
@@ -201,15 +201,15 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def raced(case: CoDesignProblem, *_: object) -> tuple[CoDesignProblem, SimpleNamespace]:
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
-        return with_sections(case, anchors=((case.inner.S_max,),)), design
+        return with_structured(case, anchors=((case.inner.S_max,),)), design
 
-    monkeypatch.setattr(outer_sections, "prepared", raced)
+    monkeypatch.setattr(outer_structured, "prepared", raced)
     case = quick(PID)
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
             asked = replace(case, inner=replace(case.inner, S_max=bound))
-            found, words = outer_sections.seeded_and_prepared(store, asked, 0, True)
-            assert (sections_of_problem(found).anchors, words) == (
+            found, words = outer_structured.seeded_and_prepared(store, asked, 0, True)
+            assert (structured_of(found).anchors, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip
 
@@ -218,15 +218,15 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
     anchored: CoDesignProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where no anchor leads to one: a single search with starts, whatever θ the pieces ask for."""
-    honest, searches = sections_bandwidth.searched, []
+    honest, searches = structured_bandwidth.searched, []
 
     def counted(case: Any, plants: Any, initial: Any, starts: Any = None, *rest: Any) -> Any:
         searches.append(starts)
         return honest(case, plants, initial, starts, *rest)
 
-    monkeypatch.setattr(sections_bandwidth, "searched", counted)
+    monkeypatch.setattr(structured_bandwidth, "searched", counted)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
-        alone = Sampler(with_sections(anchored, anchors=()), store, pool)
+        alone = Sampler(with_structured(anchored, anchors=()), store, pool)
         first = alone.bandwidths(np.array(anchored.start))[0]
         best = pieces_from(alone, first, 1e-3, 0.1)
     assert best.value >= first.value * (1.0 - 1e-6)
@@ -236,7 +236,7 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
 
 def test_few_starts_that_miss_are_not_the_last_word() -> None:
     """No search says that it found nothing from fewer starts than the usual number."""
-    impossible = with_sections(quick(), weighted_level=1e-3, starts=1)
+    impossible = with_structured(quick(), weighted_level=1e-3, starts=1)
     made = prepared(impossible)[1]
     assert not made.certified
     assert made.words.startswith(f"none found from {ENOUGH} starts")

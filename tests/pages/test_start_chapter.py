@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.drawing.content import Section
+from ccd_casadi.drawing.content import Chapter
 from ccd_casadi.drawing.paint import blocks_html
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
-from ccd_casadi.reporting.start import start_section
+from ccd_casadi.reporting.start import start_chapter
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import synthesise
 
@@ -27,13 +27,13 @@ def best_at(case: CoDesignProblem, theta: tuple[float, ...]) -> SimpleNamespace:
                            bandwidth=f.bandwidth)  # fmt: skip
 
 
-def html(section: Section) -> str:
+def html(section: Chapter) -> str:
     return blocks_html(section.body, "s")
 
 
 def test_both_sides_are_the_true_inner_problems() -> None:
     case = problem()
-    (section,) = start_section(case, best_at(case, (55.0, 55.0)))
+    (section,) = start_chapter(case, best_at(case, (55.0, 55.0)))
     row = re.search(r"bandwidth ω_b.*?</tr>", html(section), re.DOTALL)
     assert row is not None
     shown = [float(v) for v in re.findall(r">([\d.]+)</td>", row[0])]
@@ -45,7 +45,7 @@ def test_both_sides_are_the_true_inner_problems() -> None:
 
 def test_poles_are_shown_once_a_pair_and_all_damped() -> None:
     case = problem()
-    (section,) = start_section(case, best_at(case, (55.0, 60.0)))
+    (section,) = start_chapter(case, best_at(case, (55.0, 60.0)))
     rows = re.findall(r"<td>optimum</td>.*?>([-\d.e]+)</td>.*?>([-\d.e]+)</td>", html(section))
     assert rows
     assert all(0.0 < float(zeta) <= 1.0 for _, zeta in rows)
@@ -55,7 +55,7 @@ def test_poles_are_shown_once_a_pair_and_all_damped() -> None:
 def test_a_start_that_is_the_optimum_or_has_no_loop_is_said() -> None:
     case = problem()
     verified = best_at(case, (55.0, 55.0))
-    assert start_section(replace(case, start=(55.0, 55.0)), verified) == []
+    assert start_chapter(replace(case, start=(55.0, 55.0)), verified) == []
     tight = replace(case, inner=replace(case.inner, S_max=1.01))
-    (section,) = start_section(tight, verified)
+    (section,) = start_chapter(tight, verified)
     assert "no feasible loop" in html(section)

@@ -15,7 +15,7 @@ from helpers import problem
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.post_optimal import sections_responses
+from ccd_casadi.codesign.post_optimal import structured_responses
 from ccd_casadi.compare import main as compare_main
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
@@ -27,9 +27,9 @@ from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
-from ccd_casadi.inner_problem import sections_robustness
+from ccd_casadi.inner_problem import structured_robustness
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.limitations.basis import Basis
 from ccd_casadi.limitations.of_problem import limits_of_problem
@@ -147,11 +147,11 @@ def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = read_run(folder / "run")
-    monkeypatch.setattr(sections_robustness, "FRESH", 40)
+    monkeypatch.setattr(structured_robustness, "FRESH", 40)
     for more, survived in ((1.0, 40), (1.05, 0)):
         bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
         made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
-        drawn = sections_robustness.fresh_yield(run.problem, run.theta, made)
+        drawn = structured_robustness.fresh_yield(run.problem, run.theta, made)
         assert drawn is not None
         assert (drawn.survived, drawn.draws) == (survived, 40)
 
@@ -231,17 +231,17 @@ def test_insight_draws_the_front_of_the_runs_own_function(folder: Path) -> None:
 def test_responses_against_differences(folder: Path) -> None:
     """dω_b*/dS_max, and dJ*/dp at a θ whose bounds hold it, by two other designs."""
     run = read_run(folder / "run")
-    made = sections_value(run.problem, run.theta)
+    made = structured_value(run.problem, run.theta)
     sample = BandwidthSample(
         run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1
     )
-    found = sections_responses(run.problem, sample, made)
+    found = structured_responses(run.problem, sample, made)
     by_name = {item.parameter: item for item in found.responses}
     h = 1e-3
     ends = []
     for sign in (1.0, -1.0):
         inner = replace(run.problem.inner, S_max=run.problem.inner.S_max + sign * h)
-        ends.append(sections_value(replace(run.problem, inner=inner), run.theta).bandwidth)
+        ends.append(structured_value(replace(run.problem, inner=inner), run.theta).bandwidth)
     slope = (ends[0] - ends[1]) / (2.0 * h)
     assert found.determined
     assert by_name["S_max"].bandwidth == pytest.approx(slope, rel=1e-3)

@@ -11,8 +11,8 @@ from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.support.units import HZ
 
 BINDS = {

@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
 from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, near
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -30,35 +30,35 @@ from ccd_casadi.support.arrays import Array
 ALMOST = 0.99  # of the lowest flexible frequency of all: below it the suspension is
 
 
-def sections_of_problem(problem: CoDesignProblem) -> SectionsProblem:
-    """The sections of a problem that has them."""
-    assert isinstance(problem.controller, SectionsProblem)
+def structured_of(problem: CoDesignProblem) -> StructuredProblem:
+    """The controller part of a structured problem."""
+    assert isinstance(problem.controller, StructuredProblem)
     return problem.controller
 
 
 def bounds_of(problem: CoDesignProblem) -> Bounds:
     """The bounds on every plant, SI."""
-    sections, inner = sections_of_problem(problem), problem.inner
-    weighted = sections.weighted_level is not None
+    structured, inner = structured_of(problem), problem.inner
+    weighted = structured.weighted_level is not None
     return Bounds(
         S_max=inner.S_max,
         S_low=inner.S_low,
         omega_low=inner.omega_low,
-        shape=sections.shape,
-        shape_ends=sections.shape_ends,
-        weighted_level=sections.weighted_level,
+        shape=structured.shape,
+        shape_ends=structured.shape_ends,
+        weighted_level=structured.weighted_level,
         weights=problem.weights if weighted else None,
-        compliance_max=sections.compliance_max,
+        compliance_max=structured.compliance_max,
         channels=_channel_bounds(problem),
     )
 
 
 def _channel_bounds(problem: CoDesignProblem) -> tuple[ChannelBounds, ...]:
     """The channels' own, where they are tighter than the whole's; none where none is."""
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     whole = {"S_max": problem.inner.S_max, "M_K": problem.weights.M_K}
     given = {}
-    for channel in sections.channels:
+    for channel in structured.channels:
         own = {key: getattr(channel, key) for key in whole}
         own = {key: value for key, value in own.items() if value and value < whole[key]}
         if channel.bandwidth_ratio > 1.0:
@@ -74,8 +74,8 @@ def _channel_bounds(problem: CoDesignProblem) -> tuple[ChannelBounds, ...]:
 def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:
     """The controller's structure: one, or one for each channel of a plant with several."""
     if plant_of(problem).outputs == 1:
-        return sections_of_problem(problem).structure
-    channels = sections_of_problem(with_channels(problem)).channels
+        return structured_of(problem).structure
+    channels = structured_of(with_channels(problem)).channels
     names, outputs, inputs = zip(
         *((channel.name, channel.outputs or (), channel.inputs or ()) for channel in channels),
         strict=True,
@@ -87,18 +87,18 @@ def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:
 
 def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
     """The problem with the directions of its channels, by the plant at its start, for every θ."""
-    sections = sections_of_problem(problem)
-    known = {channel.name: channel for channel in sections.channels}
-    given = [channel.outputs is not None for channel in sections.channels]
+    structured = structured_of(problem)
+    known = {channel.name: channel for channel in structured.channels}
+    given = [channel.outputs is not None for channel in structured.channels]
     if plant_of(problem).outputs == 1 or any(given):
         return problem
     found = find_decoupling(scaled_plant(problem, problem.start))
     channels = []
     for i, name in enumerate(found.names):
-        own = known.get(name, ChannelProblem(name, sections.structure))
+        own = known.get(name, ChannelProblem(name, structured.structure))
         outputs, inputs = (tuple(map(float, M[:, i])) for M in (found.outputs, found.inputs))
         channels.append(replace(own, outputs=outputs, inputs=inputs))
-    return with_sections(problem, channels=tuple(channels))
+    return with_structured(problem, channels=tuple(channels))
 
 
 def nearby(
@@ -109,7 +109,7 @@ def nearby(
 
 
 def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
-    given = sections_of_problem(problem).uncertainty.options
+    given = structured_of(problem).uncertainty.options
     return [with_options(problem, options) for options in ((), *given)]
 
 
@@ -120,7 +120,7 @@ def uncertain_plant(
 
     `known`: their matrices, in the place of the plants' own.
     """
-    u, held = sections_of_problem(problem).uncertainty, problem.source.held
+    u, held = structured_of(problem).uncertainty, problem.source.held
     options = _options(problem)
     wider = [plant_of(_with_ranges(option)) for option in options]
 
@@ -136,7 +136,7 @@ def uncertain_plant(
 
 def _with_ranges(problem: CoDesignProblem) -> CoDesignProblem:
     """The problem with what varies as the last of its parameters."""
-    ranges = sections_of_problem(problem).uncertainty.ranges
+    ranges = structured_of(problem).uncertainty.ranges
     if not ranges:
         return problem
     names, lower, upper = zip(*ranges, strict=True)
@@ -161,13 +161,13 @@ def with_options(
 
 def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPlant]:
     """The plant set at θ: its members, or the corners of the box where none are known yet."""
-    uncertain, members = uncertain_plant(problem, theta), sections_of_problem(problem).members
+    uncertain, members = uncertain_plant(problem, theta), structured_of(problem).members
     known = [(option, np.array(point)) for option, point in members]
     return uncertain.plants(known or uncertain.corners())
 
 
-def with_sections(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:
-    return replace(problem, controller=replace(sections_of_problem(problem), **changes))  # type: ignore[arg-type]
+def with_structured(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:
+    return replace(problem, controller=replace(structured_of(problem), **changes))  # type: ignore[arg-type]
 
 
 def warm_starts(
@@ -182,16 +182,16 @@ def warm_starts(
     crossover moves with; a notch stays on its resonance. Of several channels each is moved on its
     own, with the first mode that it sees.
     """
-    sections = sections_of_problem(problem)
-    if not sections.anchors:
+    structured = structured_of(problem)
+    if not structured.anchors:
         return []
     first = scaled_plant(problem, problem.start)
-    anchors = [np.array(kappa) for kappa in sections.anchors]
+    anchors = [np.array(kappa) for kappa in structured.anchors]
 
     def nearer(
         own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array, bounds: Bounds
     ) -> Array:
-        found = problem_for(set_of, own, bounds, sections.sampling, sections.frequencies)
+        found = problem_for(set_of, own, bounds, structured.sampling, structured.frequencies)
         both = [kappa, moved(own, before, set_of[0], kappa)]
         merits = [
             at_its_bandwidth(found, np.clip(in_problem_units(found, one), *found.box)).merit()

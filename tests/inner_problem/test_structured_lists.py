@@ -4,19 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from test_sections_codesign import PID, quick
+from test_structured_codesign import PID, quick
 
-from ccd_casadi.codesign import outer_sections, sections_lists
+from ccd_casadi.codesign import outer_structured, structured_lists
 from ccd_casadi.codesign.catalogue import restricted
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.run import co_design
-from ccd_casadi.codesign.sections_lists import ListedSections
+from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.inner_problem import sections_search
+from ccd_casadi.inner_problem import structured_search
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
-from ccd_casadi.inner_problem.sections_problem import Uncertainty
+from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.inner_problem.structured_problem import Uncertainty
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -39,7 +39,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
     w2: float, beside: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     races = []
-    for module in (outer_sections, sections_search):
+    for module in (outer_structured, structured_search):
         honest = module.race
 
         def counted(*arguments: object, honest: object = honest, **more: object) -> object:
@@ -70,17 +70,17 @@ def test_a_part_is_not_empty_because_no_step_from_nearby_ends_in_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Then a few starts are tried there."""
-    honest = sections_lists._climbed
+    honest = structured_lists._climbed
 
     def lost(sampler: Sampler, theta: Array) -> Solution:
-        near_by = not sections_of_problem(sampler.problem).starts
-        return sections_lists._nothing("lost") if near_by else honest(sampler, theta)
+        near_by = not structured_of(sampler.problem).starts
+        return structured_lists._nothing("lost") if near_by else honest(sampler, theta)
 
     case = listed(w2=-0.995)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
-        search = ListedSections(Direct(starts=1), 0, lambda _: pytest.fail("no judge here"))
+        search = ListedStructured(Direct(starts=1), 0, lambda _: pytest.fail("no judge here"))
         first = search.search(Sampler(restricted(case, {"m1": VALUES[:1]}), store, pool), None)
-        monkeypatch.setattr(sections_lists, "_climbed", lost)
+        monkeypatch.setattr(structured_lists, "_climbed", lost)
         other = Sampler(restricted(case, {"m1": VALUES[-1:]}), store, pool)
         found = search.search(other, first)
     assert found.result["status"] == "searched"

@@ -23,13 +23,13 @@ from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.move_figures import FREE, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
-    sections_of_problem,
     structure_of,
+    structured_of,
     warm_starts,
-    with_sections,
+    with_structured,
 )
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -43,7 +43,7 @@ FEW = 8  # starts of the search at a θ where no anchor ends certified
 
 
 @dataclass(frozen=True)
-class SectionsValue:
+class StructuredValue:
     """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
 
     Of a problem that minimises something else, `error` is that in SI (RMS error in m, time of a
@@ -80,17 +80,17 @@ def searched(
     workers: Pool | None = None,
 ) -> SectionsDesign:
     """The largest bandwidth on plants, from controllers κ in SI and `starts` others beside them."""
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     return synthesise(
-        plants, structure_of(problem), bounds_of(problem), sampling=sections.sampling,
-        starts=starts or 0, seed=sections.seed, initial=initial, only_initial=starts is None,
-        frequencies=sections.frequencies, progress=progress, workers=workers,
+        plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
+        starts=starts or 0, seed=structured.seed, initial=initial, only_initial=starts is None,
+        frequencies=structured.frequencies, progress=progress, workers=workers,
     )  # fmt: skip
 
 
-def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> SectionsValue:
+def structured_value(problem: CoDesignProblem, theta: Sequence[float]) -> StructuredValue:
     """The best certified design from the problem's anchors at θ, and the envelope gradient."""
-    sections = sections_of_problem(problem)
+    structured = structured_of(problem)
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
     initial = warm_starts(problem, structure_of(problem), plants, bounds)
     made: SectionsDesign | None = None
@@ -98,8 +98,8 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     if initial:
         made = searched(problem, plants, initial)
         spent += 1
-    if made is None or (sections.starts and not made.certified):
-        made = searched(problem, plants, initial, min(FEW, sections.starts))
+    if made is None or (structured.starts and not made.certified):
+        made = searched(problem, plants, initial, min(FEW, structured.starts))
         spent += 1
     while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
         again = searched(problem, plants, [made.kappa])
@@ -116,7 +116,7 @@ def valued(
     plants: Sequence[ScaledPlant],
     made: SectionsDesign,
     spent: int,
-) -> SectionsValue:
+) -> StructuredValue:
     """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least of another
     figure."""
     point = tuple(float(v) for v in theta)
@@ -124,12 +124,12 @@ def valued(
     if made.certified and problem.figure is not BANDWIDTH:
         made, error, envelope = _least(problem, theta, plants, made)
     elif made.certified:
-        sampling = sections_of_problem(problem).sampling
+        sampling = structured_of(problem).sampling
         envelope = bandwidth_envelope(plants, bounds_of(problem), made, sampling)
     bandwidth = made.bandwidth if made.certified else np.nan
     gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
     slope = tuple(map(float, gradient))
-    return SectionsValue(point, float(bandwidth), slope, made, spent, float(error), envelope)
+    return StructuredValue(point, float(bandwidth), slope, made, spent, float(error), envelope)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
@@ -141,7 +141,7 @@ def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
 
 def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
     """The design, no longer a certified one where what is minimised asks for more bandwidth."""
-    least = sections_of_problem(problem).bandwidth_least
+    least = structured_of(problem).bandwidth_least
     if made.bandwidth >= least:
         return made
     words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
@@ -154,7 +154,7 @@ def goal_of(
     problem: CoDesignProblem, theta: Sequence[float], plants: Sequence[ScaledPlant]
 ) -> Goal:
     """What is made small besides -ω_b, on the plants of the problem's set at θ."""
-    structure, sampling = structure_of(problem), sections_of_problem(problem).sampling
+    structure, sampling = structure_of(problem), structured_of(problem).sampling
     assert isinstance(structure, Structure)
     if problem.figure is RMS_ERROR:
         assert problem.budget is not None
@@ -171,14 +171,14 @@ def _least(
     made: SectionsDesign,
 ) -> tuple[SectionsDesign, float, Envelope | None]:
     """The design of the least value, that in SI, and its gradients to θ."""
-    sections, bounds = sections_of_problem(problem), bounds_of(problem)
+    structured, bounds = structured_of(problem), bounds_of(problem)
     made = too_slow(problem, made)
     if not made.certified:
         return made, np.nan, None
-    started = with_sections(problem, anchors=sections.error_anchors)
+    started = with_structured(problem, anchors=structured.error_anchors)
     found = least_value(
-        plants, bounds, made, goal_of(problem, theta, plants), sampling=sections.sampling,
-        least_bandwidth=sections.bandwidth_least,
+        plants, bounds, made, goal_of(problem, theta, plants), sampling=structured.sampling,
+        least_bandwidth=structured.bandwidth_least,
         initial=warm_starts(started, structure_of(problem), plants, bounds),
     )  # fmt: skip
     return found.design, found.value, found.envelope

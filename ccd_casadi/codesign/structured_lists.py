@@ -21,22 +21,22 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
-from ccd_casadi.codesign.outer_sections import SectionsOuter
+from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.theta_direct import FAR, pieces_from
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
-    sections_of_problem,
     structure_of,
+    structured_of,
     warm_starts,
-    with_sections,
+    with_structured,
 )
-from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_search import with_range
+from ccd_casadi.inner_problem.structured_problem import Member
+from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -49,7 +49,7 @@ INSIDE = 1e-7  # of λ
 
 
 @dataclass
-class ListedSections:
+class ListedStructured:
     """`search` and `judge` as `best_of_lists` asks for them.
 
     `solve` goes on from a θ to a whole co-design. `members`: all plants that were found worse than
@@ -70,8 +70,8 @@ class ListedSections:
         return self._anew(sampler) if near is None else self._near(sampler, near)
 
     def _anew(self, sampler: Sampler) -> Solution:
-        outer = SectionsOuter(sampler).prepared(self.seed)
-        self.members = sections_of_problem(outer.problem).members
+        outer = StructuredOuter(sampler).prepared(self.seed)
+        self.members = structured_of(outer.problem).members
         found = _climbed(outer.sampler, np.array(sampler.problem.start))
         for theta in design("sobol", *box(sampler.problem), self.formulation.starts, self.seed):
             allowed = _allowed(sampler.problem, theta)
@@ -94,7 +94,7 @@ class ListedSections:
         begun = replace(sampler.problem, start=near.start)
         solution = self.solve(sampler.of(carried(near, begun, self.members)), np.array(near.start))
         if solution.verified is not None:
-            self.members = sections_of_problem(solution.verified.problem).members
+            self.members = structured_of(solution.verified.problem).members
         return solution
 
 
@@ -108,15 +108,15 @@ def carried(
     near: CoDesignProblem, problem: CoDesignProblem, members: tuple[Member, ...]
 ) -> CoDesignProblem:
     """A problem with the anchors of one like it, moved from that one's start to its own."""
-    problem = with_sections(problem, seed=sections_of_problem(near).seed, members=members)
+    problem = with_structured(problem, seed=structured_of(near).seed, members=members)
     problem = with_range(problem)
     plants, bounds = plants_of(problem, problem.start), bounds_of(problem)
     moved = {}
     for name in ("anchors", "error_anchors"):
-        of = with_sections(near, anchors=getattr(sections_of_problem(near), name))
+        of = with_structured(near, anchors=getattr(structured_of(near), name))
         kappas = warm_starts(of, structure_of(problem), plants, bounds)
         moved[name] = tuple(tuple(map(float, kappa)) for kappa in kappas)
-    return with_sections(problem, **moved)
+    return with_structured(problem, **moved)
 
 
 def _start(found: Solution) -> CoDesignProblem:
@@ -124,14 +124,14 @@ def _start(found: Solution) -> CoDesignProblem:
     if found.verified is None:
         assert found.problem is not None
         return found.problem
-    made = cast(VerifiedSections, found.verified)
+    made = cast(VerifiedStructured, found.verified)
     return _at(made.problem, made.theta, tuple(map(float, made.design.kappa)))
 
 
 def _at(
     problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
 ) -> CoDesignProblem:
-    own = replace(sections_of_problem(problem), anchors=(kappa,), error_anchors=())
+    own = replace(structured_of(problem), anchors=(kappa,), error_anchors=())
     return replace(problem, controller=own.with_anchor(kappa, 1), start=theta)
 
 

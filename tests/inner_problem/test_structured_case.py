@@ -11,19 +11,19 @@ from helpers import SUSPENSION, random_plant
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_plant_set import (
+from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
     structure_of,
     uncertain_plant,
     with_channels,
 )
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.rows import problem_hash
@@ -59,7 +59,7 @@ def test_the_shipped_case_comes_back_and_says_what_it_means(tmp_path: Path) -> N
     assert replace(load_case(again), path=case.path) == case
     problem = problem_of(case)
     assert problem.robust is None
-    assert isinstance(problem.controller, SectionsProblem)
+    assert isinstance(problem.controller, StructuredProblem)
     assert problem.controller.structure.order == 8
     assert problem.controller.sampling is not None
     assert problem.controller.sampling.delay == pytest.approx(1e-4)
@@ -244,7 +244,7 @@ def test_the_built_stage_has_its_channels_and_its_option_sets() -> None:
     assert isinstance(structure, ChannelStructure)
     assert structure.decoupling.names == ("z", "tip", "tilt", "twist")
     assert structure.decoupling.orthogonal
-    assert isinstance(problem.controller, SectionsProblem)
+    assert isinstance(problem.controller, StructuredProblem)
     options = [dict(item) for item in problem.controller.uncertainty.options]
     assert [item["modes"] for item in options] == [20, 20]
     assert options[0]["mesh"] == "fine"

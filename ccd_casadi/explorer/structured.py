@@ -17,11 +17,11 @@ from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
-from ccd_casadi.inner_problem.sections_robustness import judged_corners
-from ccd_casadi.inner_problem.sections_search import prepared, with_range
+from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
+from ccd_casadi.inner_problem.structured_robustness import judged_corners
+from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.sampling.rows import Sample, hashes_of, sample_key
-from ccd_casadi.sampling.units import sections_unit
+from ccd_casadi.sampling.units import structured_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome
 
@@ -47,7 +47,7 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
     """The problem with the anchors, plant set and channels of one that was designed before."""
     if known is None:
         return problem
-    mine, theirs = sections_of_problem(problem), sections_of_problem(known)
+    mine, theirs = structured_of(problem), structured_of(known)
     members = theirs.members if mine.uncertainty == theirs.uncertainty else ()
     taken = replace(
         mine, anchors=theirs.anchors, members=members, channels=theirs.channels,
@@ -59,12 +59,12 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
 def designed(task: tuple[CoDesignProblem, Knobs], tell: Progress) -> Designed:
     """The best certified controller at θ from the problem's anchors, or from many starts."""
     problem, knobs = task
-    if not sections_of_problem(problem).anchors:
+    if not structured_of(problem).anchors:
         problem = prepared(replace(problem, start=knobs.theta), progress=tell)[0]
     problem = with_range(problem)
     designs, inner = hashes_of(problem)
     own = sample_key(inner, knobs.theta, 0.0, 0.0)
-    rows, (_, theta, payload) = sections_unit(problem, designs, own, knobs.theta)
+    rows, (_, theta, payload) = structured_unit(problem, designs, own, knobs.theta)
     kappa = np.array(payload["kappa"]) if payload["kappa"] else None
     return Designed(
         problem, knobs, kappa, payload["shortfall"], tuple(rows), (own, inner, theta, payload)

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_words import SectionWords
+from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.reporting.facts import Fact, binding, loop_facts, sensitivity_facts, value_facts
 from ccd_casadi.support.units import HZ, counted, number, shown
 from ccd_casadi.synthesis.closed_loop import measure
@@ -18,12 +18,12 @@ from ccd_casadi.synthesis.synthesis import UNBOUNDED
 MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing
 
 
-def bandwidths_table(verified: VerifiedSections) -> Table:
+def bandwidths_table(verified: VerifiedStructured) -> Table:
     """Every ω_b of the one controller: which plant, and whether sampled."""
     design, problem = verified.design, verified.problem
     assert design.certificate is not None
     assert design.controller is not None
-    sampling, plants = sections_of_problem(problem).sampling, design.certificate.plants
+    sampling, plants = structured_of(problem).sampling, design.certificate.plants
     as_run = "continuous" if sampling is None else f"as sampled at {number(sampling.rate_hz)} Hz"
     least = f"the least of {counted(len(plants), 'plant')} of the set, which J counts"
     rows = [(least, as_run, design.certificate.bandwidth),
@@ -65,7 +65,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
 def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[Block, ...]:
     """What bounds every controller at θ, and what the set, hold and delay cost this structure."""
     costs, gap = result["costs"], result["gap"] or {}
-    sampled = sections_of_problem(problem).sampling is not None
+    sampled = structured_of(problem).sampling is not None
 
     def hz(value: float | None) -> str:
         return "not known" if value is None else f"{number(value, 4)} Hz"
@@ -97,10 +97,10 @@ def tolerance_words(hz: Mapping[str, float]) -> str:
     return f" A tolerance narrower by a tenth would gain, to first order: {', '.join(gains)}."
 
 
-def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
+def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
     certificate, robust = r["certificate"], r["robust"]
     optima = ", ".join(f"{number(o['bandwidth_hz'], 5)} Hz ({o['searches']}×)" for o in r["race"])
-    sampling = sections_of_problem(problem).sampling
+    sampling = structured_of(problem).sampling
     runs = "continuous" if sampling is None else (
         f"{number(sampling.rate_hz)} Hz, {number(sampling.delay_us)} µs from measurement to force"
     )  # fmt: skip
@@ -167,10 +167,10 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
         f"{', '.join(gains)}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
     )
-    return Words(words), sections_table(found)
+    return Words(words), structured_table(found)
 
 
-def sections_table(found: Sequence[SectionWords]) -> Table:
+def structured_table(found: Sequence[SectionWords]) -> Table:
     """Zeros and poles of a controller's sections."""
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
     rows = ((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in found)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from case_documents import TWO_MASS
 from helpers import HZ
-from test_sections_codesign import PID, quick
+from test_structured_codesign import PID, quick
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
 from ccd_casadi.cases.case import CaseError, load_case
@@ -17,13 +17,13 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
-from ccd_casadi.codesign.outer_sections import seeded_and_prepared
+from ccd_casadi.codesign.outer_structured import seeded_and_prepared
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
+from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
@@ -60,14 +60,14 @@ def test_the_gradient_is_the_slope_of_the_least_error(
     sampling: Sampling | None, tmp_path: Path
 ) -> None:
     case = anchored(least(sampling), tmp_path)
-    assert isinstance(case.controller, SectionsProblem)
+    assert isinstance(case.controller, StructuredProblem)
     assert case.controller.error_anchors
     theta, h = np.array([61.0, 59.0]), 0.05
-    value = sections_value(case, theta)
+    value = structured_value(case, theta)
     assert value.feasible
     assert value.bandwidth >= SLOW * (1.0 - 1e-5)
     way = np.array([0.8, 0.6])
-    ends = [sections_value(case, theta + sign * h * way) for sign in (1.0, -1.0)]
+    ends = [structured_value(case, theta + sign * h * way) for sign in (1.0, -1.0)]
     numeric = (ends[0].error - ends[1].error) / (2.0 * h)
     assert np.array(value.gradient) @ way == pytest.approx(numeric, rel=1e-4)
 

@@ -1,4 +1,4 @@
-"""The sections of a case file as frozen dataclasses; each key carries its check and a sentence.
+"""The tables of a case file as frozen dataclasses; each key carries its check and a sentence.
 
 Units are those of the file (Hz where a name says so).
 """
@@ -30,21 +30,21 @@ from ccd_casadi.cases.checks import (
     text,
     text_or_rows,
 )
-from ccd_casadi.cases.controller_sections import (
-    BaselineSection,
-    ControllerSection,
-    LimitsSection,
-    LoopSection,
-    OuterSection,
-    SamplingSection,
+from ccd_casadi.cases.controller_tables import (
+    BaselineTable,
+    ControllerTable,
+    LimitsTable,
+    LoopTable,
+    OuterTable,
+    SamplingTable,
 )
-from ccd_casadi.cases.motion import MotorSection, MoveSection
+from ccd_casadi.cases.motion import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import Shown
 
 
 @dataclass(frozen=True)
-class PlantSection:
+class PlantTable:
     """[plant]: a model's name or function = "file.py:name"; all other keys are its options."""
 
     model: str | None
@@ -85,7 +85,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class ObjectiveSection:
+class ObjectiveTable:
     """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s; else w2 e, e in m, or w2 t, t in s."""
 
     w1: float = key(
@@ -101,7 +101,7 @@ class ObjectiveSection:
 
 
 @dataclass(frozen=True)
-class WeightsSection:
+class WeightsTable:
     """[weights] of the paper's Table 1; M_K in force over displacement.
 
     `disturbance` W_d, of the same unit, with "h_infinity_disturbance": so much force weighs as
@@ -136,7 +136,7 @@ class WeightsSection:
 
 
 @dataclass(frozen=True)
-class InnerSection:
+class InnerTable:
     """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched.
 
     With sections: `minimise` what, "bandwidth" (its negative), the "rms_error" of [budget] or the
@@ -202,7 +202,7 @@ class InnerSection:
 
 
 @dataclass(frozen=True)
-class SuspensionSection:
+class SuspensionTable:
     """[suspension]: where rigid-body poles are put, and how many there must be (default: any)."""
 
     frequency_hz: float = key(
@@ -218,7 +218,7 @@ class SuspensionSection:
 
 
 @dataclass(frozen=True)
-class RobustSection:
+class RobustTable:
     """[robust]: plants on which the loop has to be stable and ‖S‖∞ within S_max; off by default.
 
     `resonance_shift` s: flexible frequencies at `shifts` places from -s to +s (relative), each with
@@ -258,7 +258,7 @@ class RobustSection:
 
 
 @dataclass(frozen=True)
-class PlacesSection:
+class PlacesTable:
     """[places]: forces and sensors between the nodes of a plant, see `plants.places`; m and kg.
 
     A coordinate is a number, the name of a [theta], or that name after a minus sign.
@@ -297,7 +297,7 @@ class PlacesSection:
 
 
 @dataclass(frozen=True)
-class BudgetSection:
+class BudgetTable:
     """[budget]: what moves the stage, by where it enters, and the window of MA and MSD in ms.
 
     Each kind is one table or several of them; their keys are checked in `budget`.
@@ -321,40 +321,40 @@ class Case(Shown):
     """A checked case file."""
 
     path: Path
-    plant: PlantSection
+    plant: PlantTable
     theta: tuple[Parameter, ...]
-    objective: ObjectiveSection
-    weights: WeightsSection
-    inner: InnerSection
-    suspension: SuspensionSection
-    robust: RobustSection
-    controller: ControllerSection
-    loop: LoopSection
-    budget: BudgetSection
-    sampling: SamplingSection
-    outer: OuterSection
-    baseline: BaselineSection
-    limits: LimitsSection
-    motor: MotorSection
-    move: MoveSection
-    places: PlacesSection = field(default_factory=PlacesSection)
+    objective: ObjectiveTable
+    weights: WeightsTable
+    inner: InnerTable
+    suspension: SuspensionTable
+    robust: RobustTable
+    controller: ControllerTable
+    loop: LoopTable
+    budget: BudgetTable
+    sampling: SamplingTable
+    outer: OuterTable
+    baseline: BaselineTable
+    limits: LimitsTable
+    motor: MotorTable
+    move: MoveTable
+    places: PlacesTable = field(default_factory=PlacesTable)
     fixed: tuple[Parameter, ...] = ()
 
 
-SECTIONS: dict[str, type] = {
-    "objective": ObjectiveSection,
-    "weights": WeightsSection,
-    "inner": InnerSection,
-    "suspension": SuspensionSection,
-    "places": PlacesSection,
-    "robust": RobustSection,
-    "controller": ControllerSection,
-    "loop": LoopSection,
-    "budget": BudgetSection,
-    "sampling": SamplingSection,
-    "outer": OuterSection,
-    "baseline": BaselineSection,
-    "limits": LimitsSection,
-    "motor": MotorSection,
-    "move": MoveSection,
+TABLES: dict[str, type] = {
+    "objective": ObjectiveTable,
+    "weights": WeightsTable,
+    "inner": InnerTable,
+    "suspension": SuspensionTable,
+    "places": PlacesTable,
+    "robust": RobustTable,
+    "controller": ControllerTable,
+    "loop": LoopTable,
+    "budget": BudgetTable,
+    "sampling": SamplingTable,
+    "outer": OuterTable,
+    "baseline": BaselineTable,
+    "limits": LimitsTable,
+    "motor": MotorTable,
+    "move": MoveTable,
 }
