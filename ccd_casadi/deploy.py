@@ -34,6 +34,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.structured_text import structured_text
     from ccd_casadi.deployment.words import deployed_line
     from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.reporting.facts import run_name
 
     finished = read_run(options.run)
     status = finished.result.get("status")
@@ -73,7 +74,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
         naming = {
-            "title": options.run.resolve().name, "delay": found.delay, "verified": found.passed
+            "title": run_name(options.run), "delay": found.delay, "verified": found.passed
         }  # fmt: skip
         texts = write_c(folder, found.realisation, **naming, forward=moved.forward)
         (folder / ST_FILE).write_text(structured_text(found.realisation, **naming), "utf-8")

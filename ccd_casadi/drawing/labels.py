@@ -15,6 +15,8 @@ POINT = 3.0  # pt; half a marker
 # places beside a point, in pt, after the one that was asked for
 AROUND = ((0, 7), (8, 3), (-8, 3), (0, -7), (8, -5), (-8, -5), (0, 20), (12, 16), (-12, 16),
           (0, -20), (12, -18), (-12, -18))  # fmt: skip
+FAR = 16.0  # pt from a point to its words, from where on a line leads to it
+LEADER = {"arrowstyle": "-", "color": "#444444", "linewidth": 0.6, "shrinkA": 0.0, "shrinkB": POINT}
 SHARES = (0.0, 0.2, 0.45, 0.75, 0.1, 0.3, 0.6, 0.9)  # of a line's length where words may begin
 APART = 2.0  # pt between the points that a curve is looked at by
 BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
@@ -114,8 +116,11 @@ class Labels:
         if found is not None:
             dx, dy = places[found][1]
             side = "center" if dx == 0 else "left" if dx > 0 else "right"
-            held = self._held(x, y)
-            self._write(text, (dx, dy), (x, y), "data", held, ha=side, va=_above(dy), bbox=BEHIND)
+            held, look = self._held(x, y), {"arrowprops": LEADER} if abs(dy) >= FAR else {}
+            made = self._write(text, (dx, dy), (x, y), "data", held, ha=side, va=_above(dy),
+                               bbox=BEHIND, **look)  # fmt: skip
+            if look:
+                made.arrow_patch.set_gid(f"leader-{held}")
 
     def along(self, value: float, text: str, vertical: bool) -> None:
         """A label at a line across the axes; upright beside a vertical one, or level with a place
@@ -184,8 +189,8 @@ class Labels:
     def _write(
         self, text: str, offset: tuple[float, float], place: tuple[float, float],
         coordinates: Any, held: str, **look: Any,
-    ) -> None:  # fmt: skip
-        self._axes.annotate(
+    ) -> Any:  # fmt: skip
+        return self._axes.annotate(
             text, place, xycoords=coordinates, xytext=offset, textcoords="offset points",
             fontsize=SIZE, annotation_clip=False, zorder=6, gid=held, **look,
         )  # fmt: skip

@@ -24,12 +24,13 @@ from ccd_casadi.drawing.content import (
     Words,
 )
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.facts import run_name, theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.robustness_figures import named
@@ -48,7 +49,7 @@ def deploy_page(
     """report.html of a deployment; `index`: the page that links all of the run."""
     meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
     head = head_of(
-        f"Controller of {run.folder.resolve().name}, deployed", found.passed,
+        f"Controller of {run_name(run.folder)}, deployed", found.passed,
         short_status(run, found), reason_words(run, found), meta, _conclusion(run, found),
         run.result,
     )  # fmt: skip
@@ -76,42 +77,42 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
 
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:
-    """The loops beside each other: name, colour, line."""
+    """The loops beside each other: name, colour, line; nothing is reduced of what was designed."""
     G, K = run.plant.plant_si(), found.realisation.system
-    return (
-        (Loop(G, run.controller), "full", BLUE, "-"),
-        (Loop(G, found.reduced), "reduced", GREEN, "--"),
-        (Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"),
-    )
+    sampled = Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"
+    if kind_of(run.problem).as_designed:
+        return (Loop(G, run.controller), "continuous", BLUE, "-"), sampled
+    full = Loop(G, run.controller), "full", BLUE, "-"
+    return full, (Loop(G, found.reduced), "reduced", GREEN, "--"), sampled
 
 
 def _loop(run: FinishedRun, found: Deployment) -> Figure:
     nyquist = 0.5 * found.rate_hz
     low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
     hz = frequency_grid(low, high, POINTS, run.plant.grid * run.plant.omega_0 / HZ)
-    curves, drawn = [], []
+    curves, drawn, names = [], [], []
     for loop, name, colour, line in _loops(run, found):
         G, K = loop.responses(HZ * hz)
-        how = "continuous" if loop.sampling is None else f"at {number(found.rate_hz)} Hz"
-        label = f"{name}{',' if loop.sampling is None else ''} {how}"
+        label = name if loop.sampling is None else f"{name} at {number(found.rate_hz)} Hz"
         curves.append(Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
         drawn.append(Curve(hz, largest(K), "", colour, line))
+        names.append(name)
     gains, controllers = ([curve.y for curve in each] for each in (curves, drawn))
-    S_max = run.problem.inner.S_max
-    bandwidth = run.figures.bandwidth / HZ
-    crossing = bandwidth_level(bandwidth, text=", continuous")
+    S_max, own = run.problem.inner.S_max, found.sampled.bandwidth / HZ
+    crossing = bandwidth_level(own, text=", sampled") if np.isfinite(own) else (
+        bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")
+    )  # fmt: skip
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named(run, 'S')} (–)")
     bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist))
-    title = "Sensitivity and controller: full, reduced and sampled, over frequency"
-    table = over_frequency(
-        ("Hz", "|S| full", "reduced", "sampled", "|K| full N/m", "reduced N/m", "sampled N/m"),
-        hz, *gains, *controllers,
-    )  # fmt: skip
-    ends = [shown(each[-1], "N/m") for each in controllers]
+    title = f"Sensitivity and controller over frequency: {', '.join(names)}"
+    head = ("Hz", *(f"|S| {name}" for name in names), *(f"|K| {name} N/m" for name in names))
+    table = over_frequency(head, hz, *gains, *controllers)
+    ends = (f"{shown(each[-1], 'N/m')} ({name})"
+            for name, each in zip(names, controllers, strict=True))  # fmt: skip
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
-        f"up to half the sampling rate. There the controller's gain, which sensor noise and "
-        f"unmodelled resonances meet, is {ends[2]} (reduced: {ends[1]}, full: {ends[0]})."
+        "up to half the sampling rate. The gain of the controller there amplifies sensor noise and "
+        f"unmodelled resonances. It is {', '.join(ends)}."
     )
     return Figure(Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption, (table,))
 
