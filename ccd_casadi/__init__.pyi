@@ -33,6 +33,7 @@ from ccd_casadi.robust.study import robustness as robustness
 from ccd_casadi.studies.comparison import compare as compare
 from ccd_casadi.support.errors import UserError as UserError
 from ccd_casadi.support.units import HZ as HZ
+from ccd_casadi.synthesis.choice import choose_inputs as choose_inputs
 from ccd_casadi.synthesis.interchange import plant_from_control as plant_from_control
 from ccd_casadi.synthesis.synthesis import synthesise as synthesise
 from ccd_casadi.synthesis.weights import Weights as Weights

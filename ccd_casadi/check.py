@@ -70,7 +70,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
     case = load_case(options.case)
     problem = problem_of(case)
-    facts, findings = diagnose(problem, case.suspension.rigid_modes, options.quiet, options.seed)
+    facts, findings = diagnose(problem, case.suspension.rigid_modes, options.seed)
     errors = [f for f in findings if f.severity is Severity.ERROR]
     for item in errors:
         say(f"{options.case}: plant: {item.words}", sys.stderr)

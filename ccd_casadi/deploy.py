@@ -27,7 +27,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
     from ccd_casadi.deployment.fmu import FILE as FMU_FILE
     from ccd_casadi.deployment.fmu import write_fmu
-    from ccd_casadi.deployment.move import Hardware
+    from ccd_casadi.deployment.move import Electronics
     from ccd_casadi.deployment.on_hardware import on_hardware
     from ccd_casadi.deployment.pipeline import deploy
     from ccd_casadi.deployment.structured_text import FILE as ST_FILE
@@ -54,7 +54,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     if kind_of(finished.problem).as_designed:
         channels = 0
     steps = channels + 2 + (options.saturation is not None)
-    with Progress(steps, "deploying", options.quiet) as bar:
+    with Progress(steps, "deploying") as bar:
         found = deploy(
             finished, timing, saturation=options.saturation,
             progress=lambda words: bar.advance(note=words),
@@ -63,7 +63,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             moved = on_hardware(
                 finished.plant.plant_si(), found.realisation, found.delay,
                 finished.figures.bandwidth, limits=move_limits(options), window=options.window,
-                hardware=Hardware(
+                hardware=Electronics(
                     options.sensor_step, options.force_step, options.jitter, options.seed
                 ),
                 progress=lambda words: bar.advance(note=words),

@@ -200,7 +200,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         from ccd_casadi.reporting.solve_page import write_report
 
         plant_case, solved = resolved(case, solution), solution.problem or problem
-        write_report(folder, plant_case, solved, solution, quiet=options.quiet)
+        write_report(folder, plant_case, solved, solution)
         if not options.quiet:
             say(f"page          {folder / 'index.html'}")
     if options.quiet and code is not ExitCode.DONE:

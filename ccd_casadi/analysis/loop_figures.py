@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import frequency_and_damping
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
@@ -33,26 +34,21 @@ RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % le
 
 
 @dataclass(frozen=True)
-class StepFigures:
-    """A unit step of each reference: overshoot and the last time outside 2 %, s (inf: not within
-    the time that was looked at); the largest displacement after 1 N, m, that at rest included."""
-
-    overshoot: float
-    settling: float
-    by_force: float
-
-
-@dataclass(frozen=True)
 class LoopFigures:
     """The least margins of all plants, with the crossover of the model; the worst step.
 
-    `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
-    `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near ω_b; `ringing`: the
-    closed-loop root of least damping within an octave of ω_b, on any plant, where that is small.
+    Of a unit step of a reference `overshoot` and `settling`, the last time outside 2 % in s (inf:
+    not within the time that was looked at); `by_force`: the largest displacement by 1 N in m, that
+    at rest included. `growth`: the largest factor by which σ_max(S) grows within a tenth of an
+    octave above ω_b. `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near
+    ω_b; `ringing`: the closed-loop root of least damping within an octave of ω_b, on any plant,
+    where that is small.
     """
 
     margins: ClassicalMargins
-    step: StepFigures
+    overshoot: float
+    settling: float
+    by_force: float
     growth: float
     light_roots: tuple[tuple[float, float, str], ...]
     ringing: tuple[float, float] | None
@@ -72,21 +68,21 @@ def loop_figures(
     steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
     above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
     sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
+    overshoot, settling, by_force = map(max, zip(*steps, strict=True))
     return LoopFigures(
-        margins=replace(least_of(margins), crossover=margins[0].crossover),
-        step=StepFigures(
-            max(s.overshoot for s in steps),
-            max(s.settling for s in steps),
-            max(s.by_force for s in steps),
-        ),
+        replace(least_of(margins), crossover=margins[0].crossover),
+        overshoot,
+        settling,
+        by_force,
         growth=max(float((size / size[0]).max()) for size in sizes),
         light_roots=light_roots(controller, bandwidth),
         ringing=ringing(np.concatenate([loop.poles for loop in loops]), bandwidth),
     )
 
 
-def step_figures(loop: Loop, bandwidth: float) -> StepFigures:
-    """Of each reference and each force in turn, the worst."""
+def step_figures(loop: Loop, bandwidth: float) -> tuple[float, float, float]:
+    """Overshoot, settling and displacement as in `LoopFigures`: of each reference and each force
+    in turn, the worst."""
     duration = PERIODS * HZ / bandwidth
     steps = loop.over_a_step(duration / (PERIODS * PER_PERIOD))
     count = int(duration / steps.period) + 1
@@ -100,33 +96,25 @@ def step_figures(loop: Loop, bandwidth: float) -> StepFigures:
         settling = max(settling, float(time[last]) if last < count else np.inf)
     rest = steps.C_y @ np.linalg.solve(np.eye(len(steps.A)) - steps.A, steps.B_d)
     moved = [float(np.abs(constant_drive(steps, drive, count)).max()) for drive in steps.B_d.T]
-    return StepFigures(overshoot, settling, max(*moved, float(np.abs(rest).max())))
+    return overshoot, settling, max(*moved, float(np.abs(rest).max()))
 
 
-def ringing(poles: Array, bandwidth: float) -> tuple[float, float] | None:
+def ringing(poles: np.ndarray, bandwidth: float) -> tuple[float, float] | None:
     """Frequency in rad/s and damping of the least damped of `poles` within an octave of ω_b, if
     that damping is below 0.05."""
-    size = np.maximum(np.abs(poles), 1e-300)
-    near = (np.abs(np.log2(size / bandwidth)) <= 1.0) & (-poles.real < RINGING * size)
-    found = zip(size[near], -poles.real[near] / size[near], strict=True)
-    return min(((float(w), float(d)) for w, d in found), key=lambda root: root[1], default=None)
+    found = zip(*frequency_and_damping(poles), strict=True)
+    near = [(float(w), float(d)) for w, d in found if bandwidth <= 2.0 * w <= 4.0 * bandwidth]
+    return min((root for root in near if root[1] < RINGING), key=lambda r: r[1], default=None)
 
 
 def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, float, str], ...]:
     """Poles and zeros of K with damping below 0.1 within 20 % of ω_b, ascending."""
-    found = []
-    for word, roots in (
-        ("zero", controller.zeros(bandwidth)),
-        ("pole", np.linalg.eigvals(controller.A)),
-    ):
-        size = np.abs(roots)
-        damping = -roots.real / np.maximum(size, 1e-300)
-        near = (np.abs(size / bandwidth - 1.0) <= NEAR) & (np.abs(damping) < LIGHT)
-        chosen = near & (roots.imag > 0.0)
-        found += [
-            (float(w), float(d), word) for w, d in zip(size[chosen], damping[chosen], strict=True)
-        ]
-    return tuple(sorted(found))
+    return tuple(sorted(
+        (float(w), float(d), word)
+        for word, roots in (("zero", controller.zeros(bandwidth)), ("pole", controller.poles))
+        for w, d in zip(*frequency_and_damping(roots), strict=True)
+        if abs(w / bandwidth - 1.0) <= NEAR and abs(d) < LIGHT
+    ))  # fmt: skip
 
 
 def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> tuple[Array, Array]:
@@ -227,8 +215,8 @@ def loop_entry(
     """The figures under the keys of `result.json`; the modulus margin is 1/‖S‖∞."""
     found = loop_figures(plants, controller, sampling, bandwidth)
     return _entry(found.margins, sensitivity_peak) | {
-        "step_overshoot": found.step.overshoot,
-        "settling_ms": 1e3 * found.step.settling,
-        "force_step_max": found.step.by_force,
+        "step_overshoot": found.overshoot,
+        "settling_ms": 1e3 * found.settling,
+        "force_step_max": found.by_force,
         "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth, found.ringing),
     }

@@ -4,17 +4,36 @@ to give instead. Each carries what JSON Schema can say of the same, for editors 
 import difflib
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, dataclass, field
-from typing import Any
+from dataclasses import MISSING, Field, dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import one_line
 
 LARGEST, SMALLEST = 1e30, 1e-30  # beyond them squares and products leave double precision
+Test = Callable[[Any], str | None]  # what is wrong with a value; None where nothing is
+
+
+class CaseError(UserError):
+    """One line: file, key, what is wrong, what to do."""
+
+
+@dataclass(frozen=True)
+class Fail:
+    """The error of a case file by its key and what is wrong."""
+
+    path: Path
+
+    def __call__(self, key: str, words: str) -> CaseError:
+        return CaseError(one_line(f"{self.path}: {key}: {words}"))
 
 
 @dataclass(frozen=True)
 class Check:
     """A check, called with a value, and its JSON Schema, which may let more pass."""
 
-    test: Callable[[Any], str | None]
+    test: Test
     schema: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, value: Any) -> str | None:
@@ -22,7 +41,7 @@ class Check:
         return self.test(value)
 
 
-def _with(schema: Mapping[str, Any]) -> Callable[[Callable[[Any], str | None]], Check]:
+def _with(schema: Mapping[str, Any]) -> Callable[[Test], Check]:
     return lambda test: Check(test, schema)
 
 
@@ -172,6 +191,7 @@ ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
 NOT_NEGATIVE = number(0.0, math.inf, "give 0 or more", closed=True)
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
+DAMPING = number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True)
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
 points = every(count(2), "give two whole numbers of at least 2", 2, 2)
@@ -215,9 +235,36 @@ def closest(name: str, known: Collection[str]) -> str:
     return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"
 
 
-def key(check: Check, default: Any = MISSING, *, says: str, unit: str = "") -> Any:
-    """The field of a table's dataclass that a key is."""
+USUAL = {float: POSITIVE, int: count(0), bool: flag, str: text}  # checks of a key, by its type
+SUFFIXES = {"_hz": "Hz", "_us": "µs", "_ms": "ms"}
+
+
+def key(says: str, default: Any = MISSING, *, check: Check | None = None, unit: str = "") -> Any:
+    """The field of a table's dataclass that a key is; `check` where its type has another one."""
     metadata = {"check": check, "says": says, "unit": unit}
     if default is MISSING:
         return field(metadata=metadata)
     return field(default=default, metadata=metadata)
+
+
+def check_of(item: Field[Any]) -> Check:
+    """Its own, or the usual one of its type: a number above 0, a count, true or false, a text."""
+    kind: Any = (*get_args(item.type), item.type)[0]
+    return item.metadata["check"] or USUAL[kind]
+
+
+def unit_of(item: Field[Any]) -> str:
+    """Its own, or that which the key's name ends with."""
+    return item.metadata["unit"] or SUFFIXES.get(item.name[-3:], "")
+
+
+def require_good(
+    place: str, table: Mapping[str, Any], checks: Mapping[str, Test], fail: Fail
+) -> None:
+    """Raise the error of the first key of a table that is unknown, or not as its check wants it."""
+    for name, value in table.items():
+        if name not in checks:
+            raise fail(f"{place}.{name}", f"unknown key{closest(name, checks)}")
+        wrong = checks[name](value)
+        if wrong is not None:
+            raise fail(f"{place}.{name}", wrong)

@@ -47,8 +47,9 @@ def points_to_check(problem: CoDesignProblem, seed: int = 0) -> list[tuple[float
     return list(dict.fromkeys(tuple(float(value) for value in row) for row in rows))
 
 
+@lru_cache(maxsize=4)
 def diagnose(
-    problem: CoDesignProblem, rigid_modes: int | None = None, quiet: bool = True, seed: int = 0
+    problem: CoDesignProblem, rigid_modes: int | None = None, seed: int = 0
 ) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
     """Facts and findings of the problem's plant over its box; `rigid_modes` are expected if given.
 
@@ -56,33 +57,13 @@ def diagnose(
     `points_to_check`; asked again, they are not computed again. Raises PlantError where the
     model's function fails.
     """
-    return _diagnosed(problem, rigid_modes, _Quiet(quiet), seed)
-
-
-class _Quiet:
-    """Whether there is a bar: equal to any other, since it changes nothing of what is found."""
-
-    def __init__(self, yes: bool) -> None:
-        self.yes = yes
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Quiet)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@lru_cache(maxsize=4)
-def _diagnosed(
-    problem: CoDesignProblem, rigid_modes: int | None, quiet: _Quiet, seed: int
-) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
     plant = plant_of(problem)
     facts: list[PlantFacts] = []
     findings = list(_outside(problem, plant))
     if findings:
         return (), tuple(findings)
     points = points_to_check(problem, seed)
-    with Progress(len(points), "checking the plant", quiet=quiet.yes) as progress:
+    with Progress(len(points), "checking the plant") as progress:
         for index, theta in enumerate(points):
             progress.advance(int(index > 0))
             place = f"at theta = {theta_words(plant, theta)}" if index else "at the start"

@@ -19,7 +19,6 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 
 LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
-LIMIT = "no bandwidth above "
 FAR = 3.0  # how far outside the frequencies that [inner] searches effort may end
 DECIBEL = 3.0  # from here on a peak of S is more likely one in dB
 # in SI, by how a person writes them
@@ -51,12 +50,16 @@ class Topic(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about the plant; `index` of the θ where it was seen, among those looked at."""
+    """One sentence about the plant; `index` of the θ where it was seen, among those looked at.
+
+    `limit_hz`: the bandwidth above which none is possible there.
+    """
 
     severity: Severity
     topic: Topic
     words: str
     index: int
+    limit_hz: float = np.inf
 
 
 def zero_findings(facts: PlantFacts, S_max: float, index: int, place: str) -> list[Finding]:
@@ -84,12 +87,12 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, index: int, place: str) 
     z, limit = zero.frequency_hz, bandwidth_limit_hz(zero, S_max)
     words = (
         f"a transmission zero in the right half-plane at {z:.4g} Hz {place}: with a peak of S of "
-        f"{S_max:g} {LIMIT}{limit:.3g} Hz is possible there (Poisson integral), and well before "
-        f"it, from about {0.5 * z:.3g} Hz on, robustness is lost; move sensor and actuator closer "
-        "together"
+        f"{S_max:g} no bandwidth above {limit:.3g} Hz is possible there (Poisson integral), and "
+        f"well before it, from about {0.5 * z:.3g} Hz on, robustness is lost; move sensor and "
+        "actuator closer together"
     )
-    severe = z < 2.0 * facts.effort_hz
-    return Finding(Severity.WARNING if severe else Severity.NOTE, Topic.ZERO, words, index)
+    severity = Severity.WARNING if z < 2.0 * facts.effort_hz else Severity.NOTE
+    return Finding(severity, Topic.ZERO, words, index, limit)
 
 
 def _dip(zero: Zero, index: int) -> Finding:
@@ -105,10 +108,8 @@ def _dip(zero: Zero, index: int) -> Finding:
 
 def most_limiting(findings: Sequence[Finding]) -> list[Finding]:
     """All findings, of the right half-plane warnings only that with the lowest limit."""
-    severe = [f for f in findings if f.severity is Severity.WARNING and LIMIT in f.words]
-    if not severe:
-        return list(findings)
-    worst = min(severe, key=lambda f: float(f.words.split(LIMIT)[1].split()[0]))
+    severe = [f for f in findings if f.severity is Severity.WARNING and f.limit_hz < np.inf]
+    worst = min(severe, key=lambda f: f.limit_hz, default=None)
     return [f for f in findings if f is worst or f not in severe]
 
 

@@ -10,24 +10,23 @@ with [inner], [controller] structure = "sections", [weights] where weighted_leve
 [loop] rate_hz: then the response was measured as the controller sees it, hold and delay in it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.cases.case import CaseError, read_toml, table_of
-from ccd_casadi.cases.checks import count, shown, text
+from ccd_casadi.cases.case import read_toml, table_of
+from ccd_casadi.cases.checks import Fail, count, require_good, shown, text
 from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
 from ccd_casadi.cases.tables import TABLES, BudgetTable, InnerTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import one_line
 from ccd_casadi.support.units import HZ
 
 MODEL = "measured"
 _TABLES = ("weights", "inner", "controller", "loop")
-_PLANT = {"file": text, "unstable_poles": count(0), "poles_at_zero": count(0)}
+_PLANT = {"model": text, "file": text, "unstable_poles": count(0), "poles_at_zero": count(0)}
 
 
 @dataclass(frozen=True)
@@ -50,9 +49,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
     if not isinstance(plant, Mapping) or plant.get("model") != MODEL:
         return None
 
-    def fail(key: str, words: str) -> CaseError:
-        return CaseError(one_line(f"{path}: {key}: {words}"))
-
+    fail = Fail(path)
     for name, table in data.items():
         if name not in ("plant", *_TABLES):
             raise fail(
@@ -84,16 +81,8 @@ def measured_case(path: Path) -> MeasuredCase | None:
     )
 
 
-def _response(
-    plant: Mapping[str, Any], path: Path, fail: Callable[[str, str], CaseError]
-) -> MeasuredResponse:
-    for key, value in plant.items():
-        if key != "model" and key not in _PLANT:
-            known = ", ".join(_PLANT)
-            raise fail(f"plant.{key}", f"is not an option of {MODEL}; known are {known}")
-        wrong = None if key == "model" else _PLANT[key](value)
-        if wrong is not None:
-            raise fail(f"plant.{key}", wrong)
+def _response(plant: Mapping[str, Any], path: Path, fail: Fail) -> MeasuredResponse:
+    require_good("plant", plant, _PLANT, fail)
     if "file" not in plant:
         raise fail("plant.file", f"is missing; add it, which {MODEL} needs")
     try:
@@ -104,7 +93,7 @@ def _response(
     return replace(found, unstable_poles=unstable, poles_at_zero=at_zero)
 
 
-def _check(tables: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -> None:
+def _check(tables: Mapping[str, Any], fail: Fail) -> None:
     inner, controller, loop = (tables[name] for name in ("inner", "controller", "loop"))
     if controller.structure != "sections":
         words = 'needs structure = "sections": a synthesis of full order has no model to start from'

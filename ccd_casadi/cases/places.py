@@ -1,16 +1,13 @@
 """[places] of a case: nodes read from their file, and its places as the plant takes them."""
 
 import csv
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
-from ccd_casadi.cases.checks import shown
+from ccd_casadi.cases.checks import Fail, shown
 from ccd_casadi.cases.tables import PlacesTable
 from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.plants.places import Places
-
-Fail = Callable[[str, str], Exception]
 
 
 def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:

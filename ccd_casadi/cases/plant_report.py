@@ -78,13 +78,8 @@ def _sources(problem: CoDesignProblem) -> list[dict[str, Any]]:
     if problem.budget is None:
         return []
     return [
-        {
-            "name": source.name,
-            "kind": source.kind.value,
-            "rms": source.spectrum.rms(),
-            "unit": source.unit,
-        }
-        for source in problem.budget.sources
+        {"name": s.name, "kind": s.kind.value, "rms": s.spectrum.rms(), "unit": s.unit}
+        for s in problem.budget.sources
     ]
 
 

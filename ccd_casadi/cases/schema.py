@@ -9,6 +9,7 @@ from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
+from ccd_casadi.cases.checks import check_of, unit_of
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.parameters import KEYS as THETA
@@ -115,8 +116,8 @@ def keys_page() -> str:
                 (
                     item.name,
                     "required" if _required(item) else _shown(item.default),
-                    item.metadata["unit"],
-                    item.metadata["says"] + _values(item.metadata["check"].schema),
+                    unit_of(item),
+                    item.metadata["says"] + _values(check_of(item).schema),
                 )
                 for item in fields(kind)
             ]
@@ -131,9 +132,9 @@ def keys_page() -> str:
 def _table(kind: type) -> dict[str, Any]:
     found = {}
     for item in fields(kind):
-        unit = item.metadata["unit"]
+        unit = unit_of(item)
         says = item.metadata["says"] + (f", in {unit}" if unit else "")
-        found[item.name] = dict(item.metadata["check"].schema) | {"description": says}
+        found[item.name] = dict(check_of(item).schema) | {"description": says}
         if item.default not in (MISSING, None, ()):
             found[item.name]["default"] = item.default
     return {

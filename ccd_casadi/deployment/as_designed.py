@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.channels import Channel, along, split
+from ccd_casadi.deployment.channels import LoopChannel, along, split
 from ccd_casadi.deployment.discretise import Conversion, Target, loop_at
 from ccd_casadi.deployment.outcome import SAMPLED_BANDWIDTH, ChannelOrders
 from ccd_casadi.deployment.rate_choice import ChannelLoops
-from ccd_casadi.deployment.reduction import Reduced, Reduction
+from ccd_casadi.deployment.reduction import ReducedController, Reduction
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, Structure
@@ -19,7 +19,7 @@ DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
 
 
 def at_its_rate(
-    run: FinishedRun, channels: tuple[Channel, ...], family: tuple[Member, ...],
+    run: FinishedRun, channels: tuple[LoopChannel, ...], family: tuple[Member, ...],
     designed: Sampling, timing: Timing,
 ) -> tuple[Target, float, float, float]:  # fmt: skip
     """Target, the rate that is needed by Tustin's rule, and the rate and delay to run at.
@@ -58,14 +58,16 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
     assert kappa is not None
     if isinstance(structure, Structure):
         channel = split(run.plant, run.controller)[0]
-        whole = Reduced(len(run.controller.A), Reduction.NONE, run.controller, run.figures)
+        whole = ReducedController(
+            len(run.controller.A), Reduction.NONE, run.controller, run.figures
+        )
         return (ChannelOrders(channel, (whole,), whole, whole, (structure, kappa)),)
     found = []
     for i, (own, values) in enumerate(structure.split(kappa)):
         u, v = structure.decoupling.outputs[:, [i]], structure.decoupling.inputs[:, [i]]
         plant, K = along(run.plant, u, v), state_space(own, values)
-        channel = Channel(structure.decoupling.names[i], u, v, plant, K)
+        channel = LoopChannel(structure.decoupling.names[i], u, v, plant, K)
         figures = run.measured(plant, K)
-        alone = Reduced(len(K.A), Reduction.NONE, K, figures)
+        alone = ReducedController(len(K.A), Reduction.NONE, K, figures)
         found.append(ChannelOrders(channel, (alone,), alone, alone, (own, values)))
     return tuple(found)

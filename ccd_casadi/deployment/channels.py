@@ -21,7 +21,7 @@ DIAGONAL = 1e-8  # share of the gain that may lie off the diagonal and count as 
 
 
 @dataclass(frozen=True)
-class Channel:
+class LoopChannel:
     """Uᵀ G V and Vᵀ K U, controller in SI; U = `outputs` (p, k), V = `inputs` (m, k)."""
 
     name: str
@@ -31,13 +31,13 @@ class Channel:
     controller: StateSpace
 
 
-def whole(plant: ScaledPlant, controller: StateSpace) -> tuple[Channel, ...]:
+def whole(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
     """The loop as one channel."""
     p, m = plant.C.shape[0], plant.B.shape[1]
-    return (Channel("all", np.eye(p), np.eye(m), plant, controller),)
+    return (LoopChannel("all", np.eye(p), np.eye(m), plant, controller),)
 
 
-def split(plant: ScaledPlant, controller: StateSpace) -> tuple[Channel, ...]:
+def split(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
     """The scalar channels of the loop, or the whole loop as one channel."""
     p, m = plant.C.shape[0], plant.B.shape[1]
     U = np.hstack([c.outputs for c in plant.channels] or [np.eye(p)])
@@ -53,7 +53,7 @@ def split(plant: ScaledPlant, controller: StateSpace) -> tuple[Channel, ...]:
         part = StateSpace(
             controller.A, controller.B @ u, v.T @ controller.C, v.T @ controller.D @ u
         )
-        found.append(Channel(str(i + 1), u, v, along(plant, u, v), part))
+        found.append(LoopChannel(str(i + 1), u, v, along(plant, u, v), part))
     return tuple(found)
 
 
@@ -68,7 +68,7 @@ def _diagonal(response: np.ndarray) -> bool:
     return bool(np.abs(off).max() <= DIAGONAL * np.abs(response).max())
 
 
-def assemble(channels: Sequence[Channel], controllers: Sequence[StateSpace]) -> StateSpace:
+def assemble(channels: Sequence[LoopChannel], controllers: Sequence[StateSpace]) -> StateSpace:
     """K = Σ V_i K_i U_iᵀ, its states one channel after the other."""
     pairs = list(zip(channels, controllers, strict=True))
     return StateSpace(

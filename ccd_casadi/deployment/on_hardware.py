@@ -14,10 +14,10 @@ import numpy as np
 
 from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.anti_windup import limited
-from ccd_casadi.deployment.move import Hardware, move
+from ccd_casadi.deployment.move import Electronics, move
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -56,9 +56,9 @@ def on_hardware(
     delay: float,
     bandwidth: float,
     *,
-    limits: Limits,
+    limits: MoveLimits,
     window: float = 1e-6,
-    hardware: Hardware | None = None,
+    hardware: Electronics | None = None,
     progress: Callable[[str], None] = lambda words: None,
 ) -> OnHardware:
     """The move of output 1 on a plant in SI; τ in s, ω_b in rad/s, window in m."""
@@ -70,7 +70,7 @@ def on_hardware(
         forward = None
 
     def made(
-        controller: Realisation, ahead: Array | None, electronics: Hardware | None = None
+        controller: Realisation, ahead: Array | None, electronics: Electronics | None = None
     ) -> Move:
         return move(
             plant, controller, delay, profile, forward=ahead, window=window, hardware=electronics

@@ -8,7 +8,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.as_designed import at_its_rate, designed_channels, require_own_bounds
-from ccd_casadi.deployment.channels import Channel, assemble, split, whole
+from ccd_casadi.deployment.channels import LoopChannel, assemble, split, whole
 from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.judgement import judged
 from ccd_casadi.deployment.outcome import (
@@ -18,7 +18,7 @@ from ccd_casadi.deployment.outcome import (
     Deployment,
 )
 from ccd_casadi.deployment.rate_choice import ChannelLoops, choose
-from ccd_casadi.deployment.reduction import Limits, Reduced, reductions, smallest
+from ccd_casadi.deployment.reduction import LoopLimits, ReducedController, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -74,13 +74,13 @@ def deploy(
     target = Target(inner.S_max, SAMPLED_EXCESS, full.bandwidth, SAMPLED_BANDWIDTH)
     if kind_of(run.problem).as_designed:
         require_own_bounds(run, designed, timing)
-        limits, remedy = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth), DESIGN_FOR_IT
+        limits, remedy = LoopLimits(inner.S_max, inner.S_low, np.inf, full.bandwidth), DESIGN_FOR_IT
         orders, channels, small = designed_channels(run), whole(run.plant, K), [K]
         reduced, figures = K, full
     else:
         _require_fast(timing, full.bandwidth / HZ)
         remedy = SHORTEN_IT
-        limits = Limits(
+        limits = LoopLimits(
             REDUCED_PEAK * inner.S_max, inner.S_low * (1.0 + STRICT), REDUCED_NORM * full.gamma,
             REDUCED_BANDWIDTH * full.bandwidth,
         )  # fmt: skip
@@ -117,9 +117,9 @@ def _require_fast(timing: Timing, bandwidth_hz: float) -> None:
 
 def _orders(
     run: FinishedRun,
-    channel: Channel,
+    channel: LoopChannel,
     family: tuple[Member, ...],
-    limits: Limits,
+    limits: LoopLimits,
     progress: Callable[[str], None],
 ) -> ChannelOrders:
     progress(f"orders of channel {channel.name}")
@@ -128,11 +128,11 @@ def _orders(
     strict = replace(limits, peak=inner.S_max * (1.0 + STRICT))
     order = WorstFirst(family)
 
-    def compliant(plant: ScaledPlant, row: Reduced) -> bool:
+    def compliant(plant: ScaledPlant, row: ReducedController) -> bool:
         return most is None or compliance_of(plant, row.controller).gain <= REDUCED_PEAK * most
 
-    def holds(peak: float) -> Callable[[Reduced], bool]:
-        def on(member: Member, row: Reduced) -> bool:
+    def holds(peak: float) -> Callable[[ReducedController], bool]:
+        def on(member: Member, row: ReducedController) -> bool:
             plant = member.seen_by(channel)
             figures = run.measured(plant, row.controller)
             kept = figures.certificate.stable and figures.sensitivity_peak <= peak

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.deployment.discretise import (
     FASTEST,
     Conversion,
@@ -25,7 +25,7 @@ class ChannelLoops:
     """The sampled loops of all channels on the nominal plant and on members of its set."""
 
     def __init__(
-        self, channels: Sequence[Channel], controllers: Sequence[StateSpace], target: Target
+        self, channels: Sequence[LoopChannel], controllers: Sequence[StateSpace], target: Target
     ) -> None:
         self.channels, self.controllers, self.target = channels, controllers, target
 

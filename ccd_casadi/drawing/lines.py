@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LEAST_POINTS = 8  # of a curve that values are read off
 LEAST_SPAN = 1e-4  # of a value: an axis of less shows digits that nobody reads
 LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a panel
 
@@ -71,11 +70,7 @@ def drawn_axes(panel: Panel, width: float, height: float) -> tuple["Figure", "Ax
 
 def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
     """What the page's scripts need to read values off the drawn curves and to enlarge a part."""
-    names = {
-        i: curve.label
-        for i, curve in enumerate(panel.curves)
-        if curve.line and len(curve.x) >= LEAST_POINTS and (np.diff(curve.x) >= 0.0).all()
-    }
+    names = {i: curve.label for i, curve in enumerate(panel.curves) if curve.readable}
     scales = scales_of(axes, panel.log_x, panel.log_y)
     found = {"x": panel.x_label, "y": panel.y_label, "scales": scales, "names": names}
     found |= {"locus": points} if (points := _locus(axes, panel, 72.0 * height)) else {}

@@ -14,6 +14,7 @@ from ccd_casadi.drawing.svg import (
     GREY,
     NARROW,
     ORANGE,
+    WIDTH,
     at_both_widths,
     axis_label,
     new_figure,
@@ -85,12 +86,8 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
         _colour_bar(figure, filled, axis_label(which, "Hz"))
         _legend(figure, axes)
         title = "Landscape of the largest bandwidth over the two parameters"
-        return to_svg(figure, key, title, json.dumps({"scales": scales_of(axes)}), _share(width))
-
-
-def _share(width: float) -> float:
-    """Of the column, in %."""
-    return 100.0 if width == NARROW else 0.0
+        share = 100.0 if width == NARROW else 100.0 * width / WIDTH
+        return to_svg(figure, key, title, json.dumps({"scales": scales_of(axes)}), share)
 
 
 def _dots(axes: "Axes", rows: Array, norm: Any, label: str) -> Any:

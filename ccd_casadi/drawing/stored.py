@@ -32,9 +32,10 @@ def write_page(path: Path, page: Page) -> None:
 
 
 def draw(path: Path, stored: Any) -> None:
-    """Draw a page from an entry of report.json. Raises UserError where it is none."""
+    """Draw a page from an entry of report.json, whose chapters may be called sections. Raises
+    UserError where it is none."""
     try:
-        page = restored(Page, stored)
+        page = restored(Page, {"chapters": stored.get("sections"), **stored})
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
         words = f"pages.{path.name}: is not what a page shows; repeat the command that wrote it"
         raise UserError(f"{path.with_name(NAME)}: {words}") from None

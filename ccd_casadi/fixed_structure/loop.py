@@ -30,6 +30,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
+PROBES = 1j * np.geomspace(1e-2, 1e2, 7)  # s over ω₀
 FAITHFUL = 1e-7  # relative error of the modal response, above which a plant has no such form
 CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
 
@@ -276,10 +277,9 @@ def _loop_plant(plant: ScaledPlant, name: str, omega_0: float, force: float) -> 
         raise PlantError(f"{name} {words}")
     W = np.linalg.inv(V)
     b, c = W @ B, C @ V
-    at = 1j * np.geomspace(1e-2, 1e2, 7)
     system = StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))
-    direct = system.at(at)
-    modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (at[:, None] - poles), b)
+    direct = system.at(PROBES)
+    modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (PROBES[:, None] - poles), b)
     if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
         words = "has poles that coincide and are coupled; move a damping ratio away from 1"
         raise PlantError(f"{name} {words}")

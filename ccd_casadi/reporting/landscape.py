@@ -1,11 +1,10 @@
-"""The landscape of ω_b*(θ) of a run: its data from surrogate and store, its words and tables."""
+"""The landscape of ω_b*(θ) of a run: its data from surrogate and store, and its words."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Landscape, Table
-from ccd_casadi.drawing.svg import axis_label
+from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.true_samples import Truths, feasible
@@ -15,7 +14,6 @@ from surrogates import GaussianProcess
 GRID = 25  # points per parameter of a landscape
 COARSER = 17  # the same where there are many samples
 MANY = 80  # samples with gradients above which it is that
-TABLE_STEP = 4  # of the grid, in the table
 
 
 def bandwidth_process(processes: Sequence[object]) -> GaussianProcess | None:
@@ -141,17 +139,3 @@ def caption_disagreement(
         f"{number(float(error[worst]), 2)} % (at {place}), {number(float(np.median(error)), 2)} % "
         "in the median."
     )
-
-
-def tables_landscape(land: Landscape) -> tuple[Table, ...]:
-    """The grid, thinned, and the true samples."""
-    tables = []
-    first, second = land.names
-    if land.bandwidth_hz.size:
-        thinned = slice(0, None, TABLE_STEP)
-        heads = (number(float(value)) for value in land.second[thinned])
-        values = land.bandwidth_hz[thinned, thinned].T
-        head = (f"ω_b* in Hz; {first} ↓ {second} →", *heads)
-        tables.append(Table.of(head, land.first[thinned], *values))
-    head = (axis_label(first, land.units[0]), axis_label(second, land.units[1]), "true ω_b* (Hz)")
-    return (*tables, Table.of(head, *land.truths.T))

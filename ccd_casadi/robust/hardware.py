@@ -43,12 +43,7 @@ class Tolerances:
 
 
 def tolerances(
-    run: FinishedRun,
-    tolerance: float,
-    samples: int,
-    seed: int,
-    quiet: bool,
-    workers: Pool | None = None,
+    run: FinishedRun, tolerance: float, samples: int, seed: int, workers: Pool | None = None
 ) -> Tolerances:
     """Uniformly random θ within ± `tolerance` (relative) of the design's, and the worst θ found.
 
@@ -72,7 +67,7 @@ def tolerances(
 
     light = replace(run, result={})
     drawn: list[Judged | None] = [None] * samples
-    with Progress(samples, "hardware tolerances", quiet=quiet) as progress:
+    with Progress(samples, "hardware tolerances") as progress:
         tasks = [(i, light, place(x)) for i, x in enumerate(unit)]
         for i, item in pool.map_unordered(_hardware_unit, tasks):
             drawn[i] = item
@@ -81,7 +76,7 @@ def tolerances(
     one = np.ones(theta.size)
     order = np.argsort([-1.0 if item is None else -item.badness for item in drawn])
     starts = [*signs, *unit[order[:STARTS]]]
-    worst = search(at, starts, -one, one, "worst hardware", quiet)
+    worst = search(at, starts, -one, one, "worst hardware")
     kept = tuple(item for item in drawn if item is not None)
     worst = max((worst, *kept), key=lambda item: item.badness)
     return Tolerances(tolerance, kept, failed, worst)

@@ -72,30 +72,23 @@ def system_of(run: FinishedRun) -> Mechanics:
     return mechanics(plant_of(run.problem), run.theta)
 
 
-def shift_line(
-    run: FinishedRun, system: Mechanics, reach: float, count: int = 41, quiet: bool = True
-) -> Line:
+def shift_line(run: FinishedRun, system: Mechanics, reach: float, count: int = 41) -> Line:
     """All flexible frequencies times 1 + s, |s| <= reach."""
     shifts = np.unique(np.append(np.linspace(-reach, reach, count), 0.0))
     marks = [abs(end) for end in kind_of(run.problem).common_shifts()]
     places = {float(s): Perturbation(float(s)) for s in shifts}
     return _line(run, system, places, 0.0, partial(shift_range, limit=reach, marks=marks),
-                 Progress(len(places), "resonance shifts", quiet=quiet))  # fmt: skip
+                 Progress(len(places), "resonance shifts"))  # fmt: skip
 
 
 def damping_line(
-    run: FinishedRun,
-    system: Mechanics,
-    low: float,
-    high: float,
-    count: int = 41,
-    quiet: bool = True,
+    run: FinishedRun, system: Mechanics, low: float, high: float, count: int = 41
 ) -> Line:
     """Damping times d, low <= d <= high; evenly in its logarithm."""
     factors = np.exp(np.unique(np.append(np.linspace(np.log(low), np.log(high), count), 0.0)))
     places = {float(d): Perturbation(0.0, float(d)) for d in factors}
     return _line(run, system, places, 1.0, partial(damping_range, limits=(low, high)),
-                 Progress(len(places), "damping", quiet=quiet))  # fmt: skip
+                 Progress(len(places), "damping"))  # fmt: skip
 
 
 def _line(
@@ -137,11 +130,7 @@ def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Jud
 
 
 def worst_in_box(
-    run: FinishedRun,
-    system: Mechanics,
-    reach: float,
-    damping: tuple[float, float],
-    quiet: bool = True,
+    run: FinishedRun, system: Mechanics, reach: float, damping: tuple[float, float]
 ) -> Judged:
     """The worst (shift, damping factor) of the box: a grid, then a local search from its worst."""
     low, high = np.array([-reach, np.log(damping[0])]), np.array([reach, np.log(damping[1])])
@@ -152,21 +141,16 @@ def worst_in_box(
 
     grid = [np.array([s, d]) for s in np.linspace(low[0], high[0], 9)
             for d in np.linspace(low[1], high[1], 5)]  # fmt: skip
-    return search(at, grid, low, high, "shift and damping", quiet)
+    return search(at, grid, low, high, "shift and damping")
 
 
 def search(
-    at: Callable[[Array], Judged | None],
-    starts: list[Array],
-    low: Array,
-    high: Array,
-    label: str,
-    quiet: bool,
+    at: Callable[[Array], Judged | None], starts: list[Array], low: Array, high: Array, label: str
 ) -> Judged:
     """The worst of the starts, and of a bounded Nelder and Mead search from the worst of them."""
     found: list[tuple[Array, Judged]] = []
 
-    progress = Progress(len(starts) + SEARCH, label, quiet=quiet)
+    progress = Progress(len(starts) + SEARCH, label)
 
     def cost(x: Array) -> float:
         item = at(x)

@@ -31,6 +31,7 @@ from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import progress_shown
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics, statics
 
@@ -93,7 +94,11 @@ def robustness(
     Study
         The content of robustness.json.
     """
-    d = demands or Demands()
+    with progress_shown(not quiet):
+        return _study(run, demands or Demands(), seed, workers)
+
+
+def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
     sampled = loop.sampling is not None
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
@@ -118,11 +123,11 @@ def robustness(
             omega_low=run.problem.inner.omega_low,
             period=0.0 if run.sampling is None else run.sampling.period,
         ),
-        shift=shift_line(run, system, d.shift, quiet=quiet),
-        damping=damping_line(run, system, *d.damping, quiet=quiet),
+        shift=shift_line(run, system, d.shift),
+        damping=damping_line(run, system, *d.damping),
         modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping, quiet),
-        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
+        box=worst_in_box(run, system, d.shift, d.damping),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, workers),
         structured=None
         if sampled
         else structured_bound(

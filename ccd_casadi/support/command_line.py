@@ -15,6 +15,7 @@ from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import Parser, one_line, usable_cores, whole
+from ccd_casadi.support.progress import progress_shown
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
@@ -115,6 +116,7 @@ def run(
             threadpool_limits(limits=1),
             threads_permitted(getattr(options, "workers", 1)),
             permit_user_code(not options.no_user_code),
+            progress_shown(not options.quiet),
             ctrl_c_noticed(),
         ):
             code = main(options)

@@ -7,6 +7,9 @@ notebook it is on stdout, since stderr is painted there as a failure.
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import TracebackType
 from typing import Self, TextIO
 
@@ -15,10 +18,23 @@ from ccd_casadi.support.terminal import columns
 
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
+_shown: ContextVar[bool] = ContextVar("progress_shown", default=True)
+
+
+@contextmanager
+def progress_shown(yes: bool) -> Iterator[None]:
+    """Within the block bars are shown, or (--quiet) not; outside of any they are."""
+    token = _shown.set(yes)
+    try:
+        yield
+    finally:
+        _shown.reset(token)
 
 
 class Progress:
     """`with Progress(total, label) as bar: bar.advance()`; nothing is printed if quiet or empty.
+
+    `quiet`: by default as `progress_shown` says.
 
     On a terminal, and in a notebook's cell, one line is rewritten a few times a second; elsewhere
     a plain line is printed every few seconds and at the end. Work that ends before its total ends
@@ -27,12 +43,12 @@ class Progress:
     """
 
     def __init__(
-        self, total: int, label: str, quiet: bool = False, stream: TextIO | None = None
+        self, total: int, label: str, quiet: bool | None = None, stream: TextIO | None = None
     ) -> None:
         self.total, self.label, self.note = total, label, ""
         cell = in_notebook(sys.stdout)
         self.stream = stream or (sys.stdout if cell else sys.stderr)
-        self.silent = quiet or total <= 0
+        self.silent = (not _shown.get() if quiet is None else quiet) or total <= 0
         self.cell = in_notebook(self.stream)
         self.terminal = not self.silent and (self.cell or self.stream.isatty())
         self.interval = (0.25 if self.cell else 0.1) if self.terminal else 5.0

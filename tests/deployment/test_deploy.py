@@ -20,7 +20,7 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment.channels import assemble, split
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.reduction import Limits, Reduction, reductions, smallest
+from ccd_casadi.deployment.reduction import LoopLimits, Reduction, reductions, smallest
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
@@ -88,7 +88,7 @@ def test_a_coupled_plant_is_one_channel() -> None:
     rows = reductions(channel, case.weights, OMEGA_LOW)
     f, best = made.figures, rows[0].figures
     assert best.bandwidth == pytest.approx(f.bandwidth, rel=1e-5)
-    limits = Limits(1.02 * f.sensitivity_peak, 1.0, 2.0 * f.gamma, 0.99 * f.bandwidth)
+    limits = LoopLimits(1.02 * f.sensitivity_peak, 1.0, 2.0 * f.gamma, 0.99 * f.bandwidth)
     chosen = smallest(rows, limits)
     assert chosen.meets(limits)
     assert chosen.order < len(made.controller.A)
@@ -107,8 +107,8 @@ def test_every_order_is_measured_on_the_true_loop(two_mass_run: Path) -> None:
         np.testing.assert_equal(again.sensitivity_peak, row.figures.sensitivity_peak)
     S_max = run.problem.inner.S_max
     f = run.figures
-    tight = Limits(S_max * (1 + 1e-6), 0.03, 2 * f.gamma, 0.99 * f.bandwidth)
-    wide = Limits(1.005 * S_max, 0.03, 2 * f.gamma, 0.99 * f.bandwidth)
+    tight = LoopLimits(S_max * (1 + 1e-6), 0.03, 2 * f.gamma, 0.99 * f.bandwidth)
+    wide = LoopLimits(1.005 * S_max, 0.03, 2 * f.gamma, 0.99 * f.bandwidth)
     strict, loose = smallest(rows, tight), smallest(rows, wide)
     assert 1 < loose.order <= strict.order < len(run.controller.A)
     for found, limits in ((strict, tight), (loose, wide)):
@@ -116,7 +116,7 @@ def test_every_order_is_measured_on_the_true_loop(two_mass_run: Path) -> None:
         assert not any(row.meets(limits) for row in rows if row.order < found.order)
         rivals = [row for row in rows if row.order == found.order and row.meets(limits)]
         assert found.figures.sensitivity_peak == min(r.figures.sensitivity_peak for r in rivals)
-    none = smallest(rows, Limits(1.0, 0.03, 2 * f.gamma, 0.99 * f.bandwidth))
+    none = smallest(rows, LoopLimits(1.0, 0.03, 2 * f.gamma, 0.99 * f.bandwidth))
     assert none is rows[0]
 
 

@@ -171,11 +171,11 @@ def test_the_worst_of_a_box_is_worse_than_all_that_was_seen(run: FinishedRun) ->
 
 def test_random_hardware_repeats_and_its_worst_is_at_a_corner(run: FinishedRun) -> None:
     """Both masses 1 % lighter: k falls with their fourth powers, and the resonance with it."""
-    first = tolerances(run, 0.01, 25, 3, quiet=True)
-    again = tolerances(run, 0.01, 25, 3, quiet=True)
+    first = tolerances(run, 0.01, 25, 3)
+    again = tolerances(run, 0.01, 25, 3)
     # as texts, in which one NaN is another
     assert repr(first) == repr(again)
-    assert repr(first) != repr(tolerances(run, 0.01, 25, 4, quiet=True))
+    assert repr(first) != repr(tolerances(run, 0.01, 25, 4))
     assert len(first.judged) == 25
     for item in first.judged:
         assert (np.abs(np.array(item.place) / run.theta - 1.0) <= 0.01).all()

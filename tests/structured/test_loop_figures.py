@@ -88,14 +88,14 @@ def test_a_second_order_loop_has_the_textbook_s_step(damping: float, hz: float) 
     A = np.array([[0.0, 1.0], [-soft * 2.0 * damping * w, -2.0 * damping * w - soft]])
     G = StateSpace(A, np.array([[0.0], [1.0 / mass]]), np.eye(1, 2), np.zeros((1, 1)))
     K = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[mass * w**2]]))
-    found = step_figures(Loop(G, K), w)
+    overshoot, settling, by_force = step_figures(Loop(G, K), w)
     expected = np.exp(-np.pi * damping / np.sqrt(1.0 - damping**2))
-    assert found.overshoot == pytest.approx(expected, abs=1e-3)
-    assert found.by_force == pytest.approx((1.0 + expected) / (mass * w**2), rel=2e-3)
+    assert overshoot == pytest.approx(expected, abs=1e-3)
+    assert by_force == pytest.approx((1.0 + expected) / (mass * w**2), rel=2e-3)
     # the envelope exp(-ζωt)/√(1-ζ²) is inside 2 % then, and was outside half an oscillation ago
     inside = np.log(0.02 * np.sqrt(1.0 - damping**2)) / (-damping * w)
-    assert found.settling <= inside * 1.01
-    assert found.settling >= inside - np.pi / (w * np.sqrt(1.0 - damping**2)) - 0.02 / hz
+    assert settling <= inside * 1.01
+    assert settling >= inside - np.pi / (w * np.sqrt(1.0 - damping**2)) - 0.02 / hz
 
 
 def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
