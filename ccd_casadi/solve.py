@@ -161,7 +161,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.formulations import formulation_of, slow_words, usual_name
     from ccd_casadi.codesign.run import co_design
     from ccd_casadi.codesign.run_files import resolved, write_run
-    from ccd_casadi.codesign.stored import named_surrogate
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
@@ -178,9 +177,6 @@ def command(options: argparse.Namespace) -> ExitCode:
         slow = slow_words(formulation, len(problem.names))
         if slow:
             say(f"warning: {slow}", sys.stderr)
-    given = None
-    if options.surrogate is not None:
-        given = named_surrogate(folder, options.surrogate, name, problem)
     store = folder / "samples.sqlite"
     with (
         pool(options.scheduler, options.workers, PATIENCE) as workers,
@@ -190,7 +186,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             held = counted(samples.count(), "row") if samples.count() else "nothing yet"
             say(f"resuming      {store} holds {held}", sys.stderr)
         sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
+        solution = with_units(co_design(sampler, formulation, options.seed), problem)
         write_run(folder, case, solution)
     code = ExitCode.of(solution.result["status"])
     if not options.quiet:
@@ -220,11 +216,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--resume",
         action="store_true",
         help="print what the run folder holds; every run continues from it",
-    )
-    arguments.add_argument(
-        "--surrogate",
-        metavar="NAME",
-        help="start from a version of the run folder's surrogates (0002), not by sampling",
     )
     arguments.add_argument(
         "--no-report",

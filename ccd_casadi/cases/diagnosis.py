@@ -22,7 +22,7 @@ from ccd_casadi.cases.findings import (
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant, require_damping
-from ccd_casadi.plants.plant import Plant, mechanics, theta_words
+from ccd_casadi.plants.plant import Plant, mechanics, named_values
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
@@ -66,7 +66,7 @@ def diagnose(
     with Progress(len(points), "checking the plant") as progress:
         for index, theta in enumerate(points):
             progress.advance(int(index > 0))
-            place = f"at theta = {theta_words(plant, theta)}" if index else "at the start"
+            place = f"at theta = {named_values(plant.names, theta)}" if index else "at the start"
             try:
                 system = mechanics(plant, theta, derivatives=index == 0)
                 modal = modal_plant(system, problem.suspension)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel
-from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival_of
+from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival
 from ccd_casadi.fixed_structure import Certificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -108,7 +108,11 @@ def survived(
     marks = [abs(end) for end in kind_of(problem).common_shifts()]
     if check is not None and check.at.damping == 1.0:
         marks.append(abs(check.at.shift))
-    found = survival_of(problem, loops, bandwidth, marks)
+    inner, slack = problem.inner, kind_of(problem).slack
+    found = survival(
+        loops, S_max=inner.S_max, bandwidth=bandwidth, omega_low=inner.omega_low, slack=slack,
+        marks=marks,
+    )  # fmt: skip
     return found, check_robust(problem, loops)
 
 

@@ -15,7 +15,6 @@ from scipy.linalg import block_diag
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.closed_loop import responses
 
 DIAGONAL = 1e-8  # share of the gain that may lie off the diagonal and count as rounding
 
@@ -44,7 +43,8 @@ def split(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]
     V = np.hstack([c.inputs for c in plant.channels] or [np.eye(m)])
     if not (U.shape == (p, p) and V.shape == (m, m) and p == m > 1):
         return whole(plant, controller)
-    G, K, _ = responses(plant, controller, plant.grid * plant.omega_0)
+    omega = plant.grid * plant.omega_0
+    G, K = plant.plant_si().response(omega), controller.response(omega)
     if not (_diagonal(U.T @ G @ V) and _diagonal(V.T @ K @ U)):
         return whole(plant, controller)
     found = []

@@ -33,8 +33,8 @@ def write_files(
         "plant": named_plant(run.plant.plant_si()),
         "controller": named_controller(run.controller),
         "controller_reduced": named_controller(found.reduced),
-        "controller_discrete": named_controller(K, K.period),
-        "plant_discrete": named_plant(held, held.period),
+        "controller_discrete": named_controller(K),
+        "plant_discrete": named_plant(held),
     }
     theta = dict(zip(run.problem.names, run.theta, strict=True))
     units = dict(zip(run.problem.names, run.problem.units, strict=True))

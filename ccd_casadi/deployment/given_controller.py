@@ -110,13 +110,12 @@ def _from_mat(path: Path) -> Given:
     systems = read_mat(path).systems
     for name in ("controller_discrete", "controller", ""):
         if name in systems:
-            found = systems[name]
-            delay = found.period
-            beside = path.with_name("deploy.json")
+            found = systems[name].system
+            delay, beside = found.period, path.with_name("deploy.json")
             if found.period and beside.exists():
                 told = read_json(beside).get("delay")
                 delay = float(told) if isinstance(told, int | float) else delay
-            return Given(replace(found.system, period=found.period), delay)
+            return Given(found, delay)
     raise UserError(f"{path}: holds no struct controller_discrete or controller")
 
 

@@ -14,7 +14,6 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.synthesis.statics import statics
@@ -39,8 +38,7 @@ def judged(
     loops = {at: closed_loop(G, K).S for at, G in held.items()}
     figures = {at: sampled_figures(loop) for at, loop in loops.items()}
     at_rest = statics(
-        plants[nominal], StateSpace(K.A, K.B, K.C, K.D), bandwidth=bandwidth,
-        omega_low=run.problem.inner.omega_low, period=period,
+        plants[nominal], K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low
     )  # fmt: skip
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:

@@ -297,23 +297,30 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
         reasons = sorted({row.outcome.value for row in rows})
         return "no synthesis was certified: " + "; ".join(reasons)
     nearest = min(certified, key=lambda row: _violation(problem, row))
-    missed, kept, least, elsewhere = [], [], [], []
+    kept, least, elsewhere = [], [], []
     for name, (attribute, bound) in problem.bounds.items():
-        label = LABELS[name]
         value = float(getattr(nearest, attribute))
-        if value > bound:
-            missed.append(f"{label} {missed_by(value, bound)} where {name} = {bound:g} is required")
-            best = min(float(getattr(row, attribute)) for row in certified)
-            if best > bound:
-                least.append(f"the least {label} of all is {missed_by(best, bound)}")
-            else:
-                elsewhere.append(name)
-        else:
+        best = min(float(getattr(row, attribute)) for row in certified)
+        if value <= bound:
             kept.append(f"{name} = {bound:g} is kept there with {value:.4g}")
+        elif best <= bound:
+            elsewhere.append(name)
+        else:
+            least.append(f"the least {LABELS[name]} of all is {missed_by(best, bound)}")
     if elsewhere:
         least.append(f"others keep {' or '.join(elsewhere)}, but not all bounds at once")
-    words = f"of {len(certified)} certified controllers the nearest has {' and '.join(missed)}"
+    missed = " and ".join(missed_bounds(problem, nearest))
+    words = f"of {len(certified)} certified controllers the nearest has {missed}"
     return "; ".join([words, *kept, *least])
+
+
+def missed_bounds(problem: InnerProblem, figures: DesignFigures) -> list[str]:
+    """Which bounds a design misses, and by how much; none where it keeps them all."""
+    return [
+        f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is required"
+        for name, (of, bound) in problem.bounds.items()
+        if (value := float(getattr(figures, of))) > bound
+    ]
 
 
 def missed_by(value: float, bound: float) -> str:

@@ -121,7 +121,6 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
             run.controller,
             bandwidth=run.figures.bandwidth,
             omega_low=run.problem.inner.omega_low,
-            period=0.0 if run.sampling is None else run.sampling.period,
         ),
         shift=shift_line(run, system, d.shift),
         damping=damping_line(run, system, *d.damping),

@@ -11,7 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import OMEGA_LOW, PAPER, flexible_case, mechanics, problem, scaled, two_mass_model
+from helpers import (
+    OMEGA_LOW,
+    PAPER,
+    flexible_case,
+    mechanics,
+    problem,
+    responses,
+    scaled,
+    two_mass_model,
+)
 from sampled_simulation import measure_set
 from scipy.linalg import block_diag
 
@@ -24,7 +33,7 @@ from ccd_casadi.deployment.reduction import LoopLimits, Reduction, reductions, s
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import measure, responses
+from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, synthesise
 
@@ -151,16 +160,16 @@ def test_the_command_leaves_a_controller_that_can_be_built(
     assert 7000.0 < found["needed_rate_hz"] < 9000.0  # 8000 Hz, found to some per cent
     # the loop of the .mat file alone, at its own bandwidth
     mat = read_mat(out / "design.mat")
-    K, G = mat.systems["controller_discrete"], mat.systems["plant_discrete"]
+    K, G = (mat.systems[name].system for name in ("controller_discrete", "plant_discrete"))
     assert (K.period, G.period) == (1e-4, 1e-4)
     z = np.exp(1j * HZ * found["sampled"]["bandwidth_hz"] * K.period)
     g, k = (
         s.C @ np.linalg.solve(z * np.eye(len(s.A)) - s.A, s.B + 0j) + s.D
-        for s in (G.system, K.system)
+        for s in (G, K)
     )
     assert abs(1.0 / (1.0 + (g @ k)[0, 0])) == pytest.approx(2**-0.5, rel=1e-8)
     table = json.loads((out / "controller.json").read_text())
-    np.testing.assert_array_equal(table["A"], K.system.A)
+    np.testing.assert_array_equal(table["A"], K.A)
     page = _Plain()
     page.feed((out / "report.html").read_text(encoding="utf-8"))
     assert (page.figures, page.foreign) == (3, ["../index.html"])  # loop, step, move

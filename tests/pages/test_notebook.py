@@ -13,7 +13,7 @@ from helpers import HZ, problem
 
 import ccd_casadi as ccd
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, Terms
 from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
@@ -99,9 +99,8 @@ def test_inner_designs_show_their_figures() -> None:
 
 
 def test_a_solution_without_a_design_says_why() -> None:
-    outcome = FormulationResult()
-    spent = {"spent": {"samples": 1}, "seconds": 1.0, "seed": 0}
-    text = shown(Solution(infeasible_dict("lifted", "too <heavy>", **spent), outcome, None))
+    result = infeasible_dict(Terms("lifted", 1e-3, 0), "too <heavy>", {"samples": 1})
+    text = shown(Solution(result, FormulationResult(), None))
     assert "No feasible design: too <heavy>" in text
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
-from helpers import HZ, SUSPENSION, random_plant, two_mass_model
+from helpers import HZ, SUSPENSION, random_plant, responses, two_mass_model
 
 from ccd_casadi.fixed_structure import (
     Bounds,
@@ -34,7 +34,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
-from ccd_casadi.synthesis.closed_loop import measure, responses
+from ccd_casadi.synthesis.closed_loop import measure
 
 # One notch and a first-order roll-off are quick to find and have every kind of bound.
 SMALL = Structure(biquads=1, roll_off=2)
