@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
@@ -34,6 +34,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.structured_text import structured_text
     from ccd_casadi.deployment.words import deployed_line
     from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.reporting.facts import run_name
 
     finished = read_run(options.run)
     status = finished.result.get("status")
@@ -72,14 +73,11 @@ def command(options: argparse.Namespace) -> ExitCode:
         (folder / name).unlink(missing_ok=True)
     write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
-        naming = {
-            "title": options.run.resolve().name, "delay": found.delay, "verified": found.passed
-        }  # fmt: skip
-        texts = write_c(folder, found.realisation, **naming, forward=moved.forward)
-        (folder / ST_FILE).write_text(structured_text(found.realisation, **naming), "utf-8")
-        if options.fmu and not write_fmu(
-            folder / FMU_FILE, found.realisation, texts, str(naming["title"])
-        ):
+        K, name = found.realisation, run_name(options.run)
+        naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed}
+        texts = write_c(folder, K, **naming, forward=moved.forward)
+        (folder / ST_FILE).write_text(structured_text(K, **naming), "utf-8")
+        if options.fmu and not write_fmu(folder / FMU_FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
     inform(_summary(finished, found))

@@ -89,15 +89,20 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     """What J counts of the controller, and what was predicted of it."""
     from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 
-    error = f"(error {result['verification_error']:.1e})"
+    sample = result.get("verdict", {}).get("predicted", {}).get("left_out") is not None
     where = " on every plant" if "plants" in result["certificate"] else ""
     bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{where}"
     v = FIGURES[result.get("minimise", BANDWIDTH.key)]
     if v is BANDWIDTH:
-        return [f"{bandwidth}   predicted {result['surrogate_bandwidth_hz']:.4f} Hz {error}"]
-    of, guess = (result[key] for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}"))
-    words = f"{v.words:<13} {v.shown(of, 6)} over the set   predicted {v.shown(guess, 6)} {error}"
-    return [words, bandwidth]
+        lines, told = [bandwidth], f"{result['surrogate_bandwidth_hz']:.4f} Hz"
+    else:
+        of, told = (
+            v.shown(result[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}")
+        )
+        lines = [f"{v.words:<13} {of} over the set", bandwidth]
+    error = f"predicted {told} (error {100.0 * result['verification_error']:.2g} %)"
+    lines[0] += "   a sample of the surrogate" if sample else f"   {error}"  # which it repeats
+    return lines
 
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:

@@ -181,10 +181,12 @@ def predicted(
         size = f"left_out_{unit.lower()}"
         figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}
     if not error <= tolerance:
-        words = f"prediction and truth differ by {100 * error:.2g} %, more than {tolerance:.0e}"
+        words = (
+            f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
+        )
         return Line(State.FAILED, words, figures)
     if left_out is None:
-        words = f"{what} predicted to {error:.1e}"
+        words = f"{what} predicted to {100 * error:.2g} %"
         if extrapolates:
             words += f"; the surrogate extrapolates there: {extrapolates[0]}"
             return Line(State.WARNED, words, figures)

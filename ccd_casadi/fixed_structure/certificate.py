@@ -32,7 +32,7 @@ from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.units import counted
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
-AT_ONCE = 64  # plants
+AT_ONCE = 16  # plants: the last ones keep all workers busy
 ROUNDING = 1e3 * float(np.finfo(float).eps)  # of a balanced matrix; 31 eps were seen at a pole
 REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
 

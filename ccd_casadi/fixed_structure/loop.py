@@ -160,6 +160,8 @@ class PlantSet:
         whatever the sampling.
 
         x (dC f(A) B + C f(A) dB + C V (f[p_i, p_j] ∘ V⁻¹dA V) V⁻¹B) y   (Daleckii and Krein)
+
+        with f[p_i, p_j] = (f(p_i) - f(p_j))/(p_i - p_j), f'(p_i) where these are one.
         """
         plant = self.plants[which]
         p = plant.poles
@@ -168,16 +170,18 @@ class PlantSet:
         f = transfer(p, omega, period, self.delay)[0]
         gap = p[:, None] - p[None, :]
         near = np.abs(gap) <= CLOSE * np.maximum(np.abs(p)[:, None], np.abs(p)[None, :])
-        between = (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap)
-        i, j = np.nonzero(near)
-        between[:, i, j] = transfer(0.5 * (p[i] + p[j]), omega, period, self.delay)[1]
         c, b = left @ plant.reading, right @ plant.drive.T
+        apart = np.where(near, 0.0, plant.dA) / np.where(near, 1.0, gap)
+        i, j = np.nonzero(near)
+        between = transfer(0.5 * (p[i] + p[j]), omega, period, self.delay)[1]
         pairs = [
-            (c[:, :, None] * between * b[:, None, :], plant.dA),
             (left[:, :, None] * (f * b)[:, None, :], plant.dC),
             ((c * f)[:, :, None] * right[:, None, :], plant.dB),
         ]
-        return np.asarray(sum(np.tensordot(a, d, ((1, 2), (1, 2))) for a, d in pairs))
+        found = sum(np.tensordot(x, d, ((1, 2), (1, 2))) for x, d in pairs)
+        found += (c[:, i] * between * b[:, j]) @ plant.dA[:, i, j].T
+        found += np.einsum("ki,tik->kt", c * f, apart @ b.T)
+        return np.asarray(found - np.einsum("kj,tjk->kt", f * b, apart.transpose(0, 2, 1) @ c.T))
 
 
 def plant_set(

@@ -12,12 +12,13 @@ from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.words import figure_rows, order_words, reason_words, short_status
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.facts import run_name, theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.structured_page import structured_table
@@ -34,7 +35,7 @@ def deploy_page(
     """report.html of a deployment; `index`: the page that links all of the run."""
     meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
     head = head_of(
-        f"Controller of {run.folder.resolve().name}, deployed", found.passed,
+        f"Controller of {run_name(run.folder)}, deployed", found.passed,
         short_status(run, found), reason_words(run, found), meta, _conclusion(run, found),
         run.result,
     )  # fmt: skip
@@ -65,13 +66,13 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
 
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:
-    """The loops beside each other: name, colour, line."""
+    """The loops beside each other: name, colour, line; nothing is reduced of what was designed."""
     G, K = run.plant.plant_si(), found.realisation.system
-    return (
-        (Loop(G, run.controller), "full", BLUE, "-"),
-        (Loop(G, found.reduced), "reduced", GREEN, "--"),
-        (Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"),
-    )
+    sampled = Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"
+    if kind_of(run.problem).as_designed:
+        return (Loop(G, run.controller), "continuous", BLUE, "-"), sampled
+    full = Loop(G, run.controller), "full", BLUE, "-"
+    return full, (Loop(G, found.reduced), "reduced", GREEN, "--"), sampled
 
 
 def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
@@ -82,21 +83,21 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     curves, drawn = [], []
     for loop, name, colour, line in _loops(run, found):
         G, K = loop.responses(HZ * hz)
-        how = "continuous" if loop.sampling is None else f"at {number(found.rate_hz)} Hz"
-        label = f"{name}{',' if loop.sampling is None else ''} {how}"
+        label = name if loop.sampling is None else f"{name} at {number(found.rate_hz)} Hz"
         curves.append(c.Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
         drawn.append(c.Curve(hz, largest(K), name, colour, line))
-    S_max = run.problem.inner.S_max
-    bandwidth = run.figures.bandwidth / HZ
-    crossing = bandwidth_level(bandwidth, text=", continuous")
+    S_max, own = run.problem.inner.S_max, found.sampled.bandwidth / HZ
+    crossing = bandwidth_level(own, text=", sampled") if np.isfinite(own) else (
+        bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")
+    )  # fmt: skip
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
     bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
-    title = "Sensitivity and controller: full, reduced and sampled, over frequency"
-    ends = [with_unit(each.y[-1], "N/m") for each in drawn]
+    title = f"Sensitivity and controller over frequency: {', '.join(k.label for k in drawn)}"
+    ends = (f"{with_unit(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
-        f"up to half the sampling rate. There the controller's gain, which sensor noise and "
-        f"unmodelled resonances meet, is {ends[2]} (reduced: {ends[1]}, full: {ends[0]})."
+        "up to half the sampling rate. The gain of the controller there amplifies sensor noise and "
+        f"unmodelled resonances. It is {', '.join(ends)}."
     )
     return c.Figure(c.Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption)
 

@@ -1,6 +1,7 @@
 """A design in words and numbers: the conclusion, the table of the design, and what binds."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,13 @@ def _prediction(result: Mapping[str, Any]) -> str:
         missed = number(100.0 * line["left_out"], 2)
         return f" It is a sample of the surrogate, and is missed by {missed} % without that sample."
     return f" The prediction errs by {number(result['verification_error'], 2)} of the truth."
+
+
+def run_name(place: Path) -> str:
+    """Of a run by its folder or its case; what `ccd new` makes is named by the folder around it."""
+    place = place.resolve()
+    names = (place.name.removesuffix(".toml"), *(parent.name for parent in place.parents))
+    return next((name for name in names if name != "case"), "case")
 
 
 def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:
@@ -320,4 +328,4 @@ def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
         step = number(0.01 * factor * (problem.upper[i] - problem.lower[i]), 3)
         words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
         return words, 0.01, f"moving the bound outwards by {step} {unit}".rstrip()
-    return f"The constraint {name} binds", 1.0, "loosening it by one unit"
+    return f"The constraint “{name}” binds", 1.0, "loosening it by one unit"

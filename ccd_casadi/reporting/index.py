@@ -9,7 +9,7 @@ from urllib.parse import quote
 from ccd_casadi.drawing.content import INDEX, Chapter, Links, Page
 from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.drawing.stored import write_page
-from ccd_casadi.reporting.facts import conclusion
+from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.reporting.verdict import run_head, with_verdict_of
 from surrogates.files import write_whole
 
@@ -65,9 +65,8 @@ def write_index(folder: Path) -> None:
         for place, words in pages.items()
     )
     files = tuple((n, n, words) for n, words in FILES.items() if (folder / n).exists())
-    name = folder.resolve().name
-    lead = conclusion(result)
-    head = run_head(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
+    lead, meta = conclusion(result), f"{result.get('formulation', '')} formulation"
+    head = run_head(f"Run: {run_name(folder)}", result, meta, lead)
     chapters = (Chapter("Pages", (Links(links),)), Chapter("Files", (Links(files),)))
     write_whole(folder / INDEX, page_html(Page(head, chapters, index="")))
 

@@ -13,7 +13,7 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_axes, theta_words
+from ccd_casadi.reporting.facts import cost_axis, cost_words, run_name, theta_axes, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
@@ -34,7 +34,7 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     verified = sum(point.verified for point in front.points)
     whole = verified == len(front.points)
     head = head_of(
-        f"Insight: {run.case.path.parent.name}",
+        f"Insight: {run_name(run.folder)}",
         whole,
         "verified" if whole else "not all verified",
         f"{verified} of {len(front.points)} points of the front",

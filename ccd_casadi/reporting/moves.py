@@ -48,25 +48,25 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
         profile, window = motion.cycle.profile, motion.motion.window
-        name, other = "with feedforward up to snap", "the move of [move]"
+        name, other = "with feedforward up to snap", ", that of [move]"
         ahead: Array | None = motion.forward
     else:
         profile, window = setpoint(LIMITS), WINDOW
         modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
-        other = "for other moves [move] of the case, or the options of robustness"
+        other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     free = free_loops(problem, theta, view.loop.controller)
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
-    several = " on every plant of the set (band; words and numbers are of the worst)"
+    several = " The band spans every plant of the set, and the numbers are of the worst."
     words = (
-        f"The move: {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
-        f"{number(1e3 * end, 4)} ms"
-        f"{several if len(loops) > 1 else ''}, "
-        f"{'without the suspension' if model.free else 'on the soft suspension'} "
-        f"({'continuous loop' if loops[0].sampling is None else 'hold and delay exact'}; {other})."
+        f"The move is {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
+        f"{number(1e3 * end, 4)} ms{other}, "
+        f"{'with rigid bodies free' if model.free else 'on the soft suspension'} and "
+        f"{'without hold and delay' if loops[0].sampling is None else 'hold and delay exact'}."
+        f"{several if len(loops) > 1 else ''}"
     )
     return ways_figure(dict(zip(ways, found, strict=True)), words)
 
@@ -126,10 +126,8 @@ def force_step(view: LoopView) -> c.Figure:
     y = 1e6 * np.array([step[1] for step in steps])
     curves, bands = of_plants(1e3 * t, y)
     panel = c.Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
-    on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
-        "the stage, until it rests"
-    )  # fmt: skip
-    words = f"A force of 1 N at the actuator moves {on}."
+    on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
+    words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
 
@@ -137,7 +135,7 @@ def force_step(view: LoopView) -> c.Figure:
 def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     ways = {words: [move] for words, move in found.ways.items()}
-    words = "The plant has its soft suspension, hold and delay are exact."
+    words = "The plant has its soft suspension. Hold and delay are exact."
     return ways_figure(ways, words), c.Words(_limit_words(found))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Chapter, Facts, Figure, Heading, Page, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
-from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.facts import run_name, theta_words
 from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
@@ -29,7 +29,7 @@ def robustness_page(
     if not found.survives:
         given = "Do not use this controller: it is not stable on every plant that was tried."
     head = head_of(
-        f"Robustness: {run.case.path.parent.name}", found.survives,
+        f"Robustness: {run_name(run.folder)}", found.survives,
         "stable on all plants" if found.survives else "not stable on all plants",
         "that were tried; others were not examined",
         f"{theta_words(run.result)} · seed {seed}", lead, run.result if own else {},

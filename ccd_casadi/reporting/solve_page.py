@@ -22,7 +22,7 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_chapter import budget_chapter
-from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table
+from ccd_casadi.reporting.facts import binding, conclusion, design_facts, run_name, theta_table
 from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
@@ -99,11 +99,9 @@ def page_of_run(run: FinishedRun) -> c.Page:
 
 def solve_head(case: Case, result: Mapping[str, Any]) -> c.Head:
     """Of the report, drawn now."""
-    # what `ccd new` makes is named by its folder
-    named = case.path.absolute().parent.name if case.path.stem == "case" else case.path.stem
     now = datetime.now().strftime("%Y-%m-%d %H:%M")
     meta = f"{case.path.name} · {result['formulation']} formulation · {now}"
-    return run_head(f"Co-design of {named}", result, meta, conclusion(result))
+    return run_head(f"Co-design of {run_name(case.path)}", result, meta, conclusion(result))
 
 
 def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> list[Part]:

@@ -45,20 +45,21 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
         mu = kink["multipliers"]
     v = problem.figure
-    gain = "raise ω_b" if v is BANDWIDTH else f"lower the {v.words}"
-    names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S", "LEVEL": "-3 dB below ω_b",
+    most = HZ * result["bandwidth_hz"] if v is BANDWIDTH else result[f"{v.entry}_of_set"]
+    names = {"S_MAX": "The peak of S", "SHAPE": "The shape of S", "LEVEL": "-3 dB below ω_b",
              "S_LOW": "|S| at ω_low",
-             "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
+             "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "The compliance"}  # fmt: skip
     over_kappa = []
     for kind, words in names.items():
         for name in (name for name, value in mu.items() if value > 1e-6):
             own, channel = kind_and_channel(name)
             if own == kind:
                 of = f" of channel {channel}" if channel else ""
-                loosened = f"a bound looser by 1 % would {gain} by {number(mu[name], 3)} %"
-                over_kappa.append(f"{words}{of} binds; {loosened}")
+                worth = v.shown(0.01 * mu[name] * most, 3)
+                over_kappa.append(f"{words}{of} binds; 1 % more of it is worth {worth}.")
     ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
-    ends = [f"{name} is at the {end} end of its range" for name, _, end in ranges]
+    ends = [f"{name[:1].upper()}{name[1:]} is at the {end} end of its range."
+            for name, _, end in ranges]  # fmt: skip
     return [*over_theta, *over_kappa, *ends]
 
 
@@ -147,8 +148,8 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
     words = (
-        f"Gain {gain_words(controller)}, order {controller['order']}, stable but for "
-        "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
+        f"Gain {gain_words(controller)}, order {controller['order']}. Apart from the integrator, K "
+        "is stable. Every section has the gain 1 at s = 0 (the integrator's: at high frequency)."
     )
     return Words(words), structured_table(found)
 

@@ -51,8 +51,8 @@ def coloured(line: str) -> str:
 
 
 def say(text: str, stream: TextIO | None = None) -> None:
-    """Print lines; a stream that is no terminal gets them as they are."""
-    stream = stream or sys.stdout
+    """Print lines, "us" and "um" in all of them; a stream that is no terminal gets them whole."""
+    stream, text = stream or sys.stdout, text.replace("µ", "u")
     if stream.isatty():
         text = "\n".join(coloured(wrapped(line, columns(stream))) for line in text.split("\n"))
         if stream is sys.stderr:  # where a bar may stand
