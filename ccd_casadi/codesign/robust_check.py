@@ -73,17 +73,18 @@ class OtherDamping:
     @property
     def words(self) -> str:
         """What passes a bound by more than a hundredth with the other damping only, or nothing."""
-        how = f"with the damping {'matrix' if self.kept == 'ratio' else 'ratio'} kept instead"
+        other = "matrix" if self.kept == "ratio" else "ratio"
+        where = f"on the set if the damping {other} is kept and not the {self.kept}"
         if not self.own:
             return ""
         if not self.other:
-            return f"{how} the set holds a plant on which the loop is unstable"
+            return f"a loop is unstable {where}"
         found = [
-            f"{name} is {100.0 * (share - 1.0):.2g} % above its bound"
+            f"{name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
             for name, share in self.other.items()
             if share - max(1.0, self.own[name]) > MATTERS
         ]
-        return f"{how} {', '.join(found)} on the set" if found else ""
+        return f"{', '.join(found)} {where}" if found else ""
 
     @property
     def entry(self) -> dict[str, Any]:

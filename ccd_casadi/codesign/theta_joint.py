@@ -104,7 +104,7 @@ def together(
         make = partial(proposed, problem, models, best, reach)
         found = asked.kept("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
-            tell(f"J {J:.6g} and {found.gain:.2g} less to be had near by")
+            tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
         promised = found.gain > SETTLED * abs(J) and reach > LEAST
         if not (members or promised):
             best = finished(asked, best)
