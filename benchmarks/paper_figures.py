@@ -29,11 +29,11 @@ from ccd_casadi.drawing.content import (
     Table,
     Words,
 )
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.drawing.svg import CYCLE
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.bode import bode
-from ccd_casadi.reporting.loops import synthesised_loop, table_gains
+from ccd_casadi.reporting.loops import synthesised_loop
 from ccd_casadi.studies.published import TWO_MASS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -107,7 +107,7 @@ def _cases(loops: dict[str, LoopView], published: dict[str, Any]) -> tuple[Block
         "S; a higher gain moves the peak, and the bandwidth, to higher frequencies."
     )
     table = Table(("figure", "here", "paper", "difference"), tuple(rows))
-    figure = Figure(lines, caption, tuple(table_gains(loop) for loop in loops.values()))
+    figure = Figure(lines, caption)
     note = "How far S_max and the box bring these to the paper's: docs/development/calibration.md."
     return figure, table, Words(note)
 
@@ -123,7 +123,7 @@ def main() -> None:
     given = parser.parse_args()
     found = sections(problem_of(load_case(given.case)), TWO_MASS)
     head = Head("The paper's figures 4 and 5", "good", "computed", "", "", "")
-    given.out.write_text(painted(Page(head, tuple(found), index="")))
+    given.out.write_text(page_html(Page(head, tuple(found), index="")))
 
 
 if __name__ == "__main__":

@@ -1,18 +1,18 @@
 """The proof for the rib stage's controller, and what other code says of it.
 
-    python benchmarks/proof_judge.py [--draws N] [--climbs N] [--option I] [--mutants] [--most N]
+    python benchmarks/proof_judge.py [--draws N] [--climbs N] [--option I] [--mutants] [--bare]
+        [--most N]
 
-benchmarks/rib_stage_design/sections.json has the sections of an earlier design, at THETA. `prove`
-is asked for stability and |S|, |KS|, |T| and |GS| within 1.05 of their bounds on the box of every
-option: each flexible mode ±2 % by itself, damping × 0.5 to 2, up to 21 parameters. Then NumPy alone
-(its own hold and delay of each mode, K by Tustin's rule) looks for the largest figures in random
+The design is that of benchmarks/rib_stage_design. `prove` is required to show stability and |S|,
+|KS|, |T| and |GS| within 1.05 of their bounds (`--bare`: |S| alone) on the box of every option:
+each flexible mode ±2 % by itself, damping × 0.5 to 2, up to 21 parameters. Then NumPy alone (its
+own hold and delay of each mode, K by Tustin's rule) looks for the largest figures in random
 plants, half of them corners, and climbs from the worst ones parameter by parameter. `--mutants`:
 plants that are not those of the proof, none of which may be proven: a twentieth of the damping,
 modes that move by ±20 %, a gain by ±60 %, a drive turned over.
 """
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from time import process_time
@@ -22,6 +22,7 @@ import rib_stage_built as built
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import SLACK_OF_MANY, prove
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -34,7 +35,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.plants.modal import modal_plant
 
 CASE = Path(__file__).parent.parent / "runs" / "rib_stage_built.toml"
-THETA = (1e-3, 3e-3, 3e-3, 4.06e-3, 14.05e-3, 73e-3)
 HZ = 2.0 * np.pi
 T = 1.0 / built.RATE
 MOST = 700_000  # enclosures for each option
@@ -135,25 +135,28 @@ def main() -> None:
     parser.add_argument("--climbs", type=int, default=5)
     parser.add_argument("--option", type=int)
     parser.add_argument("--mutants", action="store_true")
+    parser.add_argument("--bare", action="store_true", help="prove |S| alone")
     parser.add_argument("--most", type=int, default=MOST, help="enclosures for each option")
     given = parser.parse_args()
     problem = problem_of(load_case(CASE))
-    whole = uncertain_plant(problem, THETA)
+    whole = uncertain_plant(problem, tuple(built.theta_of(built.DESIGN)))
     structure, sampling = structure_of(problem), structured_of(problem).sampling
-    values = json.loads((built.DESIGN / "sections.json").read_text())
-    kappa = np.log([values[name] for name in structure.names])
+    kappa = np.array(sections_kappa(built.DESIGN, structure))
     bounds = replace(bounds_of(problem), shape=None)
+    required = replace(bounds, weighted_level=None, compliance_max=None) if given.bare else bounds
     bandwidth = 60.0 * HZ
     rng = np.random.default_rng(0)
     for option in range(len(whole.options)) if given.option is None else [given.option]:
         one = replace(whole, options=(whole.options[option],))
         if given.mutants:
             for name, box in mutants(one).items():
-                proof = prove(box, structure, kappa, bandwidth, bounds, sampling, most_boxes=60_000)
+                proof = prove(
+                    box, structure, kappa, bandwidth, required, sampling, most_boxes=60_000
+                )
                 print(f"option {option}, {name}: {proof.outcome.value}", flush=True)
             continue
         began = process_time()
-        proof = prove(one, structure, kappa, bandwidth, bounds, sampling, most_boxes=given.most)
+        proof = prove(one, structure, kappa, bandwidth, required, sampling, most_boxes=given.most)
         print(f"option {option}: {proof.words}; {len(proof.parameters)} parameters, "
               f"{process_time() - began:.0f} s of a processor; "
               f"{ {name: round(value, 4) for name, value in proof.levels.items()} }",

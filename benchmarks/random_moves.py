@@ -18,7 +18,7 @@ from scipy.linalg import expm
 
 from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.analysis.move import simulate
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.structure import state_space
@@ -79,7 +79,7 @@ def drawn(rng: np.random.Generator) -> MoveCase:
         hold = Sampling(rng.uniform(4e3, 1e4), rng.uniform(0.0, 300.0))
         kappa = np.log([(carriage + tool) * crossover**2 / 3.0, crossover / rng.uniform(5.0, 20.0),
                         crossover / 3.0, 3.0 * crossover, 10.0 * crossover, 0.7])  # fmt: skip
-        limits = Limits(rng.uniform(0.01, 0.2), rng.uniform(0.3, 2.0), np.inf,
+        limits = MoveLimits(rng.uniform(0.01, 0.2), rng.uniform(0.3, 2.0), np.inf,
                         10.0 ** rng.uniform(2.5, 4.0), 10.0 ** rng.uniform(5.0, 6.5))  # fmt: skip
         window, dwell = 10.0 ** rng.uniform(-7.5, -5.5), rng.uniform(0.0, 0.2)
         motor = Motor(

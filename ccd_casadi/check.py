@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, program, run, run_folder
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.units import counted
 
 
@@ -66,22 +66,22 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity
     from ccd_casadi.cases.plant_report import plant_report
-    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.json_files import json_values, write_json
 
     case = load_case(options.case)
     problem = problem_of(case)
-    facts, findings = diagnose(problem, case.suspension.rigid_modes, options.quiet, options.seed)
+    facts, findings = diagnose(problem, case.suspension.rigid_modes, options.seed)
     errors = [f for f in findings if f.severity is Severity.ERROR]
     for item in errors:
         say(f"{options.case}: plant: {item.words}", sys.stderr)
     if errors:
         return ExitCode.BAD_INPUT
-    found = clean(plant_report(case, problem, facts, findings))
+    found = json_values(plant_report(case, problem, facts, findings))
     if options.out is not None:
         write_json(run_folder(options.case, options.out) / "check.json", found)
     say(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
-    if not options.json and not options.quiet:
-        say(f"next          {program('ccd_casadi.solve')} {options.case}")
+    if not options.json:
+        inform(f"next          {program('ccd_casadi.solve')} {options.case}")
     return ExitCode.DONE
 
 

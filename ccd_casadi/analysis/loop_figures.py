@@ -5,11 +5,12 @@ are given; steps are of the model and of the plants where the margins are least.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import frequency_and_damping
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
@@ -32,61 +33,10 @@ NEAR = 0.2
 RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
 
 
-@dataclass(frozen=True)
-class StepFigures:
-    """A unit step of each reference: overshoot and the last time outside 2 %, s (inf: not within
-    the time that was looked at); the largest displacement after 1 N, m, that at rest included."""
-
-    overshoot: float
-    settling: float
-    by_force: float
-
-
-@dataclass(frozen=True)
-class LoopFigures:
-    """The least margins of all plants, with the crossover of the model; the worst step.
-
-    `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
-    `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near ω_b; `ringing`: the
-    closed-loop root of least damping within an octave of ω_b, on any plant, where that is small.
-    """
-
-    margins: ClassicalMargins
-    step: StepFigures
-    growth: float
-    light_roots: tuple[tuple[float, float, str], ...]
-    ringing: tuple[float, float] | None
-
-
-def loop_figures(
-    plants: Sequence[StateSpace],
-    controller: StateSpace,
-    sampling: Sampling | None,
-    bandwidth: float,
-) -> LoopFigures:
-    """Of a stable loop on every plant, the model first; SI, ω_b in rad/s."""
-    loops = [Loop(plant, controller, sampling) for plant in plants]
-    margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
-    gain = [gain_margin(m) for m in margins]
-    worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
-    steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
-    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
-    sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
-    return LoopFigures(
-        margins=replace(least_of(margins), crossover=margins[0].crossover),
-        step=StepFigures(
-            max(s.overshoot for s in steps),
-            max(s.settling for s in steps),
-            max(s.by_force for s in steps),
-        ),
-        growth=max(float((size / size[0]).max()) for size in sizes),
-        light_roots=light_roots(controller, bandwidth),
-        ringing=ringing(np.concatenate([loop.poles for loop in loops]), bandwidth),
-    )
-
-
-def step_figures(loop: Loop, bandwidth: float) -> StepFigures:
-    """Of each reference and each force in turn, the worst."""
+def step_figures(loop: Loop, bandwidth: float) -> tuple[float, float, float]:
+    """Of a unit step of a reference the overshoot, and the last time outside 2 % in s (inf: not
+    within the time looked at); the largest displacement by 1 N in m, that at rest included. Of
+    each reference and each force in turn, the worst."""
     duration = PERIODS * HZ / bandwidth
     steps = loop.over_a_step(duration / (PERIODS * PER_PERIOD))
     count = int(duration / steps.period) + 1
@@ -100,33 +50,25 @@ def step_figures(loop: Loop, bandwidth: float) -> StepFigures:
         settling = max(settling, float(time[last]) if last < count else np.inf)
     rest = steps.C_y @ np.linalg.solve(np.eye(len(steps.A)) - steps.A, steps.B_d)
     moved = [float(np.abs(constant_drive(steps, drive, count)).max()) for drive in steps.B_d.T]
-    return StepFigures(overshoot, settling, max(*moved, float(np.abs(rest).max())))
+    return overshoot, settling, max(*moved, float(np.abs(rest).max()))
 
 
-def ringing(poles: Array, bandwidth: float) -> tuple[float, float] | None:
+def ringing(poles: np.ndarray, bandwidth: float) -> tuple[float, float] | None:
     """Frequency in rad/s and damping of the least damped of `poles` within an octave of ω_b, if
     that damping is below 0.05."""
-    size = np.maximum(np.abs(poles), 1e-300)
-    near = (np.abs(np.log2(size / bandwidth)) <= 1.0) & (-poles.real < RINGING * size)
-    found = zip(size[near], -poles.real[near] / size[near], strict=True)
-    return min(((float(w), float(d)) for w, d in found), key=lambda root: root[1], default=None)
+    found = zip(*frequency_and_damping(poles), strict=True)
+    near = [(float(w), float(d)) for w, d in found if bandwidth <= 2.0 * w <= 4.0 * bandwidth]
+    return min((root for root in near if root[1] < RINGING), key=lambda r: r[1], default=None)
 
 
 def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, float, str], ...]:
     """Poles and zeros of K with damping below 0.1 within 20 % of ω_b, ascending."""
-    found = []
-    for word, roots in (
-        ("zero", controller.zeros(bandwidth)),
-        ("pole", np.linalg.eigvals(controller.A)),
-    ):
-        size = np.abs(roots)
-        damping = -roots.real / np.maximum(size, 1e-300)
-        near = (np.abs(size / bandwidth - 1.0) <= NEAR) & (np.abs(damping) < LIGHT)
-        chosen = near & (roots.imag > 0.0)
-        found += [
-            (float(w), float(d), word) for w, d in zip(size[chosen], damping[chosen], strict=True)
-        ]
-    return tuple(sorted(found))
+    return tuple(sorted(
+        (float(w), float(d), word)
+        for word, roots in (("zero", controller.zeros(bandwidth)), ("pole", controller.poles))
+        for w, d in zip(*frequency_and_damping(roots), strict=True)
+        if abs(w / bandwidth - 1.0) <= NEAR and abs(d) < LIGHT
+    ))  # fmt: skip
 
 
 def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> tuple[Array, Array]:
@@ -156,10 +98,13 @@ def force_step(loop: Loop, times: Array) -> tuple[Array, Array]:
 
 
 def loop_warnings(
-    growth: float, roots: Sequence[tuple[float, float, str]], bandwidth: float,
+    growth: float, controller: StateSpace, bandwidth: float,
     rings: tuple[float, float] | None = None,
 ) -> list[str]:  # fmt: skip
-    """By name, what an engineer would not build: ω_b that is held by something narrow, or rings."""
+    """By name, what an engineer would not build: ω_b that is held by something narrow, or rings.
+
+    `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
+    """
     hz = bandwidth / HZ
     words = []
     if growth > SHARP:
@@ -170,7 +115,7 @@ def loop_warnings(
     words += [
         f"the controller has a {word} at {w / HZ:.4g} Hz with damping {d:.3g}, within 20 % of the "
         f"bandwidth"
-        for w, d, word in roots
+        for w, d, word in light_roots(controller, bandwidth)
     ]
     if rings is not None:
         words.append(
@@ -196,9 +141,8 @@ def measured_entry(
         margins.append(classical_margins(response, omega))
         S = np.abs(1.0 / (1.0 + response(bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30))))
         growth = max(growth, float((S / S[0]).max()))
-    roots = light_roots(controller, bandwidth)
     return _entry(least_of(margins), sensitivity_peak) | {
-        "loop_warnings": loop_warnings(growth, roots, bandwidth)
+        "loop_warnings": loop_warnings(growth, controller, bandwidth)
     }
 
 
@@ -224,11 +168,23 @@ def loop_entry(
     bandwidth: float,
     sensitivity_peak: float,
 ) -> dict[str, Any]:
-    """The figures under the keys of `result.json`; the modulus margin is 1/‖S‖∞."""
-    found = loop_figures(plants, controller, sampling, bandwidth)
-    return _entry(found.margins, sensitivity_peak) | {
-        "step_overshoot": found.step.overshoot,
-        "settling_ms": 1e3 * found.step.settling,
-        "force_step_max": found.step.by_force,
-        "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth, found.ringing),
+    """Of a stable loop on every plant, the model first, under the keys of `result.json`; SI, ω_b
+    in rad/s. The least margins of all plants, with the crossover of the model, and 1/‖S‖∞ as the
+    modulus margin; the worst step."""
+    loops = [Loop(plant, controller, sampling) for plant in plants]
+    margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
+    gain = [gain_margin(m) for m in margins]
+    worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
+    steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
+    overshoot, settling, by_force = map(max, zip(*steps, strict=True))
+    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
+    sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
+    growth = max(float((size / size[0]).max()) for size in sizes)
+    rings = ringing(np.concatenate([loop.poles for loop in loops]), bandwidth)
+    least = replace(least_of(margins), crossover=margins[0].crossover)
+    return _entry(least, sensitivity_peak) | {
+        "step_overshoot": overshoot,
+        "settling_ms": 1e3 * settling,
+        "force_step_max": by_force,
+        "loop_warnings": loop_warnings(growth, controller, bandwidth, rings),
     }

@@ -48,7 +48,7 @@ class LoopView:
     """
 
     label: str
-    loop: Loop
+    loops: tuple[Loop, ...]
     hz: Array
     plant: np.ndarray
     controller: np.ndarray
@@ -60,6 +60,11 @@ class LoopView:
     peaks: tuple[tuple[float, float], ...]
     resonances_hz: tuple[float, ...]
     antiresonances_hz: tuple[float, ...]
+
+    @property
+    def loop(self) -> Loop:
+        """The model's."""
+        return self.loops[0]
 
     @property
     def gains(self) -> Array:
@@ -128,7 +133,7 @@ def loop_view(
         opened.append(G @ K)
     assert first is not None
     return LoopView(
-        label, model, hz, *first, np.array(sizes).swapaxes(0, 1), np.array(opened),
+        label, tuple(loops), hz, *first, np.array(sizes).swapaxes(0, 1), np.array(opened),
         np.asarray(bounded.over(hz)), bounded, bandwidth_hz, found, poles, zeros,
     )  # fmt: skip
 

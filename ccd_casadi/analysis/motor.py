@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ccd_casadi.analysis.feedforward import feedforward_slopes
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -63,7 +63,7 @@ class Motion:
     """A move in SI and its motor: `limits` (acceleration inf: what the motor allows), `window` in
     which it has settled, `dwell` from its end to the next. The first output moves."""
 
-    limits: Limits
+    limits: MoveLimits
     window: float
     dwell: float = 0.0
     motor: Motor | None = None

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Limits:
+class MoveLimits:
     """Stroke and bounds of velocity, acceleration, jerk and snap; unit of y and s."""
 
     stroke: float
@@ -14,5 +14,5 @@ class Limits:
     snap: float
 
 
-LIMITS = Limits(0.01, 0.1, 2.0, 100.0, 1e4)  # the move that is made where none is given
+LIMITS = MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4)  # the move that is made where none is given
 WINDOW = 1e-6  # m

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.support.arrays import Array
 
 
@@ -74,7 +74,7 @@ def _advanced(state: Array, snap: float | Array, t: Array) -> Array:
     return np.asarray(np.broadcast_arrays(*rows))
 
 
-def setpoint(limits: Limits) -> Setpoint:
+def setpoint(limits: MoveLimits) -> Setpoint:
     """The shortest symmetric fourth-order move; all limits positive.
 
     Analytic in the limits, which may be complex: a step along the imaginary axis gives derivatives.

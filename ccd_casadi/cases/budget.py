@@ -9,7 +9,8 @@ unit = "N^2/Hz"
 psd = [[1.0, 1e-3], [100.0, 1e-6]]      # [Hz, density]; or file = "cables.csv"
 """
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,19 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
-from ccd_casadi.cases.checks import NOT_NEGATIVE, POSITIVE, Check, rows, shown, text
+from ccd_casadi.cases.checks import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    Check,
+    Fail,
+    every,
+    require_good,
+    rows,
+    short_repr,
+    text,
+)
 from ccd_casadi.cases.tables import BudgetTable
 
-Fail = Callable[[str, str], Exception]
 # Unit -> factor of a density to SI, and whether the number is its square root.
 _POSITION = {"m^2/Hz": (1.0, False), "m/rtHz": (1.0, True), "nm/rtHz": (1e-9, True)}
 _ACCELERATION = {"(m/s^2)^2/Hz": (1.0, False), "m/s^2/rtHz": (1.0, True)}
@@ -34,18 +44,16 @@ MOST_ROWS = 20_000  # of a table
 PATH = ("mass", "damping", "stiffness")
 
 
-def _corners(value: Any) -> str | None:
-    remedy = "give a list of Hz, or of [Hz, damping ratio], all above 0"
-    if not isinstance(value, list | tuple):
-        return f"is {shown(value)}; {remedy}"
-    for item in value:
-        parts = item if isinstance(item, list | tuple) else [item]
-        if len(parts) not in (1, 2) or any(POSITIVE(part) is not None for part in parts):
-            return f"is {shown(value)}; {remedy}"
-    return None
+def _corner(value: Any) -> str | None:
+    parts = value if isinstance(value, list | tuple) else [value]
+    good = len(parts) in (1, 2) and all(POSITIVE(part) is None for part in parts)
+    return None if good else "is none"
 
 
-CORNERS = Check(_corners, {"type": "array"})
+CORNERS = every(
+    Check(_corner, {"type": ["number", "array"]}),
+    "give a list of Hz, or of [Hz, damping ratio], all above 0",
+)
 TABLE_CHECKS: dict[str, Check] = {
     "name": text,
     "unit": text,
@@ -86,15 +94,12 @@ def error_budget(table: BudgetTable) -> ErrorBudget | None:
 def _checked(
     entry: Mapping[str, Any], kind: Kind, place: str, folder: Path, fail: Fail
 ) -> Mapping[str, Any]:
-    for key, value in entry.items():
-        if key not in TABLE_CHECKS or (key in PATH and kind is not Kind.FLOOR_MOTION):
-            raise fail(f"{place}.{key}", f"unknown key; known are {', '.join(TABLE_CHECKS)}")
-        wrong = TABLE_CHECKS[key](value)
-        if wrong is not None:
-            raise fail(f"{place}.{key}", wrong)
+    still = kind is not Kind.FLOOR_MOTION
+    known = {key: one for key, one in TABLE_CHECKS.items() if not (still and key in PATH)}
+    require_good(place, entry, known, fail)
     if entry.get("unit") not in UNITS[kind]:
         choices = ", ".join(f'"{unit}"' for unit in UNITS[kind])
-        raise fail(f"{place}.unit", f"is {shown(entry.get('unit'))}; choose one of {choices}")
+        raise fail(f"{place}.unit", f"is {short_repr(entry.get('unit'))}; choose one of {choices}")
     ways = [key for key in ("level", "psd", "file") if key in entry]
     if len(ways) != 1:
         raise fail(place, "give one of level, psd and file, and not more")
@@ -145,20 +150,17 @@ def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
-        raise fail(f"{place}.file", f"{shown(path.name)} cannot be read: {reason}") from None
+        raise fail(f"{place}.file", f"{short_repr(path.name)} cannot be read: {reason}") from None
     found: list[list[float]] = []
-    for number_, line in enumerate(lines, 1):
-        line = line.split("#")[0].strip()
-        if not line or (not found and line[0].isalpha()):
+    for i, line in enumerate((re.split(r"[,;\t]", one.split("#")[0].strip()) for one in lines), 1):
+        if line == [""] or (not found and line[0].strip()[:1].isalpha()):
             continue
         try:
-            row = [float(part) for part in line.replace(";", ",").replace("\t", ",").split(",")]
+            hz, density = map(float, line)
         except ValueError:
-            row = []
-        if len(row) != 2:
-            words = f"line {number_} of {shown(path.name)} is not a pair Hz, density; correct it"
-            raise fail(f"{place}.file", words)
-        found.append(row)
+            words = f"line {i} of {short_repr(path.name)} is not a pair Hz, density; correct it"
+            raise fail(f"{place}.file", words) from None
+        found.append([hz, density])
     if len(found) > MOST_ROWS:
         raise fail(f"{place}.file", f"has more than {MOST_ROWS} rows; thin it out")
     return found

@@ -4,29 +4,33 @@
 """
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget
-from ccd_casadi.cases.checks import closest, shown
+from ccd_casadi.cases.checks import (
+    CaseError,
+    Fail,
+    Test,
+    check_of,
+    closest,
+    require_good,
+    short_repr,
+)
 from ccd_casadi.cases.controller_tables import ChannelTable
-from ccd_casadi.cases.kinds import check_kind, read_options
+from ccd_casadi.cases.kinds import check_kind
 from ccd_casadi.cases.motion import check_motion
-from ccd_casadi.cases.places import checked_places, place_names
+from ccd_casadi.cases.places import checked_places
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.tables import TABLES, Case
-from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import one_line
+from ccd_casadi.plants.nodes import names_in
+from ccd_casadi.support.options import DEFAULT_CASE, one_line
 
 TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
-DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
-
-
-class CaseError(UserError):
-    """One line: file, key, what is wrong, what to do."""
 
 
 # Which weight must lie below which: else it asks for nothing (W_S) or for the opposite (W_T).
@@ -35,11 +39,7 @@ _ORDERED_WEIGHTS = (
     ("A_u", "A_l", "W_T asks for a roll-off"),
 )
 # What is one number for all channels, and where those of single channels go.
-_OF_THE_WHOLE = {
-    ("inner", "S_max"),
-    ("controller", "weighted_level"),
-    *(("weights", item.name) for item in fields(TABLES["weights"])),
-}
+_OF_THE_WHOLE = ("S_max", "weighted_level", *(item.name for item in fields(TABLES["weights"])))
 _PER_CHANNEL = (
     "give a number, the whole loop's: S_max, M_K and bandwidth_ratio of a channel go in a table "
     '[controller.channel.NAME] with controller.structure = "sections"'
@@ -127,18 +127,16 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     --------
     >>> parse_case({"plant": {"model": "two_mas"}, "theta": {}})
     Traceback (most recent call last):
-    ccd_casadi.cases.case.CaseError: case: objective: is missing; add a table [objective]
+    ccd_casadi.cases.checks.CaseError: case: objective: is missing; add a table [objective]
     """
 
-    def fail(key: str, words: str) -> CaseError:
-        return CaseError(one_line(f"{path}: {key}: {words}"))
-
+    fail = Fail(path)
     known = ("plant", "theta", *TABLES)
     for name, table in data.items():
         if name not in known:
             raise fail(name, f"unknown table{closest(name, known)}")
         if not isinstance(table, Mapping):
-            raise fail(name, f"is {shown(table)}; write a table [{name}]")
+            raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     for name in ("plant", "theta"):
         if name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
@@ -167,10 +165,11 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     plant = plant_table(data["plant"], path, fail)
     files = tables["robust"].plants
     absolute = tuple(str((path.parent / file).resolve()) for file in files)
-    for file, place in zip(files, absolute, strict=True):
-        plant_table(dict(data["plant"]) | options_in(file, place, fail), path, fail)
+    for place in absolute:
+        plant_table(dict(data["plant"]) | options_in(place, fail), path, fail)
     tables["robust"] = replace(tables["robust"], plants=absolute)
-    of_case = (*place_names(tables["places"]), *filter(None, [tables["motor"].size]))
+    places, size = tables["places"], tables["motor"].size
+    of_case = (*names_in((*places.actuators, *places.sensors)), *filter(None, [size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":
@@ -180,25 +179,20 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **tables)
 
 
-def table_of(
-    kind: type, name: str, table: Mapping[str, Any], fail: Callable[[str, str], CaseError]
-) -> Any:
+def table_of(kind: type, name: str, table: Mapping[str, Any], fail: Fail) -> Any:
     """A table as its dataclass, every key checked."""
-    allowed = {item.name: item for item in fields(kind)}
-    for key in table:
-        if key not in allowed:
-            raise fail(f"{name}.{key}", f"unknown key{closest(key, allowed)}")
+    checks: dict[str, Test] = {item.name: check_of(item) for item in fields(kind)}
+    if kind is not ChannelTable:
+        whole = checks.keys() & set(_OF_THE_WHOLE)
+        checks |= {key: partial(_number_of_the_whole, checks[key]) for key in whole}
+    require_good(name, table, checks, fail)
     values = {}
-    for key, item in allowed.items():
+    for item in fields(kind):
+        key = item.name
         if key not in table:
             if item.default is MISSING:
                 raise fail(f"{name}.{key}", "is missing; add it")
             continue
-        wrong = item.metadata["check"](table[key])
-        if wrong is not None and isinstance(table[key], list) and (name, key) in _OF_THE_WHOLE:
-            wrong = f"is {shown(table[key])}; {_PER_CHANNEL}"
-        if wrong is not None:
-            raise fail(f"{name}.{key}", wrong)
         value = table[key]
         if isinstance(value, list):
             numbers = all(isinstance(v, int | float) for v in value)
@@ -210,34 +204,42 @@ def table_of(
     return kind(**values)
 
 
-def options_in(file: str, place: str, fail: Callable[[str, str], CaseError]) -> dict[str, Any]:
+def _number_of_the_whole(check: Test, value: Any) -> str | None:
+    return f"is {short_repr(value)}; {_PER_CHANNEL}" if isinstance(value, list) else check(value)
+
+
+def options_in(place: str, fail: Fail) -> dict[str, Any]:
     """The plant options in a file that [robust] names. Raises CaseError where it has none."""
     try:
-        return read_options(Path(place))
-    except ValueError as error:
-        raise fail("robust.plants", f"{shown(file)}: {error}") from None
+        found = read_toml(Path(place))
+    except CaseError as error:
+        raise fail("robust.plants", str(error)) from None
+    for key in ("model", "function"):
+        if key in found:
+            raise fail("robust.plants", f"{place}: {key} is not an option of a plant; drop it")
+    return found
 
 
 def parse_theta(case: Case, text: str) -> tuple[float, ...]:
     """θ from `m1=60,m2=60`, in the case's order. Raises CaseError naming what is wrong."""
 
-    def fail(words: str) -> CaseError:
-        return CaseError(one_line(f"{case.path}: --theta: {words}"))
-
+    fail = partial(Fail(case.path), "--theta")
     names = [parameter.name for parameter in case.theta]
     found: dict[str, float] = {}
     for part in text.split(","):
         name, equals, value = (item.strip() for item in part.partition("="))
         if not equals:
-            raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
+            raise fail(
+                f"{short_repr(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
+            )
         if name not in names:
-            raise fail(f"{shown(name)} is not a parameter of the case{closest(name, names)}")
+            raise fail(f"{short_repr(name)} is not a parameter of the case{closest(name, names)}")
         if name in found:
             raise fail(f"{name} is given twice; give it once")
         try:
             found[name] = float(value)
         except ValueError:
-            raise fail(f"{name} = {shown(value)} is not a number; give one") from None
+            raise fail(f"{name} = {short_repr(value)} is not a number; give one") from None
     for parameter in case.theta:
         if parameter.name not in found:
             raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")

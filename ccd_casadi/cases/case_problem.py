@@ -4,13 +4,14 @@ from typing import Any
 
 from ccd_casadi.cases.budget import error_budget
 from ccd_casadi.cases.case import CaseError, options_in
+from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
-from ccd_casadi.cases.kinds import disturbance_of, structured_problem, weights_of
+from ccd_casadi.cases.kinds import structured_problem, weights_of
 from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.tables import Case, RobustTable
-from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
+from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, Options, RobustSet
 from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -20,6 +21,7 @@ from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.options import one_line
+from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.units import HZ
 
 
@@ -48,7 +50,7 @@ def problem_of(case: Case) -> CoDesignProblem:
     >>> problem.names, problem.w2, round(problem.inner.omega_low, 3)
     (('m1', 'm2'), -0.995, 6.283)
     """
-    inner, w = case.inner, case.weights
+    inner = case.inner
     file = function = None
     if case.plant.function is not None:
         name, function = case.plant.function.rsplit(":", 1)
@@ -75,7 +77,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         w1=case.objective.w1,
         w2=case.objective.w2,
         cost_unit=case.objective.cost_unit,
-        weights=weights_of(w, inner, disturbance_of(case.controller, w)),
+        weights=weights_of(case.controller, case.weights, inner),
         inner=InnerProblem(
             S_max=inner.S_max,
             S_low=inner.S_low,
@@ -90,14 +92,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
         robust=None if structured else _robust(case.robust),
-        controller=structured_problem(
-            case.controller,
-            case.loop,
-            case.robust,
-            inner,
-            _option_sets(case),
-            tuple((p.name, p.lower, p.upper) for p in case.fixed if p.varies),
-        )
+        controller=structured_problem(case, _option_sets(case))
         if structured
         else MixedSensitivityProblem(),
         budget=error_budget(case.budget),
@@ -110,7 +105,9 @@ def problem_of(case: Case) -> CoDesignProblem:
             require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
-            for finding in diagnose(problem, case.suspension.rigid_modes)[1]:
+            with kept_quiet(True):
+                found = diagnose(problem, case.suspension.rigid_modes)[1]
+            for finding in found:
                 if finding.severity is Severity.ERROR:
                     raise PlantError(finding.words)
     except UserError as error:
@@ -123,15 +120,11 @@ def problem_of(case: Case) -> CoDesignProblem:
     return problem
 
 
-def _option_sets(case: Case) -> tuple[tuple[tuple[str, object], ...], ...]:
+def _option_sets(case: Case) -> tuple[Options, ...]:
     """The plant options of every file that [robust] names, data files by their absolute path."""
     found = []
     for file in case.robust.plants:
-
-        def fail(key: str, words: str) -> CaseError:
-            return CaseError(one_line(f"{case.path}: {key}: {words}"))
-
-        options = options_in(file, file, fail)
+        options = options_in(file, Fail(case.path))
         data = data_option(case.plant.model)
         if data in options:
             options[data] = str((case.path.parent / options[data]).resolve())

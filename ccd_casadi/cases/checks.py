@@ -4,17 +4,36 @@ to give instead. Each carries what JSON Schema can say of the same, for editors 
 import difflib
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, dataclass, field
-from typing import Any
+from dataclasses import MISSING, Field, dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import one_line
 
 LARGEST, SMALLEST = 1e30, 1e-30  # beyond them squares and products leave double precision
+Test = Callable[[Any], str | None]  # what is wrong with a value; None where nothing is
+
+
+class CaseError(UserError):
+    """One line: file, key, what is wrong, what to do."""
+
+
+@dataclass(frozen=True)
+class Fail:
+    """The error of a case file by its key and what is wrong."""
+
+    path: Path
+
+    def __call__(self, key: str, words: str) -> CaseError:
+        return CaseError(one_line(f"{self.path}: {key}: {words}"))
 
 
 @dataclass(frozen=True)
 class Check:
     """A check, called with a value, and its JSON Schema, which may let more pass."""
 
-    test: Callable[[Any], str | None]
+    test: Test
     schema: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, value: Any) -> str | None:
@@ -22,7 +41,7 @@ class Check:
         return self.test(value)
 
 
-def _with(schema: Mapping[str, Any]) -> Callable[[Callable[[Any], str | None]], Check]:
+def _with(schema: Mapping[str, Any]) -> Callable[[Test], Check]:
     return lambda test: Check(test, schema)
 
 
@@ -36,9 +55,9 @@ def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Che
 
     def check(value: Any) -> str | None:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            return f"is {shown(value)}, not a number; {remedy}"
+            return f"is {short_repr(value)}, not a number; {remedy}"
         if too_large(value) or not math.isfinite(value):
-            return f"is {shown(value)}; {remedy}"
+            return f"is {short_repr(value)}; {remedy}"
         if not (low < value < high or (closed and value == low)):
             return f"is {value:g}; {remedy}"
         if abs(value) > LARGEST or (not closed and 0.0 in (low, high) and abs(value) < SMALLEST):
@@ -71,7 +90,7 @@ def count(least: int) -> Check:
         good = isinstance(value, int) and not isinstance(value, bool) and value >= least
         if good and not too_large(value):
             return None
-        return f"is {shown(value)}; give a whole number of at least {least}"
+        return f"is {short_repr(value)}; give a whole number of at least {least}"
 
     return Check(check, {"type": "integer", "minimum": least})
 
@@ -80,30 +99,19 @@ def choice(*names: str) -> Check:
     def check(value: Any) -> str | None:
         if value in names:
             return None
-        return f"is {shown(value)}; choose one of {', '.join(names)}"
+        return f"is {short_repr(value)}; choose one of {', '.join(names)}"
 
     return Check(check, {"enum": list(names)})
 
 
 @_with({"type": "string"})
 def text(value: Any) -> str | None:
-    return None if isinstance(value, str) else f"is {shown(value)}; give a text in quotes"
+    return None if isinstance(value, str) else f"is {short_repr(value)}; give a text in quotes"
 
 
 @_with({"type": "boolean"})
 def flag(value: Any) -> str | None:
-    return None if isinstance(value, bool) else f"is {shown(value)}; give true or false"
-
-
-@_with(_list({"type": "number", "exclusiveMinimum": 0.0}, 2, 2))
-def interval(value: Any) -> str | None:
-    remedy = "give two positive numbers [low, high] with low < high"
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        return f"is {shown(value)}; {remedy}"
-    for item in value:
-        if POSITIVE(item) is not None:
-            return f"is {shown(value)}; {remedy}"
-    return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
+    return None if isinstance(value, bool) else f"is {short_repr(value)}; give true or false"
 
 
 @_with(
@@ -118,7 +126,7 @@ def one_or_more(value: Any) -> str | None:
     several = value if isinstance(value, list | tuple) else [value]
     if several and all(POSITIVE(item) is None for item in several):
         return None
-    return f"is {shown(value)}; give a number above 0, or a list of them"
+    return f"is {short_repr(value)}; give a number above 0, or a list of them"
 
 
 @_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
@@ -131,14 +139,14 @@ def text_or_rows(value: Any) -> str | None:
 @_with({"type": "object"})
 def table(value: Any) -> str | None:
     good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
-    return None if good else f"is {shown(value)}; write tables of that name"
+    return None if good else f"is {short_repr(value)}; write tables of that name"
 
 
 @_with({"anyOf": [{"type": "object"}, _list({"type": "object"})]})
 def tables(value: Any) -> str | None:
     several = value if isinstance(value, list | tuple) else [value]
     good = all(isinstance(item, Mapping) for item in several)
-    return None if good else f"is {shown(value)}; write a table, or several in double brackets"
+    return None if good else f"is {short_repr(value)}; write a table, or several in double brackets"
 
 
 def every(item: Check, remedy: str, least: int = 0, most: int | None = None) -> Check:
@@ -148,7 +156,7 @@ def every(item: Check, remedy: str, least: int = 0, most: int | None = None) -> 
         good = isinstance(value, list | tuple) and all(item(each) is None for each in value)
         if good and least <= len(value) <= (math.inf if most is None else most):
             return None
-        return f"is {shown(value)}; {remedy}"
+        return f"is {short_repr(value)}; {remedy}"
 
     return Check(check, _list(item.schema, least, most))
 
@@ -158,7 +166,7 @@ def too_large(value: Any) -> bool:
     return isinstance(value, int) and abs(value) >= 2**63
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     if too_large(value):
         return "an integer of more than 64 bits"
     try:
@@ -172,8 +180,10 @@ ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
 NOT_NEGATIVE = number(0.0, math.inf, "give 0 or more", closed=True)
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
+DAMPING = number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True)
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
+_pair = every(POSITIVE, "give two positive numbers [low, high] with low < high", 2, 2)
 points = every(count(2), "give two whole numbers of at least 2", 2, 2)
 steps = every(FRACTION, "give a list of numbers between 0 and 1, both exclusive", 1)
 factors = every(POSITIVE, "give a list of numbers above 0")
@@ -197,12 +207,20 @@ places = every(
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
+@_with(_pair.schema)
+def interval(value: Any) -> str | None:
+    wrong = _pair(value)
+    if wrong is None and not value[0] < value[1]:
+        return f"is an empty range {short_repr(value)}; give [low, high] with low < high"
+    return wrong
+
+
 @_with(numbers.schema)
 def direction(value: Any) -> str | None:
     wrong = numbers(value)
     if wrong is not None:
         return f"{wrong}, one for each"
-    return None if any(value) else f"is {shown(value)}; give numbers that are not all 0"
+    return None if any(value) else f"is {short_repr(value)}; give numbers that are not all 0"
 
 
 def rows(width: int) -> Check:
@@ -215,9 +233,36 @@ def closest(name: str, known: Collection[str]) -> str:
     return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"
 
 
-def key(check: Check, default: Any = MISSING, *, says: str, unit: str = "") -> Any:
-    """The field of a table's dataclass that a key is."""
+USUAL = {float: POSITIVE, int: count(0), bool: flag, str: text}  # checks of a key, by its type
+SUFFIXES = {"_hz": "Hz", "_us": "µs", "_ms": "ms"}
+
+
+def key(says: str, default: Any = MISSING, *, check: Check | None = None, unit: str = "") -> Any:
+    """The field of a table's dataclass that a key is; `check` where its type has another one."""
     metadata = {"check": check, "says": says, "unit": unit}
     if default is MISSING:
         return field(metadata=metadata)
     return field(default=default, metadata=metadata)
+
+
+def check_of(item: Field[Any]) -> Check:
+    """Its own, or the usual one of its type: a number above 0, a count, true or false, a text."""
+    kind: Any = (*get_args(item.type), item.type)[0]
+    return item.metadata["check"] or USUAL[kind]
+
+
+def unit_of(item: Field[Any]) -> str:
+    """Its own, or that which the key's name ends with."""
+    return item.metadata["unit"] or SUFFIXES.get(item.name[-3:], "")
+
+
+def require_good(
+    place: str, table: Mapping[str, Any], checks: Mapping[str, Test], fail: Fail
+) -> None:
+    """Raise the error of the first key of a table that is unknown, or not as its check wants it."""
+    for name, value in table.items():
+        if name not in checks:
+            raise fail(f"{place}.{name}", f"unknown key{closest(name, checks)}")
+        wrong = checks[name](value)
+        if wrong is not None:
+            raise fail(f"{place}.{name}", wrong)

@@ -5,17 +5,15 @@ import math
 from dataclasses import dataclass
 
 from ccd_casadi.cases.checks import (
+    DAMPING,
     FRACTION,
-    POSITIVE,
     choice,
     count,
     direction,
-    flag,
     key,
     number,
     steps,
     table,
-    text,
 )
 
 
@@ -32,38 +30,35 @@ class ChannelTable:
     """
 
     outputs: tuple[float, ...] | None = key(
-        direction, None, says="the channel's measurement as weights of the plant's outputs"
+        "the channel's measurement as weights of the plant's outputs", None, check=direction
     )
     inputs: tuple[float, ...] | None = key(
-        direction,
+        "the channel's force as weights of the plant's inputs; default: as outputs",
         None,
-        says="the channel's force as weights of the plant's inputs; default: as outputs",
+        check=direction,
     )
-    like: str | None = key(text, None, says="another channel: both have one controller")
-    integrator: bool | None = key(flag, None, says="instead of [controller]'s")
-    lead: int | None = key(count(0), None, says="instead of [controller]'s")
-    biquads: int | None = key(count(0), None, says="instead of [controller]'s")
-    roll_off: int | None = key(count(0), None, says="instead of [controller]'s")
-    least_damping: float | None = key(
-        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
-        None,
-        says="instead of [controller]'s",
-    )
+    like: str | None = key("another channel: both have one controller", None)
+    integrator: bool | None = key("instead of [controller]'s", None)
+    lead: int | None = key("instead of [controller]'s", None)
+    biquads: int | None = key("instead of [controller]'s", None)
+    roll_off: int | None = key("instead of [controller]'s", None)
+    least_damping: float | None = key("instead of [controller]'s", None, check=DAMPING)
     S_max: float | None = key(
-        number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
+        "bound of the peak of this channel's S, tighter than the whole loop's in [inner]",
         None,
-        says="bound of the peak of this channel's S, tighter than the whole loop's in [inner]",
+        check=number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
     )
     M_K: float | None = key(
-        POSITIVE,
+        "M_K of this channel's W_KS, lower than that of [weights]: its force counts more",
         None,
-        says="M_K of this channel's W_KS, lower than that of [weights]: its force counts more",
         unit="N/m",
     )
     bandwidth_ratio: float = key(
-        number(1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True),
+        "least ratio of this channel's bandwidth to ω_b, which is that of the slowest channel",
         1.0,
-        says="least ratio of this channel's bandwidth to ω_b, which is that of the slowest channel",
+        check=number(
+            1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True
+        ),
     )
 
 
@@ -72,37 +67,29 @@ class ControllerTable:
     """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
     of full order with an input disturbance beside the reference, or "sections".
 
-    The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
-    of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
-    The search starts at `starts` places. `channel` overrides the structure of single channels.
+    The sections: an integrator, leads, biquads (a pair of zeros and one of poles), a roll-off.
     """
 
     structure: str = key(
-        choice("h_infinity", "h_infinity_disturbance", "sections"),
+        "mixed sensitivity, the same with an input disturbance, or a fixed structure",
         "h_infinity",
-        says="mixed sensitivity, the same with an input disturbance, or a fixed structure",
+        check=choice("h_infinity", "h_infinity_disturbance", "sections"),
     )
-    integrator: bool = key(flag, True, says="sections: whether K has an integrator with a zero")
-    lead: int = key(count(0), 1, says="sections: number of first-order leads")
+    integrator: bool = key("sections: whether K has an integrator with a zero", True)
+    lead: int = key("sections: number of first-order leads", 1)
     biquads: int = key(
-        count(0),
-        2,
-        says="sections: number of biquads, pairs of zeros and poles: notches, skewed notches",
+        "sections: number of biquads, pairs of zeros and poles: notches, skewed notches", 2
     )
-    roll_off: int = key(count(0), 2, says="sections: order of the roll-off")
+    roll_off: int = key("sections: order of the roll-off", 2)
     weighted_level: float | None = key(
-        POSITIVE,
-        None,
-        says="sections: bound of |W_KS KS| and |W_T T|; absent: no bound, which results report",
+        "sections: bound of |W_KS KS| and |W_T T|; absent: no bound, which results report", None
     )
     least_damping: float = key(
-        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
-        0.0,
-        says="sections: least damping ratio of zeros and poles",
+        "sections: least damping ratio of zeros and poles", 0.0, check=DAMPING
     )
-    starts: int = key(count(1), 12, says="sections: number of starts of the search")
+    starts: int = key("sections: number of starts of the search", 12, check=count(1))
     channel: tuple[tuple[str, ChannelTable], ...] = key(
-        table, (), says="tables [controller.channel.NAME] for plants with several outputs"
+        "tables [controller.channel.NAME] for plants with several outputs", (), check=table
     )
 
 
@@ -111,82 +98,64 @@ class LoopTable:
     """[loop]: sampled with a hold at `rate_hz`; `delay_us` from measurement to force."""
 
     rate_hz: float | None = key(
-        POSITIVE,
-        None,
-        says="sections: sampling rate of the loop, with a hold; absent: continuous",
-        unit="Hz",
+        "sections: sampling rate of the loop, with a hold; absent: continuous", None
     )
     delay_us: float = key(
-        number(0.0, 1e6, "give 0 to 1e6", closed=True),
+        "delay from reading the sensor to the new force",
         0.0,
-        says="delay from reading the sensor to the new force",
-        unit="µs",
+        check=number(0.0, 1e6, "give 0 to 1e6", closed=True),
     )
 
 
 @dataclass(frozen=True)
 class SamplingTable:
-    """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
+    """[sampling]: the plan over θ."""
 
-    `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
-    """
-
-    design: str = key(choice("grid", "sobol", "lhs"), "grid", says="sampling plan over θ")
+    design: str = key("sampling plan over θ", "grid", check=choice("grid", "sobol", "lhs"))
     points: int = key(
-        count(2), 5, says="number of θ: along each axis of a grid, in total for other plans"
+        "number of θ: along each axis of a grid, in total for other plans", 5, check=count(2)
     )
     lifted_points: int = key(
-        count(0), 0, says="number of designs (θ, ω_S, ω_T) for lifted; 0: chosen by the program"
+        "number of designs (θ, ω_S, ω_T) for lifted; 0: chosen by the program", 0
     )
 
 
 @dataclass(frozen=True)
 class OuterTable:
-    """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
+    """[outer]: starts, agreement of prediction and truth, rounds of refinement, global check."""
 
-    `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
-    that predicts left-out samples best. `box_points`: true inner problems spread over the box of θ
-    that a solve ends with a look at, those that it has solved already among them; 0: none.
-    """
-
-    starts: int = key(count(1), 16, says="starts of IPOPT on the surrogates")
-    direct_starts: int = key(count(1), 4, says="local solves on the true problem")
+    starts: int = key("starts of IPOPT on the surrogates", 16, check=count(1))
+    direct_starts: int = key("local solves on the true problem", 4, check=count(1))
     tolerance: float = key(
-        FRACTION, 1e-3, says="largest relative difference of prediction and truth"
+        "largest relative difference of prediction and truth", 1e-3, check=FRACTION
     )
-    max_refinements: int = key(count(0), 12, says="most rounds of adding true samples")
+    max_refinements: int = key("most rounds of adding true samples", 12)
     surrogate: str = key(
-        choice("matern52", "rbf", "auto"),
+        'kernel of the Gaussian processes; "auto": the one with the least left-out error',
         "matern52",
-        says='kernel of the Gaussian processes; "auto": the one with the least left-out error',
+        check=choice("matern52", "rbf", "auto"),
     )
     box_points: int = key(
-        count(0), 32, says="number of θ over the box in the global check at the end; 0: no check"
+        "number of θ over the box in the global check at the end; 0: no check", 32
     )
 
 
 @dataclass(frozen=True)
 class BaselineTable:
-    """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
+    """[baseline]: the sequential design's first resonance, and the descents' steps and starts."""
 
-    `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
-    and a Latin hypercube.
-    """
-
-    first_resonance_hz: float = key(
-        POSITIVE, 250.0, says="least first resonance of the sequential design", unit="Hz"
-    )
+    first_resonance_hz: float = key("least first resonance of the sequential design", 250.0)
     steps: tuple[float, ...] = key(
-        steps, (0.02, 0.05, 0.1), says="first steps of the descents, as shares of the box"
+        "first steps of the descents, as shares of the box", (0.02, 0.05, 0.1), check=steps
     )
-    starts: int = key(count(1), 3, says="starts of the descents: the case's own, a Latin hypercube")
-    max_iterations: int = key(count(1), 100, says="most iterations of a descent")
+    starts: int = key(
+        "starts of the descents: the case's own, a Latin hypercube", 3, check=count(1)
+    )
+    max_iterations: int = key("most iterations of a descent", 100, check=count(1))
 
 
 @dataclass(frozen=True)
 class LimitsTable:
     """[limits]: how long a user's plant function may take at each call, in s."""
 
-    plant_seconds: float = key(
-        POSITIVE, 60.0, says="time limit of each call of your own plant function", unit="s"
-    )
+    plant_seconds: float = key("time limit of each call of your own plant function", 60.0, unit="s")

@@ -1,15 +1,15 @@
 """Kinds of inner problem in a case file: which keys go with which, and the structured problem."""
 
-import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 from ccd_casadi.budget import Kind
-from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable, LoopTable
-from ccd_casadi.cases.tables import Case, InnerTable, RobustTable, WeightsTable
+from ccd_casadi.cases.checks import Fail
+from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable
+from ccd_casadi.cases.tables import Case, InnerTable, WeightsTable
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.inner_problem.controller_problem import Options
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
@@ -38,7 +38,7 @@ _OF_H_INFINITY = {
 }
 
 
-def check_kind(tables: Mapping[str, Any], fail: Callable[[str, str], Exception]) -> None:
+def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     """Raise where a key is given that has no effect on the chosen kind of inner problem."""
     controller, loop = tables["controller"], tables["loop"]
     structured = controller.structure == "sections"
@@ -122,60 +122,29 @@ def with_structure(case: Case, structure: str) -> Case:
     return replace(case, **tables)
 
 
-def disturbance_of(controller: ControllerTable, weights: WeightsTable) -> float:
-    """W_d in force over displacement; 0 where the kind has none."""
-    if controller.structure != WITH_DISTURBANCE:
-        return 0.0
-    return DISTURBANCE * weights.M_K if weights.disturbance is None else weights.disturbance
-
-
 def structure_of(controller: ControllerTable) -> Structure:
     """The structure that [controller] names."""
     return Structure(**{item.name: getattr(controller, item.name) for item in fields(Structure)})
 
 
-def weights_of(weights: WeightsTable, inner: InnerTable, disturbance: float) -> Weights:
+def weights_of(controller: ControllerTable, weights: WeightsTable, inner: InnerTable) -> Weights:
     """The weights, in SI, with ω_S and ω_T at the lower ends of their ranges."""
-    w = weights
-    return Weights(
-        M_S=w.M_S,
-        A_S=w.A_S,
-        omega_S=HZ * inner.omega_S_hz[0],
-        c_K=w.c_K,
-        omega_K=HZ * w.omega_K_hz,
-        M_K=w.M_K,
-        A_l=w.A_l,
-        A_u=w.A_u,
-        omega_T=HZ * inner.omega_T_hz[0],
-        disturbance=disturbance,
-    )
+    values: dict[str, Any] = vars(weights) | {
+        "omega_K": HZ * weights.omega_K_hz,
+        "omega_S": HZ * inner.omega_S_hz[0],
+        "omega_T": HZ * inner.omega_T_hz[0],
+    }
+    if controller.structure != WITH_DISTURBANCE:
+        values["disturbance"] = 0.0
+    elif weights.disturbance is None:
+        values["disturbance"] = DISTURBANCE * weights.M_K
+    del values["omega_K_hz"]
+    return Weights(**values)
 
 
-def read_options(path: Path) -> dict[str, Any]:
-    """An option set of the plant: a TOML file of plain keys. Raises ValueError with a remedy."""
-    try:
-        found = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise ValueError("there is no such file; give its path relative to the case file") from None
-    except OSError as error:
-        raise ValueError(f"cannot be read: {error.strerror}; name a readable file") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"is not valid TOML: {error}; correct it") from None
-    for key in ("model", "function"):
-        if key in found:
-            raise ValueError(f"{key} is not an option of a plant; drop it")
-    return found
-
-
-def structured_problem(
-    controller: ControllerTable,
-    loop: LoopTable,
-    robust: RobustTable,
-    inner: InnerTable,
-    options: tuple[tuple[tuple[str, object], ...], ...],
-    ranges: tuple[tuple[str, float, float], ...] = (),
-) -> StructuredProblem:
-    """The problem of a fixed structure."""
+def structured_problem(case: Case, options: tuple[Options, ...]) -> StructuredProblem:
+    """The problem of a fixed structure; `options` of the plant's further sets."""
+    controller, loop, robust, inner = case.controller, case.loop, case.robust, case.inner
     return StructuredProblem(
         structure=structure_of(controller),
         shape=SHAPE if inner.shape is None else inner.shape,
@@ -189,7 +158,7 @@ def structured_problem(
             (min(1.0, *robust.damping, 1.0), max(1.0, *robust.damping, 1.0)),
             robust.gain,
             options,
-            ranges,
+            tuple((p.name, p.lower, p.upper) for p in case.fixed if p.varies),
         ),
         starts=controller.starts,
         minimise=inner.minimise,

@@ -10,24 +10,23 @@ with [inner], [controller] structure = "sections", [weights] where weighted_leve
 [loop] rate_hz: then the response was measured as the controller sees it, hold and delay in it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.cases.case import CaseError, read_toml, table_of
-from ccd_casadi.cases.checks import count, shown, text
+from ccd_casadi.cases.case import read_toml, table_of
+from ccd_casadi.cases.checks import Fail, count, require_good, short_repr, text
 from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
-from ccd_casadi.cases.tables import TABLES, BudgetTable, InnerTable, ObjectiveTable, RobustTable
+from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import one_line
 from ccd_casadi.support.units import HZ
 
 MODEL = "measured"
 _TABLES = ("weights", "inner", "controller", "loop")
-_PLANT = {"file": text, "unstable_poles": count(0), "poles_at_zero": count(0)}
+_PLANT = {"model": text, "file": text, "unstable_poles": count(0), "poles_at_zero": count(0)}
 
 
 @dataclass(frozen=True)
@@ -50,16 +49,14 @@ def measured_case(path: Path) -> MeasuredCase | None:
     if not isinstance(plant, Mapping) or plant.get("model") != MODEL:
         return None
 
-    def fail(key: str, words: str) -> CaseError:
-        return CaseError(one_line(f"{path}: {key}: {words}"))
-
+    fail = Fail(path)
     for name, table in data.items():
         if name not in ("plant", *_TABLES):
             raise fail(
                 name, f'has no effect on plant.model = "{MODEL}", which has no theta; drop it'
             )
         if not isinstance(table, Mapping):
-            raise fail(name, f"is {shown(table)}; write a table [{name}]")
+            raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     response = _response(plant, path, fail)
     if "inner" not in data:
         raise fail("inner", "is missing; add a table [inner]")
@@ -72,28 +69,29 @@ def measured_case(path: Path) -> MeasuredCase | None:
     inner, controller, loop = (tables[name] for name in ("inner", "controller", "loop"))
     weights = None
     if controller.weighted_level is not None:
-        weights = weights_of(tables["weights"], inner, 0.0)
+        weights = weights_of(controller, tables["weights"], inner)
     return MeasuredCase(
         path=path,
         file=str(plant["file"]),
         responses=(response,),
         structure=structure_of(controller),
-        bounds=_bounds(inner, controller.weighted_level, weights),
+        bounds=Bounds(
+            S_max=inner.S_max,
+            S_low=inner.S_low,
+            omega_low=HZ * inner.omega_low_hz,
+            shape=SHAPE if inner.shape is None else inner.shape,
+            shape_ends=ShapeEnd(inner.shape_ends),
+            weighted_level=controller.weighted_level,
+            weights=weights,
+            compliance_max=inner.compliance_max,
+        ),
         period=None if loop.rate_hz is None else 1.0 / loop.rate_hz,
         starts=controller.starts,
     )
 
 
-def _response(
-    plant: Mapping[str, Any], path: Path, fail: Callable[[str, str], CaseError]
-) -> MeasuredResponse:
-    for key, value in plant.items():
-        if key != "model" and key not in _PLANT:
-            known = ", ".join(_PLANT)
-            raise fail(f"plant.{key}", f"is not an option of {MODEL}; known are {known}")
-        wrong = None if key == "model" else _PLANT[key](value)
-        if wrong is not None:
-            raise fail(f"plant.{key}", wrong)
+def _response(plant: Mapping[str, Any], path: Path, fail: Fail) -> MeasuredResponse:
+    require_good("plant", plant, _PLANT, fail)
     if "file" not in plant:
         raise fail("plant.file", f"is missing; add it, which {MODEL} needs")
     try:
@@ -104,7 +102,7 @@ def _response(
     return replace(found, unstable_poles=unstable, poles_at_zero=at_zero)
 
 
-def _check(tables: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -> None:
+def _check(tables: Mapping[str, Any], fail: Fail) -> None:
     inner, controller, loop = (tables[name] for name in ("inner", "controller", "loop"))
     if controller.structure != "sections":
         words = 'needs structure = "sections": a synthesis of full order has no model to start from'
@@ -122,16 +120,3 @@ def _check(tables: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -> 
               "budget": BudgetTable()}  # fmt: skip
     if "weights" in tables:
         check_kind({**tables, **others}, fail)
-
-
-def _bounds(inner: InnerTable, level: float | None, weights: Any) -> Bounds:
-    return Bounds(
-        S_max=inner.S_max,
-        S_low=inner.S_low,
-        omega_low=HZ * inner.omega_low_hz,
-        shape=SHAPE if inner.shape is None else inner.shape,
-        shape_ends=ShapeEnd(inner.shape_ends),
-        weighted_level=level,
-        weights=weights,
-        compliance_max=inner.compliance_max,
-    )

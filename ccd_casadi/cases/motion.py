@@ -1,12 +1,12 @@
 """[motor] and [move] of a case file: what they may say, and the move in SI."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from ccd_casadi.analysis.motor import UNLIMITED, Motion, Motor
-from ccd_casadi.analysis.move_limits import Limits
-from ccd_casadi.cases.checks import NOT_NEGATIVE, POSITIVE, key, one_or_more, text
+from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, key, one_or_more
 
 Numbers = float | tuple[float, ...] | None
 OF_A_MOTOR = ("force_constant", "resistance", "peak_current", "moving_mass")
@@ -18,41 +18,39 @@ class MotorTable:
     """[motor]: one motor, or a catalogue as lists in rising order of the moving mass."""
 
     force_constant: float | tuple[float, ...] | None = key(
-        one_or_more, None, says="force per current, a list for a catalogue", unit="N/A"
+        "force per current, a list for a catalogue", None, check=one_or_more, unit="N/A"
     )
     resistance: float | tuple[float, ...] | None = key(
-        one_or_more, None, says="of the warm coil", unit="ohm"
+        "of the warm coil", None, check=one_or_more, unit="ohm"
     )
     peak_current: float | tuple[float, ...] | None = key(
-        one_or_more, None, says="the largest for moments; absent: any", unit="A"
+        "the largest for moments; absent: any", None, check=one_or_more, unit="A"
     )
     moving_mass: float | tuple[float, ...] | None = key(
-        one_or_more, None, says="added to the plant where each force enters", unit="kg"
+        "added to the plant where each force enters", None, check=one_or_more, unit="kg"
     )
     rms_power: float | None = key(
-        POSITIVE, None, says="heat of all motors together, mean of a cycle, at most", unit="W"
+        "heat of all motors together, mean of a cycle, at most", None, unit="W"
     )
-    size: str = key(text, "", says="the [theta] that is the moving mass, of any or of a list")
+    size: str = key("the [theta] that is the moving mass, of any or of a list", "")
 
 
 @dataclass(frozen=True)
 class MoveTable:
     """[move]: a setpoint of third or fourth order, made over and over."""
 
-    distance: float | None = key(POSITIVE, None, says="from rest to rest", unit="m")
-    velocity: float | None = key(POSITIVE, None, says="at most", unit="m/s")
+    distance: float | None = key("from rest to rest", None, unit="m")
+    velocity: float | None = key("at most", None, unit="m/s")
     acceleration: float | None = key(
-        POSITIVE, None, says="of the move; absent: the largest that the motor allows", unit="m/s²"
+        "of the move; absent: the largest that the motor allows", None, unit="m/s²"
     )
-    jerk: float | None = key(POSITIVE, None, says="at most", unit="m/s³")
-    snap: float | None = key(POSITIVE, None, says="at most; absent: jerk/sample", unit="m/s⁴")
-    settle_band: float | None = key(POSITIVE, None, says="of the error, to either side", unit="m")
-    dwell: float = key(NOT_NEGATIVE, 0.0, says="from a move to the next", unit="s")
+    jerk: float | None = key("at most", None, unit="m/s³")
+    snap: float | None = key("at most; absent: jerk/sample", None, unit="m/s⁴")
+    settle_band: float | None = key("of the error, to either side", None, unit="m")
+    dwell: float = key("from a move to the next", 0.0, check=NOT_NEGATIVE, unit="s")
 
 
-def check_motion(
-    tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Callable[[str, str], Exception]
-) -> None:
+def check_motion(tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Fail) -> None:
     """Raise where [move] and [motor] do not go together, or with the rest of the case."""
     move, motor = tables["move"], tables["motor"]
     given, timed = motor != MotorTable(), tables["inner"].minimise == "move_time"
@@ -95,7 +93,7 @@ def motion_problem(move: MoveTable, motor: MotorTable, rate_hz: float | None) ->
         return None
     given = {item.name: getattr(move, item.name) for item in fields(move)}
     shortest = SHORTEST if rate_hz is None else 1.0 / rate_hz
-    limits = Limits(
+    limits = MoveLimits(
         given["distance"], given["velocity"], move.acceleration or float("inf"), given["jerk"],
         move.snap or given["jerk"] / shortest,
     )  # fmt: skip

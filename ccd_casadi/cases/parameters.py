@@ -1,10 +1,10 @@
 """[theta.NAME]: the hardware parameters of a case: free within bounds, one of a list, or fixed."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from ccd_casadi.cases.checks import ANY, Check, closest, flag, listed, shown, text
+from ccd_casadi.cases.checks import ANY, Check, Fail, flag, listed, require_good, short_repr, text
 from ccd_casadi.cases.tables import Parameter
 
 MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
@@ -24,7 +24,6 @@ KEYS: dict[str, tuple[Check, str]] = {
         "a stroke does; `start` is the model",
     ),
 }
-Fail = Callable[[str, str], Exception]
 
 
 def parameters_of(
@@ -34,14 +33,11 @@ def parameters_of(
     if not table:
         raise fail("theta", "names no parameter; add a table [theta.NAME]")
     found = [_parameter(name, entry, fail) for name, entry in table.items()]
-    if not any(not (parameter.values or parameter.varies) for parameter in found):
+    if all(parameter.values or parameter.varies for parameter in found):
         words = "has no parameter with a range: give one lower and upper, or ask inner for each"
         raise fail("theta", words)
-    kept = [len(parameter.values) != 1 and not parameter.varies for parameter in found]
-    return (
-        tuple(parameter for parameter, free in zip(found, kept, strict=True) if free),
-        tuple(parameter for parameter, free in zip(found, kept, strict=True) if not free),
-    )
+    free = tuple(p for p in found if len(p.values) != 1 and not p.varies)
+    return free, tuple(p for p in found if p not in free)
 
 
 def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
@@ -49,13 +45,8 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
     if not name.isidentifier():
         raise fail(place, "is not an identifier; use letters, digits and _")
     if not isinstance(entry, Mapping):
-        raise fail(place, f"is {shown(entry)}; write a table [theta.{name}]")
-    for key, value in entry.items():
-        if key not in KEYS:
-            raise fail(f"{place}.{key}", f"unknown key{closest(key, KEYS)}")
-        wrong = KEYS[key][0](value)
-        if wrong is not None:
-            raise fail(f"{place}.{key}", wrong)
+        raise fail(place, f"is {short_repr(entry)}; write a table [theta.{name}]")
+    require_good(place, entry, {key: check for key, (check, _) in KEYS.items()}, fail)
     unit = entry.get("unit", "")
     for key, others in (("fixed", ("values", "lower", "upper", "start", "integer", "varies")),
                         ("values", ("lower", "upper", "integer", "varies")),

@@ -2,52 +2,37 @@
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.checks import (
     FRACTION,
-    POSITIVE,
+    USUAL,
     Check,
+    Fail,
+    Test,
     closest,
     count,
-    flag,
     names,
     number,
-    shown,
-    text,
+    short_repr,
     too_large,
 )
 from ccd_casadi.cases.parameters import parameters_of
 from ccd_casadi.cases.tables import Parameter, PlantTable
-from ccd_casadi.plants.registry import model_named, model_names
+from ccd_casadi.plants.registry import OWN, model_named, model_names
 
-# What the models of the package take, as far as a function's signature does not say it.
-_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
-    ("two_mass", "zeta"): FRACTION,
-    ("modal_table", "table"): text,
-    ("modal_table", "rigid_below_hz"): POSITIVE,
-    ("sampled_matrices", "folder"): text,
-    ("sampled_matrices", "modes"): count(1),
-    ("sampled_matrices", "static_correction"): flag,
-    ("sampled_matrices", "rigid_below_hz"): POSITIVE,
-    ("cad_stage", "morph"): text,
-    ("cad_stage", "forces"): names,
-    ("cad_stage", "sensors"): names,
-    ("cad_stage", "rigid"): names,
-    ("cad_stage", "held"): names,
-    ("cad_stage", "modes"): count(1),
-    ("cad_stage", "zeta"): FRACTION,
-    ("cad_stage", "young"): POSITIVE,
-    ("cad_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
-    ("cad_stage", "density"): POSITIVE,
+# Checks of a model's options that its builder's annotations do not say, by their names.
+_OPTIONS: dict[str, Check] = {
+    "zeta": FRACTION,
+    "poisson": number(0.0, 0.5, "give a number between 0 and 0.5"),
+    "modes": count(1),
 }
 
 
-def plant_table(
-    table: Mapping[str, Any], path: Path, fail: Callable[[str, str], Exception]
-) -> PlantTable:
+def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
     """[plant], files in it as absolute paths."""
     model, function = table.get("model"), table.get("function")
     if (model is None) == (function is None):
@@ -58,52 +43,54 @@ def plant_table(
     known = model_named(model) if isinstance(model, str) else None
     if model is not None and known is None:
         hint = closest(str(model), model_names())
-        raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
+        raise fail(
+            "plant.model", f"is {short_repr(model)}, not a known model{hint}; or use function"
+        )
     if function is not None:
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
         if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
-            raise fail("plant.function", f'is {shown(function)}; write "my_plant.py:model"')
-        try:
-            exists = (path.parent / parts[0]).is_file()
-        except (OSError, ValueError):
-            exists = False
-        if not exists:
-            words = f"there is no file {shown(parts[0])}; give its path relative to the case file"
-            raise fail("plant.function", words)
-        # Absolute, so that the resolved case means the same from the run folder.
-        function = f"{(path.parent / parts[0]).resolve()}:{parts[1]}"
+            raise fail("plant.function", f'is {short_repr(function)}; write "my_plant.py:model"')
+        function = f"{_absolute(path, parts[0], 'plant.function', fail)}:{parts[1]}"
     options = {key: value for key, value in table.items() if key not in ("model", "function")}
-    takes = None if known is None else list(inspect.signature(known.build).parameters)[1:]
+    takes = {} if known is None else dict(inspect.signature(known.build).parameters)
     checks = {} if known is None else known.checks
     for key, value in options.items():
         if not key.isidentifier():
             raise fail(f"plant.{key}", "is not a keyword; use a Python identifier")
-        if takes is not None and key not in takes:
-            raise fail(f"plant.{key}", f"is not an option of {model}{closest(key, takes)}")
-        wrong = _MODEL_OPTIONS.get((model, key), checks.get(key, _option))(value)
+        own = list(takes)[1:]
+        if takes and key not in own:
+            raise fail(f"plant.{key}", f"is not an option of {model}{closest(key, own)}")
+        usual = _check_of(takes[key]) if model in OWN else _option
+        wrong = checks.get(key, usual)(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)
     data = "" if known is None else known.data
     if data:
         if data not in options:
             raise fail(f"plant.{data}", f"is missing; add it, which {model} needs")
-        try:
-            place = (path.parent / options[data]).resolve()
-            exists = place.exists()
-        except (OSError, ValueError):
-            exists = False
-        if not exists:
-            words = f"there is no {shown(options[data])}; give its path relative to the case file"
-            raise fail(f"plant.{data}", words)
-        options[data] = str(place)  # absolute, as a function's file
+        options[data] = _absolute(path, options[data], f"plant.{data}", fail)
     return PlantTable(model, function, options)
+
+
+def _absolute(case: Path, name: str, key: str, fail: Fail) -> str:
+    """A file or folder that a case names, so that the resolved case means the same elsewhere."""
+    with suppress(OSError, ValueError):
+        if (place := (case.parent / name).resolve()).exists():
+            return str(place)
+    raise fail(key, f"there is no {short_repr(name)}; give its path relative to the case file")
+
+
+def _check_of(option: inspect.Parameter) -> Test:
+    """What its name or its annotation in the builder asks of an option."""
+    usual = names if option.annotation == Sequence[str] else USUAL.get(option.annotation, _option)
+    return _OPTIONS.get(option.name, usual)
 
 
 def _option(value: Any) -> str | None:
     if isinstance(value, float) and not math.isfinite(value):
         return f"is {value}; give a finite number"
     if too_large(value):
-        return f"is {shown(value)}; write it as a float"
+        return f"is {short_repr(value)}; write it as a float"
     if isinstance(value, list):
         for item in value:
             wrong = _option(item)
@@ -112,14 +99,11 @@ def _option(value: Any) -> str | None:
         return None
     if isinstance(value, str | bool | int | float):
         return None
-    return f"is {shown(value)}; give a number, text, true or false, or a list of them"
+    return f"is {short_repr(value)}; give a number, text, true or false, or a list of them"
 
 
 def theta_tables(
-    table: Mapping[str, Any],
-    model: str | None,
-    of_case: tuple[str, ...],
-    fail: Callable[[str, str], Exception],
+    table: Mapping[str, Any], model: str | None, of_case: tuple[str, ...], fail: Fail
 ) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
     """[theta.NAME] of every parameter, searched ones and fixed ones.
 
@@ -127,18 +111,14 @@ def theta_tables(
     """
     searched, fixed = parameters_of(table, fail)
     known = model_named(model)
-    needed = None if known is None else known.theta
-    for name in of_case:
+    own = None if known is None else known.theta
+    needed = (*(own or ()), *of_case)
+    for name in () if own is None else table:
+        if name not in needed:
+            raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
+    for name in needed:
         if name not in table:
-            words = f"is missing; add a table [theta.{name}], which [places] or [motor] names"
+            which = "[places] or [motor] names" if name in of_case else f"{model} needs"
+            words = f"is missing; add a table [theta.{name}], which {which}"
             raise fail(f"theta.{name}", words)
-    if needed is not None:
-        needed = (*needed, *of_case)
-        for name in table:
-            if name not in needed:
-                raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
-        for name in needed:
-            if name not in table:
-                words = f"is missing; add a table [theta.{name}], which {model} needs"
-                raise fail(f"theta.{name}", words)
     return searched, fixed

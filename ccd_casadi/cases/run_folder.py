@@ -30,7 +30,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
@@ -44,7 +44,7 @@ SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is n
 
 
 @dataclass(frozen=True)
-class FinishedRun(Shown):
+class FinishedRun(NotebookHtml):
     """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
 
     `figures` are measured when the folder is read, on the plant as the case describes it now;
@@ -112,42 +112,35 @@ def read_run(folder: str | Path) -> FinishedRun:
     case = load_case(folder / "case.toml")
     problem = problem_of(case)
     theta = _theta(folder / "result.json", result, problem)
-    return _READERS[type(problem.controller)](folder, case, problem, theta, result)
+    found = _READERS[type(problem.controller)](folder, problem, theta, result)
+    problem = found.pop("problem", problem)
+    plant = scaled_plant(problem, theta)
+    return FinishedRun(folder, case, problem, theta, plant, result=result, **found)
 
 
 def _read_mixed(
-    folder: Path,
-    case: Case,
-    problem: CoDesignProblem,
-    theta: tuple[float, ...],
-    result: Mapping[str, Any],
-) -> FinishedRun:
-    """A run of mixed sensitivity: its controller, certified again at the γ that it had."""
-    frequencies = [_number(folder / "result.json", result, k) for k in ("omega_S_hz", "omega_T_hz")]
-    weights = problem.weights.at(HZ * frequencies[0], HZ * frequencies[1])
-    plant = scaled_plant(problem, theta)
-    path = folder / "controller.json"
-    controller = _controller(path, read_json(path), plant)
-    gamma = _number(folder / "result.json", result, "gamma") * (1.0 + SHORTFALL)
+    folder: Path, problem: CoDesignProblem, theta: tuple[float, ...], result: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Weights, controller and figures of a run of mixed sensitivity, certified again at its γ."""
+    path = folder / "result.json"
+    hz = [_number(path, result, key) for key in ("omega_S_hz", "omega_T_hz")]
+    weights, plant = problem.weights.at(HZ * hz[0], HZ * hz[1]), scaled_plant(problem, theta)
+    controller = _controller(folder / "controller.json", plant)
     figures = measure(
-        plant, controller, weights, gamma=gamma, omega_low=problem.inner.omega_low,
-        gamma_opt=_number(folder / "result.json", result, "gamma_opt"),
-        gamma_lower_bound=_number(folder / "result.json", result, "gamma_lower_bound"),
+        plant, controller, weights, gamma=_number(path, result, "gamma") * (1.0 + SHORTFALL),
+        omega_low=problem.inner.omega_low, gamma_opt=_number(path, result, "gamma_opt"),
+        gamma_lower_bound=_number(path, result, "gamma_lower_bound"),
     )  # fmt: skip
     if not figures.certified:
         words = f"is not certified on the plant of case.toml: {figures.outcome.value}"
-        raise UserError(f"{path}: {words}; solve the case again")
-    return FinishedRun(folder, case, problem, theta, plant, weights, controller, figures, result)
+        raise UserError(f"{folder / 'controller.json'}: {words}; solve the case again")
+    return {"weights": weights, "controller": controller, "figures": figures}
 
 
 def _read_structured(
-    folder: Path,
-    case: Case,
-    problem: CoDesignProblem,
-    theta: tuple[float, ...],
-    result: Mapping[str, Any],
-) -> FinishedRun:
-    """A run with a controller of fixed structure: rebuilt from κ, judged on the corners of its set.
+    folder: Path, problem: CoDesignProblem, theta: tuple[float, ...], result: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The same and κ of a fixed structure: rebuilt from κ, judged on the corners of its set.
 
     `figures` are those of the continuous loop with the model; hold and delay are not in them.
     """
@@ -161,13 +154,12 @@ def _read_structured(
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
     problem = joined(with_function(folder / "result.json", problem, result), kappa, ())
-    plant, weights = scaled_plant(problem, theta), problem.weights
     figures = measure(
-        plant, controller, weights, gamma=UNBOUNDED, omega_low=problem.inner.omega_low
-    )
-    return FinishedRun(
-        folder, case, problem, theta, plant, weights, controller, figures, result, kappa=kappa
-    )
+        scaled_plant(problem, theta), controller, problem.weights, gamma=UNBOUNDED,
+        omega_low=problem.inner.omega_low,
+    )  # fmt: skip
+    return {"problem": problem, "weights": problem.weights, "controller": controller,
+            "figures": figures, "kappa": kappa}  # fmt: skip
 
 
 def with_function(
@@ -235,18 +227,10 @@ def _with_directions(
     return replace(problem, controller=replace(structured, channels=channels))
 
 
-Reader = Callable[[Path, Case, CoDesignProblem, tuple[float, ...], Mapping[str, Any]], FinishedRun]
-_READERS: dict[type[ControllerProblem], Reader] = {
+_READERS: dict[type[ControllerProblem], Callable[..., dict[str, Any]]] = {
     MixedSensitivityProblem: _read_mixed,
     StructuredProblem: _read_structured,
 }
-
-
-def refuse_structured(run: FinishedRun, command: str, remedy: str) -> None:
-    """Raise UserError where a command is for mixed sensitivity only."""
-    if run.kappa is not None:
-        words = f'{command} is for controller.structure = "h_infinity" so far; {remedy}'
-        raise UserError(f"{run.folder / 'case.toml'}: controller.structure: {words}")
 
 
 def read_json(path: Path) -> Mapping[str, Any]:
@@ -293,13 +277,11 @@ def _theta(path: Path, result: Mapping[str, Any], problem: CoDesignProblem) -> t
     return tuple(values)
 
 
-def _controller(path: Path, table: Mapping[str, Any], plant: ScaledPlant) -> StateSpace:
-    m, p = plant.B.shape[1], plant.C.shape[0]
-    A = _matrix(path, table, "A")
-    n = A.shape[0]
-    parts = {"A": (n, n), "B": (n, p), "C": (m, n), "D": (m, p)}
-    found = {key: _matrix(path, table, key) for key in parts}
-    for key, shape in parts.items():
+def _controller(path: Path, plant: ScaledPlant) -> StateSpace:
+    table, m, p = read_json(path), plant.B.shape[1], plant.C.shape[0]
+    found = {key: _matrix(path, table, key) for key in "ABCD"}
+    n = len(found["A"])
+    for key, shape in {"A": (n, n), "B": (n, p), "C": (m, n), "D": (m, p)}.items():
         if found[key].shape != shape:
             words = f"is {found[key].shape}, not {shape} for this plant; solve the case again"
             raise UserError(f"{path}: {key}: {words}")

@@ -13,12 +13,10 @@ from ccd_casadi.cases.checks import (
     ABOVE_ONE,
     FRACTION,
     NOT_NEGATIVE,
-    POSITIVE,
     choice,
     count,
     factors,
     files,
-    flag,
     interval,
     key,
     number,
@@ -27,7 +25,6 @@ from ccd_casadi.cases.checks import (
     points,
     signed,
     tables,
-    text,
     text_or_rows,
 )
 from ccd_casadi.cases.controller_tables import (
@@ -40,7 +37,7 @@ from ccd_casadi.cases.controller_tables import (
 )
 from ccd_casadi.cases.motion import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 
 
 @dataclass(frozen=True)
@@ -89,115 +86,93 @@ class ObjectiveTable:
     """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s; else w2 e, e in m, or w2 t, t in s."""
 
     w1: float = key(
-        number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
-        says="weight of the hardware cost f(θ) in J",
+        "weight of the hardware cost f(θ) in J",
+        check=number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
     )
     w2: float = key(
-        signed("give a negative number: J must reward bandwidth"),
-        says="weight of the bandwidth in J, negative, 1/(rad/s); of an RMS error or a move's time "
+        "weight of the bandwidth in J, negative, 1/(rad/s); of an RMS error or a move's time "
         "positive, 1/m or 1/s",
+        check=signed("give a negative number: J must reward bandwidth"),
     )
-    cost_unit: str = key(text, "", says="unit of the hardware cost f(θ), for tables and pages")
+    cost_unit: str = key("unit of the hardware cost f(θ), for tables and pages", "")
 
 
 @dataclass(frozen=True)
 class WeightsTable:
-    """[weights] of the paper's Table 1; M_K in force over displacement.
+    """[weights] of the paper's Table 1; M_K in force over displacement."""
 
-    `disturbance` W_d, of the same unit, with "h_infinity_disturbance": so much force weighs as
-    much as a reference of one unit of length. Default: ten times M_K.
-    """
-
-    M_S: float = key(
-        POSITIVE, says="W_S at high frequency is 1/M_S: the peak of S that the weight allows"
-    )
+    M_S: float = key("W_S at high frequency is 1/M_S: the peak of S that the weight allows")
     A_S: float = key(
-        FRACTION, says="W_S at zero frequency is 1/A_S: the S that the weight allows there"
+        "W_S at zero frequency is 1/A_S: the S that the weight allows there", check=FRACTION
     )
-    c_K: float = key(ABOVE_ONE, says="W_KS grows by this factor above omega_K")
-    omega_K_hz: float = key(
-        POSITIVE, says="W_KS is 1/M_K below this frequency and grows above it", unit="Hz"
-    )
+    c_K: float = key("W_KS grows by this factor above omega_K", check=ABOVE_ONE)
+    omega_K_hz: float = key("W_KS is 1/M_K below this frequency and grows above it")
     M_K: float = key(
-        POSITIVE,
-        says="gain of the controller that W_KS allows: about mass times (2π ω_b)²",
-        unit="N/m",
+        "gain of the controller that W_KS allows: about mass times (2π ω_b)²", unit="N/m"
     )
-    A_l: float = key(POSITIVE, says="W_T at zero frequency is 1/A_l")
+    A_l: float = key("W_T at zero frequency is 1/A_l")
     A_u: float = key(
-        FRACTION, says="W_T at high frequency is 1/A_u: the T that the weight allows there"
+        "W_T at high frequency is 1/A_u: the T that the weight allows there", check=FRACTION
     )
     disturbance: float | None = key(
-        POSITIVE,
+        '"h_infinity_disturbance": force that weighs as 1 m of reference; default 10 M_K',
         None,
-        says='"h_infinity_disturbance": force that weighs as 1 m of reference; default 10 M_K',
         unit="N/m",
     )
 
 
 @dataclass(frozen=True)
 class InnerTable:
-    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched.
-
-    With sections: `minimise` what, "bandwidth" (its negative), the "rms_error" of [budget] or the
-    "move_time" of [move], these at a bandwidth of `bandwidth_least_hz` or more.
-    """
+    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched."""
 
     S_max: float = key(
-        number(1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral"),
-        says="bound of the peak of S, as a ratio: 2 is 6 dB",
+        "bound of the peak of S, as a ratio: 2 is 6 dB",
+        check=number(
+            1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral"
+        ),
     )
-    S_low: float = key(FRACTION, says="bound of |S| at omega_low")
-    omega_low_hz: float = key(POSITIVE, says="where S_low holds", unit="Hz")
-    omega_S_hz: tuple[float, float] = key(
-        interval, says="searched range of the frequency of W_S", unit="Hz"
-    )
+    S_low: float = key("bound of |S| at omega_low", check=FRACTION)
+    omega_low_hz: float = key("where S_low holds")
+    omega_S_hz: tuple[float, float] = key("searched range of the frequency of W_S", check=interval)
     omega_T_hz: tuple[float, float] = key(
-        interval,
-        says="searched range of the frequency of W_T; sections: the lower end is that of W_T",
-        unit="Hz",
+        "searched range of the frequency of W_T; sections: the lower end is that of W_T",
+        check=interval,
     )
     gamma_backoff: float = key(
-        number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"),
+        "controllers are synthesised at this multiple of γ_opt",
         1.02,
-        says="controllers are synthesised at this multiple of γ_opt",
+        check=number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"),
     )
     sweep_points: tuple[int, int] = key(
-        points, (20, 20), says='grid of (omega_S, omega_T) for method "sweep", as in the paper'
+        'grid of (omega_S, omega_T) for method "sweep", as in the paper', (20, 20), check=points
     )
     method: str = key(
-        choice("search", "sweep"),
+        "find the best weights by a search with exact derivatives, or on a grid",
         "search",
-        says="find the best weights by a search with exact derivatives, or on a grid",
+        check=choice("search", "sweep"),
     )
     shape: float | None = key(
-        number(1.0, 10.0, "give 1 to 10", closed=True),
+        "sections: |S| stays below this times (ω/ω_b)/√2 at every frequency; absent: 1.1",
         None,
-        says="sections: |S| stays below this times (ω/ω_b)/√2 at every frequency; absent: 1.1",
+        check=number(1.0, 10.0, "give 1 to 10", closed=True),
     )
     shape_ends: str = key(
-        choice(*ShapeEnd),
-        ShapeEnd.S_MAX.value,
-        says="with sections: the shape holds up to S_max, or up to ω_b only, which lets a narrow "
+        "with sections: the shape holds up to S_max, or up to ω_b only, which lets a narrow "
         "filter at ω_b buy bandwidth",
+        ShapeEnd.S_MAX.value,
+        check=choice(*ShapeEnd),
     )
     compliance_max: float | None = key(
-        POSITIVE,
-        None,
-        says="bound of the peak of GS, the displacement by a force at any frequency",
-        unit="m/N",
+        "bound of the peak of GS, the displacement by a force at any frequency", None, unit="m/N"
     )
     minimise: str = key(
-        choice("bandwidth", "rms_error", "move_time"),
-        "bandwidth",
-        says="with sections: the negative bandwidth, the RMS error of [budget], or the time of "
+        "with sections: the negative bandwidth, the RMS error of [budget], or the time of "
         "[move] until it has settled",
+        "bandwidth",
+        check=choice("bandwidth", "rms_error", "move_time"),
     )
     bandwidth_least_hz: float | None = key(
-        POSITIVE,
-        None,
-        says='with another minimise than "bandwidth": the bandwidth that is kept at least',
-        unit="Hz",
+        'with another minimise than "bandwidth": the bandwidth that is kept at least', None
     )
 
 
@@ -206,15 +181,10 @@ class SuspensionTable:
     """[suspension]: where rigid-body poles are put, and how many there must be (default: any)."""
 
     frequency_hz: float = key(
-        POSITIVE,
-        0.1,
-        says="frequency of the soft suspension that keeps rigid-body poles off the axis",
-        unit="Hz",
+        "frequency of the soft suspension that keeps rigid-body poles off the axis", 0.1
     )
-    damping_ratio: float = key(POSITIVE, 0.7, says="of these poles")
-    rigid_modes: int | None = key(
-        count(0), None, says="required number of rigid-body modes; absent: any number"
-    )
+    damping_ratio: float = key("of these poles", 0.7)
+    rigid_modes: int | None = key("required number of rigid-body modes; absent: any number", None)
 
 
 @dataclass(frozen=True)
@@ -231,29 +201,29 @@ class RobustTable:
     """
 
     resonance_shift: float = key(
-        number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
+        "largest common shift of all flexible frequencies, as a share",
         0.0,
-        says="largest common shift of all flexible frequencies, as a share",
+        check=number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
     )
-    shifts: int = key(count(2), 5, says="number of plants over that range (full-order kinds)")
-    damping: tuple[float, ...] = key(factors, (), says="factors of every modal damping, besides 1")
+    shifts: int = key("number of plants over that range (full-order kinds)", 5, check=count(2))
+    damping: tuple[float, ...] = key("factors of every modal damping, besides 1", (), check=factors)
     design_at: str = key(
-        choice("auto", "low", "nominal", "high"),
+        'plant of the range that a full-order controller is made for; "auto" tries all three',
         "auto",
-        says='plant of the range that a full-order controller is made for; "auto" tries all three',
+        check=choice("auto", "low", "nominal", "high"),
     )
     mode_shift: float = key(
-        number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
+        "sections: largest shift of each flexible mode by itself, as a share",
         0.0,
-        says="sections: largest shift of each flexible mode by itself, as a share",
+        check=number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
     )
     gain: float = key(
-        number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
+        "sections: largest error of the plant's gain, as a share",
         0.0,
-        says="sections: largest error of the plant's gain, as a share",
+        check=number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
     )
     plants: tuple[str, ...] = key(
-        files, (), says="sections: TOML files of plant options: other loads, positions, meshes"
+        "sections: TOML files of plant options: other loads, positions, meshes", (), check=files
     )
 
 
@@ -265,34 +235,33 @@ class PlacesTable:
     """
 
     nodes: str | tuple[tuple[float, ...], ...] = key(
-        text_or_rows,
-        (),
-        says="places of the plant's inputs, each a unit force, in their order: a CSV file with a "
+        "places of the plant's inputs, each a unit force, in their order: a CSV file with a "
         "row of coordinates each after a header, or the rows",
+        (),
+        check=text_or_rows,
         unit="m",
     )
     actuators: tuple[tuple[float | str, ...], ...] = key(
-        places, (), says="coordinates of each force: numbers, or names of [theta]", unit="m"
+        "coordinates of each force: numbers, or names of [theta]", (), check=places, unit="m"
     )
     sensors: tuple[tuple[float | str, ...], ...] = key(
-        places, (), says="coordinates of each sensor; absent: the plant's own outputs", unit="m"
+        "coordinates of each sensor; absent: the plant's own outputs", (), check=places, unit="m"
     )
-    actuator_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each force", unit="kg")
-    sensor_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each sensor", unit="kg")
+    actuator_mass: float = key("moves with each force", 0.0, check=NOT_NEGATIVE, unit="kg")
+    sensor_mass: float = key("moves with each sensor", 0.0, check=NOT_NEGATIVE, unit="kg")
     apart: float = key(
-        NOT_NEGATIVE, 0.0, says="least distance of two forces, and of two sensors", unit="m"
+        "least distance of two forces, and of two sensors", 0.0, check=NOT_NEGATIVE, unit="m"
     )
     axes: bool = key(
-        flag,
-        False,
-        says="true: all forces and all sensors act together, an input and an output for each "
+        "true: all forces and all sensors act together, an input and an output for each "
         "motion of a rigid body normal to the nodes",
+        False,
     )
     quiet: tuple[int, ...] = key(
-        numbers_of_modes, (), says="with axes: flexible modes, from 1, which these leave alone"
+        "with axes: flexible modes, from 1, which these leave alone", (), check=numbers_of_modes
     )
     damped: tuple[int, ...] = key(
-        numbers_of_modes, (), says="with axes: flexible modes, from 1, each an axis of its own"
+        "with axes: flexible modes, from 1, each an axis of its own", (), check=numbers_of_modes
     )
 
 
@@ -303,21 +272,19 @@ class BudgetTable:
     Each kind is one table or several of them; their keys are checked in `budget`.
     """
 
-    window_ms: float | None = key(
-        POSITIVE, None, says="window of the moving average and the moving deviation", unit="ms"
-    )
-    force: tuple[Mapping[str, Any], ...] = key(tables, (), says="spectra of forces on the stage")
+    window_ms: float | None = key("window of the moving average and the moving deviation", None)
+    force: tuple[Mapping[str, Any], ...] = key("spectra of forces on the stage", (), check=tables)
     floor_motion: tuple[Mapping[str, Any], ...] = key(
-        tables, (), says="spectra of the floor's motion"
+        "spectra of the floor's motion", (), check=tables
     )
     sensor_noise: tuple[Mapping[str, Any], ...] = key(
-        tables, (), says="spectra of the sensor's noise"
+        "spectra of the sensor's noise", (), check=tables
     )
-    setpoint: tuple[Mapping[str, Any], ...] = key(tables, (), says="spectra of the setpoint")
+    setpoint: tuple[Mapping[str, Any], ...] = key("spectra of the setpoint", (), check=tables)
 
 
 @dataclass(frozen=True)
-class Case(Shown):
+class Case(NotebookHtml):
     """A checked case file."""
 
     path: Path

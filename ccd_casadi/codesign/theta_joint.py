@@ -13,7 +13,7 @@ true plants too, as values and slopes are exact in the middle.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -104,7 +104,7 @@ def together(
         make = partial(proposed, problem, models, best, reach)
         found = asked.kept("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
-            tell(f"J {J:.6g} and {found.gain:.2g} less to be had near by")
+            tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
         promised = found.gain > SETTLED * abs(J) and reach > LEAST
         if not (members or promised):
             best = finished(asked, best)
@@ -119,6 +119,7 @@ def together(
         if not promised:
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
+        models = ()  # the basis is large: it grows and need not stay
         models = nearby(problem, known, found.end.theta)
         end, there = JointModel(problem, models, found.end, reach).adapted()
         gained = J - there
@@ -219,6 +220,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self.unit = -problem.w2 * place.bandwidth
         middle = (self.middle - lower) / self.width
         loops = self.first_loops = self.loops(middle)
+        self.loops_beside = lru_cache(1)(self._loops_beside)  # a step that fails is followed by one
         self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
         kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
         self.start = np.concatenate([middle, kappa, [self.tau]])
@@ -282,6 +284,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
             bounds_of(self.problem), structured.sampling, structured.frequencies,
         )  # fmt: skip
 
+    def _loops_beside(self, z: tuple[float, ...]) -> list[LoopProblem]:
+        return [self.loops(np.array(z), BESIDE * unit) for unit in np.eye(len(z))]
+
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
         """With every loop stable."""
         x = np.clip(x, self.low, self.high)
@@ -309,12 +314,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         own = hardware_at(self.problem, self.theta(z))
         of_z = np.pad(own.slopes, ((0, 0), (0, len(here.x) - count)))
 
-        @cache
-        def beside() -> list[LoopProblem]:
-            return [self.loops(z, BESIDE * unit) for unit in np.eye(count)]
-
         def second(index: np.ndarray) -> Array:
-            return hessians(problem, kappa, tau, found.only(index), beside())
+            beside = self.loops_beside(tuple(z.tolist()))
+            return hessians(problem, kappa, tau, found.only(index), beside)
 
         return Rows(
             np.concatenate([found.value, own.constraints + INSIDE]), np.vstack([slopes, of_z]),

@@ -19,7 +19,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import counted, metres, shown
+from ccd_casadi.support.units import counted, metres, with_unit
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -181,10 +181,12 @@ def predicted(
         size = f"left_out_{unit.lower()}"
         figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}
     if not error <= tolerance:
-        words = f"prediction and truth differ by {100 * error:.2g} %, more than {tolerance:.0e}"
+        words = (
+            f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
+        )
         return Line(State.FAILED, words, figures)
     if left_out is None:
-        words = f"{what} predicted to {error:.1e}"
+        words = f"{what} predicted to {100 * error:.2g} %"
         if extrapolates:
             words += f"; the surrogate extrapolates there: {extrapolates[0]}"
             return Line(State.WARNED, words, figures)
@@ -286,7 +288,7 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
         return Line(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
-        f"run deploy; the loops' least delay margin is {shown(found.delay, 's')}, and below "
+        f"run deploy; the loops' least delay margin is {with_unit(found.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     ).replace("µ", "u")
     return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})

@@ -16,6 +16,7 @@ from ccd_casadi.deployment.anti_windup import takeover
 from ccd_casadi.deployment.realisation import (
     Realisation,
     difference_equation,
+    dot,
     literals,
     plain_title,
 )
@@ -93,10 +94,7 @@ def vectors(realisation: Realisation) -> tuple[Array, Array, Array, Array]:
     size = limit if limit is not None else ERROR * float(np.abs(K.D).max() + 1.0)
     forwards = size * rng.standard_normal((SAMPLES, len(K.C)))
     first = np.full(len(K.C), 0.5 * size)
-    start = [
-        sum((gain * value for gain, value in zip(row, [*errors[0], *first], strict=True)), 0.0)
-        for row in takeover(K).tolist()
-    ]
+    start = [dot(row, [*errors[0], *first]) for row in takeover(K).tolist()]
     return errors, forwards, first, difference_equation(realisation, errors, forwards, start)
 
 

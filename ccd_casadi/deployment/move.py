@@ -21,7 +21,7 @@ TAIL = 3.0  # the machine is watched for this many times the setpoint's duration
 
 
 @dataclass(frozen=True)
-class Hardware:
+class Electronics:
     """What the electronics do: steps of sensor (unit of y) and force (N), jitter of the delay (s).
 
     The delay of each sample is uniform within ± `jitter` of the nominal one; `seed` of the draws.
@@ -47,10 +47,10 @@ def move(
     axis: int = 0,
     forward: Array | None = None,
     window: float = 1e-6,
-    hardware: Hardware | None = None,
+    hardware: Electronics | None = None,
 ) -> Move:
     """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None."""
-    hardware = hardware or Hardware()
+    hardware = hardware or Electronics()
     K, T = realisation.system, realisation.system.period
     n, m, p = len(plant.A), len(K.C), len(plant.C)
     count = int(np.ceil((1.0 + TAIL) * profile.duration / T))

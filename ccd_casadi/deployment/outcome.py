@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.realisation import Realisation
-from ccd_casadi.deployment.reduction import Limits, Reduced
+from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem.sweep import missed_by
@@ -28,10 +28,10 @@ class ChannelOrders:
     `designed`: structure and κ (SI) of sections, which are deployed as they are.
     """
 
-    channel: Channel
-    rows: tuple[Reduced, ...]
-    chosen: Reduced
-    strict: Reduced
+    channel: LoopChannel
+    rows: tuple[ReducedController, ...]
+    chosen: ReducedController
+    strict: ReducedController
     designed: tuple[Structure, Array] | None = None
 
 
@@ -47,7 +47,7 @@ class Deployment:
     """
 
     orders: tuple[ChannelOrders, ...]
-    limits: Limits
+    limits: LoopLimits
     reduced: StateSpace
     reduced_figures: DesignFigures
     needed_hz: float | None

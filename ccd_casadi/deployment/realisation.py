@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import schur, solve_sylvester
 
-from ccd_casadi.deployment.channels import Channel, assemble
+from ccd_casadi.deployment.channels import LoopChannel, assemble
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -43,7 +43,9 @@ class Realisation:
 
 
 def realise(
-    channels: Sequence[Channel], controllers: Sequence[StateSpace], saturation: float | None = None
+    channels: Sequence[LoopChannel],
+    controllers: Sequence[StateSpace],
+    saturation: float | None = None,
 ) -> Realisation:
     """The controllers of all channels as one block-diagonal system from e to u."""
     parts, blocks = [], []
@@ -121,30 +123,25 @@ def difference_equation(
     for e, f in zip(np.asarray(errors, float).tolist(), ahead.tolist(), strict=True):
         u, cut = [], []
         for row_c, row_d, extra in zip(C, D, f, strict=True):
-            total = 0.0
-            for gain, value in zip(row_c, x, strict=True):
-                total += gain * value
-            for gain, value in zip(row_d, e, strict=True):
-                total += gain * value
-            total += extra
+            total = dot(row_d, e, dot(row_c, x)) + extra
             u.append(total if limit is None else min(max(total, -limit), limit))
             cut.append(u[-1] - total)
-        following, start_row = [], 0
+        following: list[float] = []
         for size in realisation.blocks:
-            for i in range(start_row, start_row + size):
-                total = 0.0
-                for j in range(start_row, start_row + size):
-                    total += A[i][j] * x[j]
-                for gain, value in zip(B[i], e, strict=True):
-                    total += gain * value
-                if L is not None:
-                    for gain, value in zip(L[i], cut, strict=True):
-                        total += gain * value
-                following.append(total)
-            start_row += size
+            block = slice(len(following), len(following) + size)
+            for i in range(block.start, block.stop):
+                total = dot(B[i], e, dot(A[i][block], x[block]))
+                following.append(total if L is None else dot(L[i], cut, total))
         x = following
         answers.append(u)
     return np.array(answers).reshape(len(answers), len(C))
+
+
+def dot(gains: Sequence[float], values: Sequence[float], total: float = 0.0) -> float:
+    """The sum of products as the C code forms it, term after term: Python's `sum` compensates."""
+    for gain, value in zip(gains, values, strict=True):
+        total += gain * value
+    return total
 
 
 def literal(value: float) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag, eigh, schur, solve_sylvester, svd
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
 
-from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -40,7 +40,7 @@ class Reduction(StrEnum):
 
 
 @dataclass(frozen=True)
-class Limits:
+class LoopLimits:
     """Most of ‖S‖∞, of σ_max(S) at ω_low and of the weighted norm, least of ω_b (rad/s)."""
 
     peak: float
@@ -50,7 +50,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Reduced:
+class ReducedController:
     """A controller in SI of some order, and its loop; figures of an unstable loop are NaN."""
 
     order: int
@@ -58,7 +58,7 @@ class Reduced:
     controller: StateSpace
     figures: DesignFigures
 
-    def meets(self, limits: Limits) -> bool:
+    def meets(self, limits: LoopLimits) -> bool:
         """Whether the loop is stable and within the limits."""
         f = self.figures
         return (
@@ -70,7 +70,7 @@ class Reduced:
         )
 
 
-def reductions(channel: Channel, weights: Weights, omega_low: float) -> list[Reduced]:
+def reductions(channel: LoopChannel, weights: Weights, omega_low: float) -> list[ReducedController]:
     """Every method at every order from the minimal one down to 1, highest order first.
 
     A method that cannot give an order is left out there. ω_low in rad/s.
@@ -91,13 +91,15 @@ def reductions(channel: Channel, weights: Weights, omega_low: float) -> list[Red
                 continue
             controller = smaller.in_units(1.0 / plant.omega_0, 1.0 / plant.force)
             figures = measure(plant, controller, weights, gamma=UNBOUNDED, omega_low=omega_low)
-            found.append(Reduced(r, method, controller, figures))
+            found.append(ReducedController(r, method, controller, figures))
     return found
 
 
 def smallest(
-    rows: list[Reduced], limits: Limits, holds: Callable[[Reduced], bool] = lambda row: True
-) -> Reduced:
+    rows: list[ReducedController],
+    limits: LoopLimits,
+    holds: Callable[[ReducedController], bool] = lambda row: True,
+) -> ReducedController:
     """The row of least order within the limits; of several, the one with the lowest peak.
 
     `holds`: what else is asked of it, on other plants. The minimal realisation where none does.
@@ -123,10 +125,6 @@ def _perturbation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | Non
         np.hstack([small.C, C[:, rest]]),
         small.D,
     )
-
-
-def _closed_loop(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace:
-    return _without_fast(K, closed_loop(plant.system, K).T, r)
 
 
 def _without_fast(K: StateSpace, whole: StateSpace, r: int) -> StateSpace:
@@ -161,7 +159,7 @@ def _residual(K: StateSpace, r: int) -> StateSpace:
 
 _METHODS: dict[Reduction, Callable[[ScaledPlant, StateSpace, int], StateSpace | None]] = {
     Reduction.PERTURBATION: _perturbation,
-    Reduction.CLOSED_LOOP: _closed_loop,
+    Reduction.CLOSED_LOOP: lambda plant, K, r: _without_fast(K, closed_loop(plant.system, K).T, r),
 }
 
 

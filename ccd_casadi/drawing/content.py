@@ -16,6 +16,7 @@ from ccd_casadi.support.arrays import Array
 
 Fact = tuple[str, str, str]  # quantity, value, remark
 INDEX = "index.html"  # of a run's folder
+LEAST_POINTS = 8  # of a curve that values are read off
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,12 @@ class Curve:
     marker: str = ""
     width: float = 1.3
     hz: Array | None = None
+
+    @property
+    def readable(self) -> bool:
+        """Whether values are read off it: a line of several points, from left to right."""
+        rising = len(self.x) >= LEAST_POINTS and bool((np.diff(self.x) >= 0.0).all())
+        return bool(self.line) and rising
 
 
 @dataclass(frozen=True)
@@ -204,11 +211,12 @@ Drawing = Lines | Landscape | Modes | Picture
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure with its caption, and the numbers behind it, which a page folds away."""
+    """A figure with its caption, and the numbers behind it, which a page folds away: by default
+    those of its curves (`numbers`)."""
 
     drawing: Drawing
     caption: str
-    tables: tuple[Table, ...]
+    tables: tuple[Table, ...] = ()
 
 
 @dataclass(frozen=True)

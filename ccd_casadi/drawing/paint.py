@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.lines import figure_lines
 from ccd_casadi.drawing.maps import figure_landscape
+from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.page import document, escape, table_html, typeset
 from ccd_casadi.drawing.turntable import modes_html
 
@@ -16,7 +17,7 @@ BADGES = {"passed": "good", "warned": "warn", "failed": "bad", "unknown": "open"
 STANDINGS = {"good": "✓", "warn": "!", "bad": "✕"}
 
 
-def painted(page: c.Page) -> str:
+def page_html(page: c.Page) -> str:
     """The whole document."""
     body, contents = [], []
     for i, chapter in enumerate(page.chapters, 1):
@@ -86,7 +87,7 @@ def drawing_html(drawing: c.Drawing, key: str) -> str:
 
 
 def _figure(figure: c.Figure, key: str) -> str:
-    tables = "\n".join(table_html(item) for item in figure.tables)
+    tables = "\n".join(map(table_html, figure.tables or tables_of(figure.drawing)))
     return (
         f'<figure>\n<div class="drawing">{drawing_html(figure.drawing, key)}</div>\n'
         f"<figcaption>{escape(typeset(figure.caption))}</figcaption>\n"

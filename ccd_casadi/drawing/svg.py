@@ -77,12 +77,12 @@ def place(figure: "Figure", left: float, bottom: float, width: float, height: fl
     return figure.add_axes((left / w, bottom / h, width / w, height / h))
 
 
-def to_svg(figure: "Figure", key: str, title: str, data: str = "", share: float = 0.0) -> str:
+def to_svg(figure: "Figure", key: str, title: str, data: str, share: float) -> str:
     """The figure as an <svg> element for inline use; `key` is unique in the page, `title` read out.
 
     Colours become the page's variables, so that they follow its theme. Namespaces, metadata and
     global style rules are dropped: HTML needs none of them. `data`: for the page's script; `share`
-    of the width that there is, in %: by itself that of the figure.
+    of the column, in %, so that text has one size in all figures.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -105,11 +105,9 @@ def to_svg(figure: "Figure", key: str, title: str, data: str = "", share: float 
     text = re.sub(r"(?<=: )#[0-9a-f]{6}\b", lambda c: VARIABLES.get(c[0], c[0]), text)
     box = re.search(r'viewBox="([^"]*)"', text)
     assert box is not None
-    # as a share of the column, so that text has one size in all figures
-    share = share or 100.0 * min(1.0, float(figure.get_figwidth()) / WIDTH)
     size = f'style="width: {share:.0f}%"'
-    more = f' data-axes="{escape(data)}"' if data else ""
-    head = f'<svg viewBox="{box[1]}" {size} role="img" aria-label="{escape(title)}"{more}>'
+    named = f'role="img" aria-label="{escape(title)}" data-axes="{escape(data)}"'
+    head = f'<svg viewBox="{box[1]}" {size} {named}>'
     body = text[text.index(">") + 1 :]
     return re.sub(r"\n\s*", "\n", head + body).strip()
 

@@ -39,6 +39,11 @@ class Boxes:
         """Some of them, by mask or index."""
         return Boxes(self.chart[chosen], self.low[:, chosen], self.high[:, chosen])
 
+    def beside(self, other: "Boxes") -> "Boxes":
+        """Both."""
+        pairs = ((self.low, other.low), (self.high, other.high))
+        return Boxes(np.append(self.chart, other.chart), *map(np.hstack, pairs))
+
     def omega(self, unit: float, period: float | None) -> tuple[Array, Array]:
         """The ends of ω in rad/s."""
         if period is not None:

@@ -9,6 +9,7 @@ a stage on a soft suspension the directions in which its rigid body moves.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -20,7 +21,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 ORTHOGONAL = 1e-9  # of UᵀU - I: with more, singular values differ between the coordinates
+PROBES = np.geomspace(1e-3, 1e3, 19)  # over ω₀
 DIAGONAL = 1e-7  # |G_ij| over the mean of |G_ii| and |G_jj| that counts as no coupling
+NOTHING = 1e-12  # the same by which no part of a plant couples channels, at its resonance either
 ABSENT = 1e-8  # share of the strongest drive or reading under which a mode is in no channel
 LEAST_GAIN = 1e-9  # of static gains, relative: a channel below it is none
 
@@ -122,7 +125,7 @@ def channel_plant(plant: ScaledPlant, decoupling: Decoupling, number: int) -> Sc
     """The SISO plant u_iᵀ G v_i, with the states that take part in it or may as θ moves."""
     whole = in_channels(plant, decoupling)
     b, c = whole.B[:, [number]], whole.C[[number]]
-    count, group = connected_components(csr_array(whole.A != 0.0), directed=False)
+    count, group = _apart((whole.A != 0.0).tobytes(), len(whole.A))
     drive, reading = np.zeros(count), np.zeros(count)
     np.maximum.at(drive, group, np.abs(b[:, 0]))
     np.maximum.at(reading, group, np.abs(c[0]))
@@ -135,18 +138,38 @@ def channel_plant(plant: ScaledPlant, decoupling: Decoupling, number: int) -> Sc
     )  # fmt: skip
 
 
+@lru_cache(maxsize=64)  # plants of a set are alike
+def _apart(coupled: bytes, states: int) -> tuple[int, np.ndarray]:
+    """How many parts of A have no entry between each other, and which one each state is of."""
+    pattern = np.frombuffer(coupled, bool).reshape(states, states)
+    count, group = connected_components(csr_array(pattern), directed=False)
+    return int(count), group
+
+
 def is_decoupled(plant: ScaledPlant, decoupling: Decoupling) -> bool:
     """Whether Uᵀ G V is diagonal, at every resonance and between; U and V have to be orthogonal."""
     if not decoupling.orthogonal:
         return False
     whole = in_channels(plant, decoupling)
+    count, group = _apart((whole.A != 0.0).tobytes(), len(whole.A))
+    taken = np.zeros((count, len(whole.C)))
+    for part in (np.abs(whole.B), np.abs(whole.C.T)):
+        np.maximum.at(taken, group, part / part.max(axis=0))
+    if ((taken > NOTHING).sum(axis=1) <= 1).all():
+        return True
+    if _coupled(whole, PROBES):
+        return False
     poles = np.linalg.eigvals(whole.A)
-    omega = np.concatenate([np.abs(poles[poles.imag >= 0.0]), np.geomspace(1e-3, 1e3, 19)])
+    return not _coupled(whole, np.abs(poles[poles.imag >= 0.0]))
+
+
+def _coupled(whole: ScaledPlant, omega: Array) -> bool:
+    """Whether G is more than diagonal at some of these frequencies over ω₀."""
     G = np.abs(whole.system.response(omega))
     own = np.sqrt(np.einsum("kii->ki", G))
     coupling = G / np.maximum(own[:, :, None] * own[:, None, :], 1e-300)
     coupling[:, range(len(own[0])), range(len(own[0]))] = 0.0
-    return bool(coupling.max() <= DIAGONAL)
+    return bool(coupling.max() > DIAGONAL)
 
 
 def in_units_of(plant: ScaledPlant, first: ScaledPlant) -> ScaledPlant:

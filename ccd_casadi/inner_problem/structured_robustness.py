@@ -83,7 +83,7 @@ def worse_members(
         seed=structured.seed + turn,
     )  # fmt: skip
     if progress is not None:
-        progress(f"{np.exp(heads[0].value):.6g} of a bound at most on {count} plants")
+        progress(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
     known = list(structured.members)
     found: list[Member] = []

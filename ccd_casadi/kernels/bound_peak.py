@@ -1,4 +1,4 @@
-"""The bound γ_jω along one direction: its gradient where it is attained, and what rounding leaves.
+"""The bound γ_jω along one direction, and its gradient where it is attained.
 
     γ_jω² = (1 + δ²σ²)|W1|²E/(|W1|²σ² + E),   E = |W2|² + |W3|²σ²,  or |W2|² + |W3|² where δ > 0,
 
@@ -14,13 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.kernels.gamma import BACKWARD
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.pullback import squared_weight_slopes
-
-EPS = 2.0**-52
-DEVIATIONS = 4.0  # standard deviations of the rounding that `bound_error` admits
 
 
 class BoundTerms(NamedTuple):
@@ -53,7 +48,7 @@ def bound_terms(W1, W2, W3, sigma, delta):
     )
 
 
-def _direction(A, B, C, ω, least=True):
+def direction(A, B, C, ω, least=True):
     """M = jω - A, M⁻¹B, and the least (largest) σ of G = C M⁻¹ B with its singular vectors u, v.
 
     With fewer inputs than outputs the least is 0, and so is v.
@@ -68,31 +63,9 @@ def _direction(A, B, C, ω, least=True):
     return M, right, s[i], U[:, i], Vh[i].conj()
 
 
-def bound_error(A, B, C, w, ω):
-    """δγ_jω/γ_jω that rounding leaves in the bound attained at ω, through σ_p(G(jω)).
-
-    δσ = l δT r, l = u* C (jω - T)⁻¹, r = (jω - T)⁻¹ B v, in coordinates of the Schur form T of A.
-    Its own backward error is |δT| = BACKWARD |T|, spread evenly over the entries; the solves at ω
-    leave eps |T_ij| in each, which is more where eigenvalues stand in an unlucky order. Next to a
-    transmission zero of small damping σ is small and its error is not.
-    """
-    T, B, C = prepare(A, B, C)
-    n = T.shape[0]
-    M, right, σ, u, v = _direction(T, B, C, ω)
-    if σ == 0.0:
-        return 0.0  # fewer inputs than outputs, or none that acts: the bound is |W1|
-    left = np.linalg.solve(M.T, u.conj() @ C)
-    form = BACKWARD * np.linalg.norm(T) / n * np.linalg.norm(left) * np.linalg.norm(right @ v)
-    squares = [np.abs(part) ** 2 for part in (left, M, right, v)]
-    dσ = np.hypot(form, EPS * np.sqrt(np.linalg.multi_dot(squares)))
-    W1, W2, W3 = squared_weights(w, ω)
-    force = W2 / σ**2
-    return DEVIATIONS * W1 / (W1 + force + W3) * force / (force + W3) * dσ / σ
-
-
 def bound_slope(A, B, C, w, delta, ω, least=True):
     """dγ_jω²(ω)/dω, dσ = Re(u* dG v)."""
-    M, right, σ, u, v = _direction(A, B, C, ω, least)
+    M, right, σ, u, v = direction(A, B, C, ω, least)
     dσ = np.vdot(u, -1j * (C @ np.linalg.solve(M, right)) @ v).real
     terms = bound_terms(*squared_weights(w, ω), σ, delta)
     return terms.to_sigma * dσ + np.dot(terms[2:5], squared_weight_rates(w, ω))
@@ -100,7 +73,7 @@ def bound_slope(A, B, C, w, delta, ω, least=True):
 
 def bound_gradient(A, B, C, w, delta, ω, least=True):
     """Gradients of γ_jω at its maximising ω (envelope) to A, B, C, the weight vector (8,) and δ."""
-    M, right, σ, u, v = _direction(A, B, C, ω, least)
+    M, right, σ, u, v = direction(A, B, C, ω, least)
     terms = bound_terms(*squared_weights(w, ω), σ, delta)
     scale = 0.5 / np.sqrt(terms.value)
     left, through = np.linalg.solve(M.T, u.conj() @ C), right @ v

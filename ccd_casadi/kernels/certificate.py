@@ -10,12 +10,12 @@ the spectral factor is used.
 
 import numpy as np
 
-from ccd_casadi.kernels.closed_loop import loop_matrices
+from ccd_casadi.kernels.blocks import frobenius, place
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import narrow, next_trial, promised, response, responses
-from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
+from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.sensitivity import axis_frequencies
-from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenvalue, multiply
+from ccd_casadi.kernels.small import add_real, invert, largest_singular, multiply
 
 REFINED_FROM = 0.95  # of the largest gain on the grid: a peak this high is refined in any case
 REFINEMENTS = 40  # trials a peak; some six are used
@@ -53,11 +53,12 @@ def _stack(g, k, Dk, w, delta, ω):
             for j in range(m):
                 wide[i, p + j] = delta * SG[i, j]
         S = wide
-    Z = np.zeros((S.shape[1], S.shape[1]), np.complex128)
-    add_gram(Z, S, W1)
-    add_gram(Z, multiply(k, S), W2)
-    add_gram(Z, multiply(last, S), W3)
-    return np.sqrt(largest_eigenvalue(Z))
+    KS, last = multiply(k, S), multiply(last, S)
+    Z = np.empty((p + KS.shape[0] + last.shape[0], S.shape[1]), np.complex128)
+    place(Z, 0, 0, np.sqrt(W1), S)
+    place(Z, p, 0, np.sqrt(W2), KS)
+    place(Z, p + KS.shape[0], 0, np.sqrt(W3), last)
+    return largest_singular(Z)
 
 
 @compiled
@@ -116,14 +117,7 @@ def level_test(G, K, Dk, w, delta, loop, level):
     they bound decides. False as well where LAPACK fails or the feedthrough exceeds the level.
     """
     Az, Bz, Cz, Dz = loop
-    p = Dz.shape[1]
-    gram, size = np.zeros((p, p), np.complex128), 0.0
-    for k in range(Dz.shape[0]):
-        for i in range(p):
-            size += Dz[k, i] ** 2
-            for j in range(p):
-                gram[i, j] += Dz[k, i] * Dz[k, j]
-    if size >= level**2 and largest_eigenvalue(gram) >= level**2:
+    if frobenius(Dz) >= level and largest_singular(Dz.astype(np.complex128)) >= level:
         return False
     candidates, info = axis_frequencies(Az, Bz, Cz, Dz, level)
     if info != 0:
@@ -146,26 +140,3 @@ def level_test(G, K, Dk, w, delta, loop, level):
         if not stack_gain(G, K, Dk, w, delta, candidates[i]) <= level * (1.0 + 1e-9):
             return False
     return True
-
-
-def four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta):
-    """State space of (r, d) to [W1 e; W2 u; W3 u], states [x; x_K; W1; W2; W3]."""
-    n, N, m, p = A.shape[0], Ak.shape[0], B.shape[1], C.shape[0]
-    f = first_order_weights(w)
-    As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
-    Bs = np.hstack([Bs, np.vstack([delta * B, np.zeros((N, m))])])
-    De = np.hstack([np.eye(p), np.zeros((p, m))])
-    Cu, Du = np.hstack([-Dk @ C, Ck]), Dk @ De
-    signals = ((Cs, De), (Cu, Du), (Cu, Du))
-    poles = np.repeat(-f[:, 0], [p, m, m])
-    Az = np.zeros((n + N + poles.size, n + N + poles.size))
-    Az[: n + N, : n + N] = As
-    Az[n + N :, n + N :] = np.diag(poles)
-    Az[n + N :, : n + N] = np.vstack([b * c for b, (c, _) in zip(f[:, 1], signals, strict=True)])
-    Bz = np.vstack([Bs, *(b * d for b, (_, d) in zip(f[:, 1], signals, strict=True))])
-    Cz = np.hstack([
-        np.vstack([d * c for d, (c, _) in zip(f[:, 3], signals, strict=True)]),
-        np.diag(np.repeat(f[:, 2], [p, m, m])),
-    ])  # fmt: skip
-    Dz = np.vstack([d * through for d, (_, through) in zip(f[:, 3], signals, strict=True)])
-    return Az, Bz, Cz, Dz

@@ -43,43 +43,40 @@ def pole_rounding(A):
 
 
 @compiled
-def weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w):
-    """State space of r to [W1 e; W2 u; W3 y], states [x; x_K; W1; W2; W3]."""
-    n, N, p, m = A.shape[0], Ak.shape[0], C.shape[0], B.shape[1]
+def weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta):
+    """State space of r to [W1 e; W2 u; W3 y], states [x; x_K; W1; W2; W3].
+
+    With δ > 0 of (r, d) to [W1 e; W2 u; W3 u].
+    """
+    n, own, p, m = A.shape[0], A.shape[0] + Ak.shape[0], C.shape[0], B.shape[1]
     f = first_order_weights(w)
-    i1, i2 = n + N, n + N + p
-    i3 = i2 + m
-    total = i3 + p
-    Az, Bz = np.zeros((total, total)), np.zeros((total, p))
-    Cz, Dz = np.zeros((2 * p + m, total)), np.zeros((2 * p + m, p))
+    As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
+    count, inputs = (p + 2 * m, p + m) if delta > 0.0 else (2 * p + m, p)
+    # what the weights see, e, u and y or u again, of states and inputs
+    C_seen, D_seen = np.zeros((count, own)), np.zeros((count, inputs))
     DC = Dk @ C
-    place(Az, 0, 0, 1.0, A)
-    add(Az, 0, 0, -1.0, B @ DC)
-    place(Az, 0, n, 1.0, B @ Ck)
-    place(Az, n, 0, -1.0, Bk @ C)
-    place(Az, n, n, 1.0, Ak)
-    place(Bz, 0, 0, 1.0, B @ Dk)
-    place(Bz, n, 0, 1.0, Bk)
-    place(Az, i1, 0, -f[0, 1], C)
-    place(Az, i2, 0, -f[1, 1], DC)
-    place(Az, i2, n, f[1, 1], Ck)
-    place(Bz, i2, 0, f[1, 1], Dk)
-    place(Az, i3, 0, f[2, 1], C)
-    place(Cz, 0, 0, -f[0, 3], C)
-    place(Cz, p, 0, -f[1, 3], DC)
-    place(Cz, p, n, f[1, 3], Ck)
-    place(Dz, p, 0, f[1, 3], Dk)
-    place(Cz, p + m, 0, f[2, 3], C)
+    place(C_seen, 0, 0, 1.0, Cs)
     for i in range(p):
-        Az[i1 + i, i1 + i] = -f[0, 0]
-        Bz[i1 + i, i] = f[0, 1]
-        Cz[i, i1 + i] = f[0, 2]
-        Dz[i, i] = f[0, 3]
-        Az[i3 + i, i3 + i] = -f[2, 0]
-        Cz[p + m + i, i3 + i] = f[2, 2]
-    for i in range(m):
-        Az[i2 + i, i2 + i] = -f[1, 0]
-        Cz[p + i, i2 + i] = f[1, 2]
+        D_seen[i, i] = 1.0
+    for first in range(p, count if delta > 0.0 else p + m, m):
+        place(C_seen, first, 0, -1.0, DC)
+        place(C_seen, first, n, 1.0, Ck)
+        place(D_seen, first, 0, 1.0, Dk)
+    Az, Bz = np.zeros((own + count, own + count)), np.zeros((own + count, inputs))
+    Cz, Dz = np.zeros((count, own + count)), np.zeros((count, inputs))
+    place(Az, 0, 0, 1.0, As)
+    place(Bz, 0, 0, 1.0, Bs)
+    if delta > 0.0:
+        place(Bz, 0, p, delta, B)
+    else:
+        place(C_seen, p + m, 0, 1.0, C)
+    for i in range(count):
+        a, b, c, d = f[0 if i < p else 1 if i < p + m else 2]
+        for j in range(own):
+            Az[own + i, j], Cz[i, j] = b * C_seen[i, j], d * C_seen[i, j]
+        for j in range(inputs):
+            Bz[own + i, j], Dz[i, j] = b * D_seen[i, j], d * D_seen[i, j]
+        Az[own + i, own + i], Cz[i, own + i] = -a, c
     return Az, Bz, Cz, Dz
 
 

@@ -5,7 +5,7 @@ from math import exp, isnan, log, nan
 import numpy as np
 
 from ccd_casadi.kernels.blocks import ascending, place
-from ccd_casadi.kernels.certificate import four_block_loop, level_test, stack_norm
+from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import (
     loop_matrices,
     pole_rounding,
@@ -62,20 +62,21 @@ def _closed(A, B, C, Ak, Bk, Ck, Dk, row):
 
 
 @compiled
-def _stack_proof(G, K, Dk, w, grid, gamma, matrices, loop):
+def _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop):
     """The norm, where, whether it and the Hamiltonian stay below γ, and the least r to e."""
     A, B, C, Ak, Bk, Ck = matrices
-    norm, at = stack_norm(G, K, Dk, w, 0.0, grid)
-    n, N = A.shape[0], Ak.shape[0]
+    norm, at = stack_norm(G, K, Dk, w, delta, grid)
     if not norm <= gamma:
         return norm, at, False, loop
-    whole, smaller = reachable_loop(weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w), n, N)
-    if smaller:
-        # x = x̂ as seen from r, so the controller's own states carry S as well
-        Cs = np.zeros((C.shape[0], N))
-        place(Cs, 0, 0, -1.0, C)
-        loop = (whole[0], whole[1], Cs)
-    return norm, at, level_test(G, K, Dk, w, 0.0, whole, gamma), loop
+    whole = weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta)
+    if not delta > 0.0:
+        whole, smaller = reachable_loop(whole, A.shape[0], Ak.shape[0])
+        if smaller:
+            # x = x̂ as seen from r, so the controller's own states carry S as well
+            Cs = np.zeros((C.shape[0], Ak.shape[0]))
+            place(Cs, 0, 0, -1.0, C)
+            loop = (whole[0], whole[1], Cs)
+    return norm, at, level_test(G, K, Dk, w, delta, whole, gamma), loop
 
 
 @compiled
@@ -113,13 +114,8 @@ def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     if code != Code.CERTIFIED:
         return code
     grid = certificate_grid(*poles)
-    if delta:
-        norm, at = stack_norm(G, K, Dk, w, delta, grid)
-        whole = four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta)
-        held = norm <= gamma and level_test(G, K, Dk, w, delta, whole, gamma)
-    else:
-        matrices = (A, B, C, Ak, Bk, Ck)
-        norm, at, held, loop = _stack_proof(G, K, Dk, w, grid, gamma, matrices, loop)
+    matrices = (A, B, C, Ak, Bk, Ck)
+    norm, at, held, loop = _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop)
     row[Figure.NORM], row[Figure.NORM_FREQUENCY] = norm, at
     if not held:
         return Code.LEVEL_TEST_FAILED if norm <= gamma else Code.NORM_EXCEEDED

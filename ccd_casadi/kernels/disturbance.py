@@ -38,30 +38,37 @@ def filter_solution(A, B, C, delta):
     return 0.5 * (Y + Y.T), True
 
 
+def four_block_plant(A, B, C, w, delta):
+    """A, B1, B2, C1, C2, D11, D12 of (r, d) to [W1 e; W2 u; W3 u]; states [plant; W1; W2; W3]."""
+    n, m, p = A.shape[0], B.shape[1], C.shape[0]
+    f, channels = first_order_weights(w), [p, m, m]
+    N = n + p + 2 * m
+    pole, into, out, direct = (np.repeat(f[:, k], channels) for k in range(4))
+    twice = np.vstack([np.eye(m), np.eye(m)])
+    Ag, B1, B2 = np.zeros((N, N)), np.zeros((N, p + m)), np.zeros((N, m))
+    Ag[:n, :n], Ag[n:, n:], Ag[n : n + p, :n] = A, -np.diag(pole), -f[0, 1] * C
+    B1[:n, p:], B1[n : n + p, :p] = delta * B, f[0, 1] * np.eye(p)
+    B2[:n], B2[n + p :] = B, into[p:, None] * twice
+    C1, D11, D12 = np.zeros((p + 2 * m, N)), np.zeros((p + 2 * m, p + m)), np.zeros((p + 2 * m, m))
+    C1[:, n:], C1[:p, :n] = np.diag(out), -f[0, 3] * C
+    D11[:p, :p], D12[p:] = f[0, 3] * np.eye(p), direct[p:, None] * twice
+    return Ag, B1, B2, C1, np.hstack([-C, np.zeros((p, N - n))]), D11, D12
+
+
 def innovations_plant(A, B, C, w, Y):
-    """A, B1, B2, C1, C2, d1, d of the equivalent problem; states [plant; W1; W2; W3 of u].
+    """A, B1, B2, C1, C2, d1, d of the equivalent problem; states as in `four_block_plant`.
 
     z = [W1 e; (d2 z2 + d3 z3)/d; (d2 z3 - d3 z2)/d] with d² = d2² + d3²: turned so that the
     feedthrough of u is [0; d I; 0], as the kernels of the first kind take it.
     """
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
-    f = first_order_weights(w)
-    N = n + p + 2 * m
-    i1, i2, i3 = n, n + p, n + p + m
-    Ag, B1, B2 = np.zeros((N, N)), np.zeros((N, p)), np.zeros((N, m))
-    C1, C2 = np.zeros((p + 2 * m, N)), np.zeros((p, N))
-    Ag[:n, :n], B2[:n], C2[:, :n], B1[:n] = A, B, -C, -Y @ C.T
-    Ag[i1:i2, :n], C1[:p, :n] = -f[0, 1] * C, -f[0, 3] * C
-    for k, first, last in ((0, i1, i2), (1, i2, i3), (2, i3, N)):
-        one = np.eye(last - first)
-        Ag[first:last, first:last] = -f[k, 0] * one
-        (B1 if k == 0 else B2)[first:last] = f[k, 1] * one
-    C1[:p, i1:i2] = f[0, 2] * np.eye(p)
-    d2, d3, one = f[1, 3], f[2, 3], np.eye(m)
+    Ag, B1, B2, C1, C2, D11, D12 = four_block_plant(A, B, C, w, 0.0)
+    B1 = np.ascontiguousarray(B1[:, :p])
+    B1[:n] = -Y @ C.T
+    d2, d3 = D12[p, 0], D12[p + m, 0]
     d = np.hypot(d2, d3)
-    C1[p : p + m, i2:i3], C1[p : p + m, i3:] = d2 / d * f[1, 2] * one, d3 / d * f[2, 2] * one
-    C1[p + m :, i2:i3], C1[p + m :, i3:] = -d3 / d * f[1, 2] * one, d2 / d * f[2, 2] * one
-    return Ag, B1, B2, C1, C2, float(f[0, 3]), float(d)
+    C1[p:] = np.kron(np.array([[d2, d3], [-d3, d2]]) / d, np.eye(m)) @ C1[p:]
+    return Ag, B1, B2, C1, C2, float(D11[0, 0]), float(d)
 
 
 # ---- what no controller passes ------------------------------------------------------------------

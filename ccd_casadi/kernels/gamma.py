@@ -117,7 +117,7 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
     `guess` starts the iteration (0: none), `noise` is the level's. Returns γ_opt, whether γ_jω
     limits, the number of Schur forms, whether it closed to the relative `tolerance` in γ, and
     the relative error that rounding and search may have left (infinite where it is not known),
-    γ_jω taken as exact: see `bound_error`.
+    γ_jω taken as exact.
     """
     # γ_jω itself puts eigenvalues on the axis: the test is made a hair above it.
     t_jw = max(gamma_jw**2 * (1 + 1e-7) - d1**2, 1e-12 * d1**2)

@@ -34,75 +34,110 @@ class MixedPullback:
 
     def __init__(self, A, B, C, w):
         self.n, self.m, self.p = A.shape[0], B.shape[1], C.shape[0]
-        self.C, self.w, self.f = C, w, first_order_weights(w)
+        self.A, self.B, self.C, self.w, self.f = A, B, C, w, first_order_weights(w)
 
     def to_plant_and_weights(self, of):
         """Gradients to A, B, C and the weights, k in front of each."""
-        n, m, p = self.n, self.m, self.p
-        A_, B_, C_ = to_plant(of.A, of.B2, of.C1, of.C2, self.f, self.C, m)
-        w_ = to_weights(of.A, of.A_rate, of.C1, of.C1_rate, self.f, self.w, n, p, m)
-        return A_, B_, C_, w_
+        n, p, m, f = self.n, self.p, self.m, self.f
+        C_ = f[2, 3] * of.C1[:, p + m :, :n] + f[2, 1] * of.A[:, n + p + m :, :n] + self._of_e(of)
+        w_ = self._to_weights(of.A, of.A_rate, of.C1, of.C1_rate)
+        return of.A[:, :n, :n], of.B2[:, :n], C_, w_
+
+    def _of_e(self, of):
+        """The gradient to C through e = r - y."""
+        n, p, f = self.n, self.p, self.f
+        return -f[0, 3] * of.C1[:, :p, :n] - f[0, 1] * of.A[:, n : n + p, :n] - of.C2[:, :, :n]
+
+    def _to_weights(self, A_, A_rate, C1_, C1_rate):
+        """Pull gradients p xᵀ, p ẋᵀ, z xᵀ, z ẋᵀ of costate and output back to the weight vector.
+
+        Each (k, ...), the result (k, 8). In ẋ = -a x + b v, z = c x + d v a filter with W(0) = 1
+        and W(∞) = d = 10⁴ has gradients to a, b, c and d of up to 10⁸ times their sum, which
+        rounding then leaves nothing of. In units of x where b = a the same is ẋ = a (v - x),
+        z = W(0) x + W(∞)(v - x), and v - x is ẋ/a, which the stable subspace gives without a
+        difference.
+        """
+        n, w, f = self.n, self.w, self.f
+        rate_S, rate_K, rate_T = self._traces(A_rate, n)
+        direct_S, direct_K, direct_T = f[:, 3:] / f[:, 1:2] * self._traces(C1_rate, 0)
+        static_S, _, static_T = self._traces(C1_, 0)
+        # A_S moves the pole and W1(0) at once, and far above the pole these two would cancel
+        leak = -f[0, 0] * (self._traces(A_, n)[0] + f[0, 3] / f[0, 1] * static_S)
+        static_T = f[2, 0] / (w[5] * f[2, 1]) * static_T
+        logarithmic = np.array(
+            [
+                -direct_S, leak, rate_S, rate_K + direct_K,
+                rate_K, -static_T, -rate_T - direct_T, rate_T,
+            ]
+        )  # fmt: skip
+        return logarithmic.T / w
+
+    def _traces(self, M, first):
+        """Traces of the blocks of W1, W2 and W3, which begin at (first, n), along the last axis."""
+        diagonal = M[..., first:, self.n :].diagonal(0, -2, -1)
+        return np.add.reduceat(diagonal, (0, self.p, self.p + self.m), axis=-1).T
 
     def gain_to_weights(self, h, x, costate, rate):
-        """As the function of this name; x, costate and rate of the controller's whole state."""
-        of_W2 = slice(self.n + self.p, self.n + self.p + self.m)
-        return gain_to_weights(h, x[:, of_W2], costate[:, of_W2], rate[:, of_W2], self.f, self.w)
+        """Gradient (k, 8) of -Re(hᵀ dF x) to the weights through d2² F = -B2ᵀX - D12ᵀC1, X held.
+
+        Columns (k, N, 1) of the controller's whole state: x, `costate` X times it, `rate` ẋ. As in
+        `_to_weights`, c x + d F stands as W(0) x + W(∞) ẋ/a.
+        """
+        (a, b, _, d), of_W2 = self.f[1], slice(self.n + self.p, self.n + self.p + self.m)
+        through_pole = (h * costate[:, of_W2]).sum((1, 2)).real * b / d**2
+        through_direct = (h * (2.0 * rate[:, of_W2] + a / d * x[:, of_W2])).sum((1, 2)).real / b
+        w_ = np.zeros((len(h), 8))
+        w_[:, 3] = (through_pole + through_direct) / self.w[3]
+        w_[:, 4] = through_pole / self.w[4]
+        return w_
 
 
-def to_plant(A_, B2_, C1_, C2_, f, C, m):
-    """Pull gradients of the generalized plant back to A, B and C; axes in front stay."""
-    p, n = C.shape
-    i1, i2, i3 = n, n + p, n + p + m
-    C_ = (
-        f[2, 3] * C1_[..., p + m :, :n] - f[0, 3] * C1_[..., :p, :n]
-        + f[2, 1] * A_[..., i3:, :n] - f[0, 1] * A_[..., i1:i2, :n] - C2_[..., :n]
-    )  # fmt: skip
-    return A_[..., :n, :n], B2_[..., :n, :], C_
+class FourBlockPullback(MixedPullback):
+    """From `innovations_plant` back to A, B, C and (weights, δ) (9,)."""
 
+    def __init__(self, A, B, C, w, Y, delta):
+        super().__init__(A, B, C, w)
+        self.Y, self.delta, self.filter = Y, delta, A - Y @ C.T @ C
 
-def _traces(M, first, n, p, m):
-    """Traces of the blocks of W1, W2 and W3, which begin at (first, n), along the last axis."""
-    diagonal = M[..., first:, n:].diagonal(0, -2, -1)
-    return np.add.reduceat(diagonal, (0, p, p + m), axis=-1).T
+    def to_plant_and_weights(self, of):
+        """Gradients to A, B, C and (weights, δ), k in front of each."""
+        n, B, C, Y, delta = self.n, self.B, self.C, self.Y, self.delta
+        B1_ = of.B1[:, :n]
+        Y_ = -0.5 * (B1_ @ C + (B1_ @ C).swapaxes(1, 2))
+        L = np.array([solve_continuous_lyapunov(self.filter.T, -part) for part in Y_])
+        A_ = of.A[:, :n, :n] + 2.0 * L @ Y
+        B_ = of.B2[:, :n] + 2.0 * delta**2 * L @ B
+        C_ = self._of_e(of) - B1_.swapaxes(1, 2) @ Y - 2.0 * C @ Y @ L @ Y
+        C1_, C1_rate = self._turned_back(of.C1), self._turned_back(of.C1_rate)
+        w_ = self._to_weights(of.A, of.A_rate, C1_, C1_rate)
+        to_delta = 2.0 * delta * (B * (L @ B)).sum((1, 2))
+        return A_, B_, C_, np.column_stack([w_, to_delta])
 
+    def _turned_back(self, C1_):
+        """Rows to [z1; z2; z3] from the turned outputs."""
+        m, p, d2, d3 = self.m, self.p, self.f[1, 3], self.f[2, 3]
+        d, along, across = np.hypot(d2, d3), C1_[:, p : p + m], C1_[:, p + m :]
+        z2, z3 = (d2 * along - d3 * across) / d, (d3 * along + d2 * across) / d
+        return np.concatenate([C1_[:, :p], z2, z3], axis=1)
 
-def to_weights(A_, A_rate, C1_, C1_rate, f, w, n, p, m):
-    """Pull gradients p xᵀ, p ẋᵀ, z xᵀ, z ẋᵀ of costate and output back to the weight vector.
+    def gain_to_weights(self, h, x, costate, rate):
+        """Gradient (k, 9) of -Re(hᵀ dF x) to (weights, δ) through d²F = -B2ᵀX - D12ᵀC1, X held.
 
-    Each (k, ...), the result (k, 8). In ẋ = -a x + b v, z = c x + d v a filter with W(0) = 1 and
-    W(∞) = d = 10⁴ has gradients to a, b, c and d of up to 10⁸ times their sum, which rounding then
-    leaves nothing of. In units of x where b = a the same is ẋ = a (v - x),
-    z = W(0) x + W(∞)(v - x), and v - x is ẋ/a, which the stable subspace gives without a
-    difference.
-    """
-    rate_S, rate_K, rate_T = _traces(A_rate, n, n, p, m)
-    direct_S, direct_K, direct_T = f[:, 3:] / f[:, 1:2] * _traces(C1_rate, 0, n, p, m)
-    static_S, _, static_T = _traces(C1_, 0, n, p, m)
-    # A_S moves the pole and W1(0) at once, and far above the pole these two would cancel
-    leak = -f[0, 0] * (_traces(A_, n, n, p, m)[0] + f[0, 3] / f[0, 1] * static_S)
-    static_T = f[2, 0] / (w[5] * f[2, 1]) * static_T
-    logarithmic = np.array(
-        [
-            -direct_S, leak, rate_S, rate_K + direct_K,
-            rate_K, -static_T, -rate_T - direct_T, rate_T,
-        ]
-    )  # fmt: skip
-    return logarithmic.T / w
-
-
-def gain_to_weights(h, x, costate, rate, f, w):
-    """Gradient (k, 8) of -Re(hᵀ dF x) to the weights through d2² F = -B2ᵀX - D12ᵀC1, X held.
-
-    Columns (k, m, 1): x the states of W2, `costate` their entries of X times the whole state,
-    `rate` ẋ. As in `to_weights`, c x + d F stands as W(0) x + W(∞) ẋ/a.
-    """
-    a, b, d = f[1, 0], f[1, 1], f[1, 3]
-    through_pole = (h * costate).sum((1, 2)).real * b / d**2
-    through_direct = (h * (2.0 * rate + a / d * x)).sum((1, 2)).real / b
-    w_ = np.zeros((len(h), 8))
-    w_[:, 3] = (through_pole + through_direct) / w[3]
-    w_[:, 4] = through_pole / w[4]
-    return w_
+        W3 as W2 of the mixed problem, but W3(0) = 1/A_l, W3(∞) = 1/A_u, pole ω_T/A_u.
+        """
+        n, m, p, f = self.n, self.m, self.p, self.f
+        of_W3 = slice(n + p + m, n + p + 2 * m)
+        d2, (a, b, _, d3) = f[1, 3], f[2]
+        size = d2**2 + d3**2
+        w_ = np.zeros((len(h), 9))
+        w_[:, :8] = d2**2 / size * super().gain_to_weights(h, x, costate, rate)
+        pole = (h * costate[:, of_W3]).sum((1, 2)).real * b / size
+        at_rest = d3 / self.w[5] * a / b * (h * x[:, of_W3]).sum((1, 2)).real / size
+        direct = at_rest + 2.0 * d3**2 / b * (h * rate[:, of_W3]).sum((1, 2)).real / size
+        w_[:, 5] -= at_rest / self.w[5]
+        w_[:, 6] -= (pole + direct) / self.w[6]
+        w_[:, 7] += pole / self.w[7]
+        return w_
 
 
 def squared_weight_slopes(w, ω):
@@ -126,59 +161,3 @@ def squared_weight_slopes(w, ω):
             2.0 * ω_T * ((A_u / A_l) ** 2 - 1.0) * (ω / b3) ** 2,
         ]
     )
-
-
-class FourBlockPullback:
-    """From `innovations_plant` back to A, B, C and (weights, δ) (9,); as `MixedPullback`."""
-
-    def __init__(self, A, B, C, w, Y, delta):
-        self.n, self.m, self.p = A.shape[0], B.shape[1], C.shape[0]
-        self.A, self.B, self.C, self.w, self.Y, self.delta = A, B, C, w, Y, delta
-        self.f = first_order_weights(w)
-        self.filter = A - Y @ C.T @ C
-
-    def to_plant_and_weights(self, of):
-        """Gradients to A, B, C and (weights, δ), k in front of each."""
-        n, m, p, f = self.n, self.m, self.p, self.f
-        B, C, Y, delta = self.B, self.C, self.Y, self.delta
-        B1_ = of.B1[:, :n]
-        Y_ = -0.5 * (B1_ @ C + (B1_ @ C).swapaxes(1, 2))
-        L = np.array([solve_continuous_lyapunov(self.filter.T, -part) for part in Y_])
-        A_ = of.A[:, :n, :n] + 2.0 * L @ Y
-        B_ = of.B2[:, :n] + 2.0 * delta**2 * L @ B
-        C_ = (
-            -f[0, 3] * of.C1[:, :p, :n] - f[0, 1] * of.A[:, n : n + p, :n] - of.C2[:, :, :n]
-            - B1_.swapaxes(1, 2) @ Y - 2.0 * C @ Y @ L @ Y
-        )  # fmt: skip
-        C1_, C1_rate = self._turned_back(of.C1), self._turned_back(of.C1_rate)
-        w_ = to_weights(of.A, of.A_rate, C1_, C1_rate, f, self.w, n, p, m)
-        to_delta = 2.0 * delta * (B * (L @ B)).sum((1, 2))
-        return A_, B_, C_, np.column_stack([w_, to_delta])
-
-    def _turned_back(self, C1_):
-        """Rows to [z1; z2; z3] from the turned outputs."""
-        m, p, d2, d3 = self.m, self.p, self.f[1, 3], self.f[2, 3]
-        d, along, across = np.hypot(d2, d3), C1_[:, p : p + m], C1_[:, p + m :]
-        z2, z3 = (d2 * along - d3 * across) / d, (d3 * along + d2 * across) / d
-        return np.concatenate([C1_[:, :p], z2, z3], axis=1)
-
-    def gain_to_weights(self, h, x, costate, rate):
-        """Gradient (k, 9) of -Re(hᵀ dF x) to (weights, δ) through d²F = -B2ᵀX - D12ᵀC1, X held.
-
-        x, costate and ẋ of the controller's whole state. W3 as W2 in `pullback.gain_to_weights`,
-        but W3(0) = 1/A_l, W3(∞) = 1/A_u, pole ω_T/A_u.
-        """
-        n, m, p, f = self.n, self.m, self.p, self.f
-        of_W2, of_W3 = slice(n + p, n + p + m), slice(n + p + m, n + p + 2 * m)
-        d2, (a, b, _, d3) = f[1, 3], f[2]
-        size = d2**2 + d3**2
-        w_ = np.zeros((len(h), 9))
-        first = gain_to_weights(h, x[:, of_W2], costate[:, of_W2], rate[:, of_W2], f, self.w)
-        w_[:, :8] = d2**2 / size * first
-        pole = (h * costate[:, of_W3]).sum((1, 2)).real * b / size
-        at_rest = d3 / self.w[5] * a / b * (h * x[:, of_W3]).sum((1, 2)).real / size
-        direct = at_rest + 2.0 * d3**2 / b * (h * rate[:, of_W3]).sum((1, 2)).real / size
-        w_[:, 5] -= at_rest / self.w[5]
-        w_[:, 6] -= (pole + direct) / self.w[6]
-        w_[:, 7] += pole / self.w[7]
-        return w_

@@ -12,7 +12,7 @@ from ccd_casadi.kernels.blocks import add, ascending, place, place_transposed, t
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import response, response_and_slope, responses
 from ccd_casadi.kernels.lapack import eigenvalues
-from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenvalue, multiply
+from ccd_casadi.kernels.small import add_real, invert, largest_singular, multiply
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 
@@ -65,9 +65,7 @@ def _gain(g, k, Dk):
     L = multiply(g, add_real(k, Dk))
     for i in range(p):
         L[i, i] += 1.0
-    Z = np.zeros((p, p), np.complex128)
-    add_gram(Z, invert(L), 1.0)
-    return np.sqrt(largest_eigenvalue(Z))
+    return largest_singular(invert(L))
 
 
 @compiled

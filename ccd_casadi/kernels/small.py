@@ -31,17 +31,6 @@ def add_real(Z, D):
 
 
 @compiled
-def add_gram(Z, A, factor):
-    """Z ← Z + factor AᴴA."""
-    rows, n = A.shape
-    for k in range(rows):
-        for i in range(n):
-            a = factor * A[k, i].conjugate()
-            for j in range(n):
-                Z[i, j] += a * A[k, j]
-
-
-@compiled
 def invert(A):
     """A⁻¹ by Gauss-Jordan elimination with row exchanges; infinite where A is singular."""
     n = A.shape[0]
@@ -73,43 +62,6 @@ def invert(A):
                     M[i, j] -= factor * M[k, j]
                     X[i, j] -= factor * X[k, j]
     return X
-
-
-@compiled
-def largest_eigenvalue(Z):
-    """The largest eigenvalue of a Hermitian matrix, by Jacobi rotations; Z is overwritten."""
-    n = Z.shape[0]
-    for _ in range(30):
-        off, size = 0.0, 0.0
-        for i in range(n):
-            size += Z[i, i].real ** 2
-            for j in range(i):
-                off += Z[i, j].real ** 2 + Z[i, j].imag ** 2
-        # the diagonal's error is second order in what is left beside it
-        if not off > 1e-18 * size:
-            break
-        for i in range(n - 1):
-            for j in range(i + 1, n):
-                h = abs(Z[i, j])
-                if h == 0.0:
-                    continue
-                phase = Z[i, j] / h
-                ratio = (Z[j, j].real - Z[i, i].real) / (2.0 * h)
-                t = 1.0 / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
-                if ratio < 0.0:
-                    t = -t
-                c = 1.0 / np.sqrt(t * t + 1.0)
-                s = t * c * phase
-                for k in range(n):
-                    a, b = Z[k, i], Z[k, j]
-                    Z[k, i], Z[k, j] = c * a - s.conjugate() * b, s * a + c * b
-                for k in range(n):
-                    a, b = Z[i, k], Z[j, k]
-                    Z[i, k], Z[j, k] = c * a - s * b, s.conjugate() * a + c * b
-    best = Z[0, 0].real
-    for i in range(1, n):
-        best = max(best, Z[i, i].real)
-    return best
 
 
 @compiled
@@ -172,6 +124,14 @@ def singular(M, rows, columns, V, sigma, vectors):
             if vectors:
                 for k in range(columns):
                     V[k, i], V[k, best] = V[k, best], V[k, i]
+
+
+@compiled
+def largest_singular(M):
+    """σ_max of a matrix, which is overwritten."""
+    sigma = np.empty(M.shape[1])
+    singular(M, M.shape[0], M.shape[1], M, sigma, False)
+    return sigma[0]
 
 
 @compiled

@@ -4,7 +4,6 @@ import numpy as np
 
 from ccd_casadi.kernels.balance import balancing, in_coordinates, rounding_noise
 from ccd_casadi.kernels.blocks import add, symmetric_part, transposed
-from ccd_casadi.kernels.bound_peak import bound_error
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, innovations_plant
 from ccd_casadi.kernels.figures import Code, Figure
@@ -62,9 +61,8 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
 def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
     gp = generalized_plant(A, B, C, w)
     H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
-    bound, at = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
-    row, Ak, Bk, Ck = _search_and_control(gp, H0, bound, backoff, guess, NOISE)
-    return row, Ak, Bk, Ck, at
+    bound = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[0]
+    return _search_and_control(gp, H0, bound, backoff, guess, NOISE)
 
 
 # What follows is plain NumPy: few designs come to it.
@@ -86,7 +84,7 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
             none = np.full((1, 1), np.nan)
             return row, none, none, none
     if balanced:
-        gp, bound, at = posed
+        gp, bound = posed
         gp, H0, τ = _balanced(gp, bound)
         with np.errstate(all="ignore"):  # an undefined number is seen in the result
             noise = rounding_noise(H0)
@@ -94,27 +92,26 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
             K = _in_own_coordinates(*K, τ)
     else:
         if delta:
-            gp, bound, at = posed
+            gp, bound = posed
             row, *K = _search_and_control(gp, _hamiltonian(gp), bound, backoff, guess, NOISE)
         else:
-            row, *K, at = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
+            row, *K = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
         closed = row[Figure.CODE] != Code.GAMMA_NOT_CONVERGED
         if closed and ENOUGH < row[Figure.GAMMA_ERROR] < np.inf:
-            gp, bound, _ = posed or _posed(A, B, C, w, grid, sigma, delta)
+            gp, bound = posed or _posed(A, B, C, w, grid, sigma, delta)
             row, *K = _with_a_better_optimum(row, K, gp, bound, backoff)
-    if row[Figure.LIMITED_BY_BOUND] and not delta:
-        row[Figure.GAMMA_ERROR] += bound_error(A, B, C, w, at)
     return row, *K
 
 
 def _posed(A, B, C, w, grid, sigma, delta):
-    """The generalized plant, γ_jω and where it is; None where the filter has no solution."""
+    """The generalized plant and γ_jω; None where the filter has no solution."""
     if delta == 0.0:
-        return generalized_plant(A, B, C, w), *gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+        bound = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[0]
+        return generalized_plant(A, B, C, w), bound
     Y, ok = filter_solution(A, B, C, delta)
     if not ok:
         return None
-    return innovations_plant(A, B, C, w, Y), *disturbance_bound(A, B, C, w, delta, grid)[:2]
+    return innovations_plant(A, B, C, w, Y), disturbance_bound(A, B, C, w, delta, grid)[0]
 
 
 def _hamiltonian(gp):

@@ -15,7 +15,8 @@ from ccd_casadi.support.arrays import Array
 
 KEPT = 1e-7  # by how much an answer may miss its rows
 INSIDE = 1e-6  # and its bounds, to which it can be moved
-CURVED, SLACK = 1e-8, 1e-4  # of a step in its own units: its answer is then one point
+CURVED = 1e-8  # of a step in its own units: its answer is then one point
+SLACK = 1e-3  # of the penalty: σ's curvature; with less DAQP begins so far out that it cycles
 UNBOUNDED = 1e30  # what DAQP takes for infinite
 QUIET = ("error_on_fail", "print_iter", "print_header", "print_info")
 TOLERANCES = {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}
@@ -76,7 +77,8 @@ def solve_elastic(
     A = np.column_stack([slopes, -elastic])
     hessian = np.zeros((n + 1, n + 1))
     hessian[:n, :n] = radius / unit * H
-    hessian[range(n + 1), range(n + 1)] += np.append(np.full(n, CURVED), CURVED if free else SLACK)
+    hessian[range(n), range(n)] += CURVED
+    hessian[n, n] = CURVED if free else SLACK * penalty / unit
     ends = np.append(low / radius, -np.inf if free else 0.0), np.append(high / radius, np.inf)
     cost, upper, held = np.append(c, penalty) / unit, -value / radius, np.arange(m) < AT_FIRST
     while True:

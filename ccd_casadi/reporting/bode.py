@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccd_casadi.analysis.loop_view import LoopView, phase_deg
-from ccd_casadi.deployment.channels import Channel
-from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel, Table
+from ccd_casadi.deployment.channels import LoopChannel
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY
 from ccd_casadi.reporting.loops import bandwidth_level, margin_words, of_plants, over_hz
 from ccd_casadi.reporting.nyquist import loci_of
-from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number, shown
+from ccd_casadi.support.units import HZ, number, with_unit
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
@@ -22,7 +21,7 @@ TURNS = np.arange(-1980.0, 1981.0, 360.0)  # phases of -1
 Parts = Mapping[str, tuple[np.ndarray, ...]]  # g, k and their product of a channel, by its name
 
 
-def bode(loop: LoopView, channels: Sequence[Channel] = ()) -> Figure:
+def bode(loop: LoopView, channels: Sequence[LoopChannel] = ()) -> Figure:
     """The Bode plot of one design with its words and numbers.
 
     L, then plant and controller, of every one of several scalar channels; of a loop that does not
@@ -39,7 +38,7 @@ def bode(loop: LoopView, channels: Sequence[Channel] = ()) -> Figure:
         ))  # fmt: skip
     title = "Bode plots of the loop, the plant and the controller"
     lines = Lines(tuple(rows), title, (3.0, 2.9, 2.3)[: len(rows)])
-    return Figure(lines, _caption(loop, channels), (_table(loop),))
+    return Figure(lines, _caption(loop, channels))
 
 
 def loop_panels(
@@ -135,7 +134,7 @@ def _curves(loop: LoopView, values: Mapping[str, Array]) -> list[Curve]:
     ]
 
 
-def scalar_parts(loop: LoopView, channels: Sequence[Channel]) -> Parts:
+def scalar_parts(loop: LoopView, channels: Sequence[LoopChannel]) -> Parts:
     """g, k and their product of every scalar channel, by a name that says which outputs it moves.
 
     Empty where the loop is no scalar one and does not fall apart into such channels.
@@ -172,7 +171,7 @@ def _marks(loop: LoopView, gains: Array) -> list[Mark]:
     return found
 
 
-def _caption(loop: LoopView, channels: Sequence[Channel]) -> str:
+def _caption(loop: LoopView, channels: Sequence[LoopChannel]) -> str:
     scalar = loop.plant.shape[1:] == (1, 1)
     what = "" if scalar else (
         "Every channel by itself; the signs are those of the outputs that it moves together. "
@@ -188,34 +187,14 @@ def _caption(loop: LoopView, channels: Sequence[Channel]) -> str:
     K = np.linalg.norm(loop.controller, 2, axis=(1, 2))
     i = int(K.argmax())
     words += (
-        f" The controller's gain is {shown(gain, 'N/m')} at {number(float(loop.hz[0]), 3)} Hz and "
-        f"at most {shown(float(K[i]), 'N/m')}, at {number(float(loop.hz[i]), 4)} Hz."
+        f" The controller's gain is {with_unit(gain, 'N/m')} at {number(float(loop.hz[0]), 3)} Hz "
+        f"and at most {with_unit(float(K[i]), 'N/m')}, at {number(float(loop.hz[i]), 4)} Hz."
     )
     below = [hz for hz in loop.antiresonances_hz if hz > loop.bandwidth_hz]
     if below:
         ratio = loop.bandwidth_hz / below[0]
         words += f" The bandwidth is {100.0 * ratio:.0f} % of the first anti-resonance above it."
     return words
-
-
-def _table(loop: LoopView) -> Table:
-    """Magnitudes, and phases of a scalar loop, at some frequencies."""
-    special = [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz]
-    if loop.plant.shape[1:] == (1, 1):
-        head: tuple[str, ...] = (
-            "Hz", "|L|", "phase deg", "|G| m/N", "phase deg", "|K| N/m", "phase deg"
-        )  # fmt: skip
-        responses = (part[:, 0, 0] for part in (loop.open[0], loop.plant, loop.controller))
-        columns = [column for part in responses for column in (np.abs(part), phase_deg(part))]
-    else:
-        G, K = _singular_values(loop.plant), _singular_values(loop.controller)
-        head = (
-            "Hz",
-            *(f"σ{i + 1}(G) m/N" for i in range(G.shape[1])),
-            *(f"σ{i + 1}(K) N/m" for i in range(K.shape[1])),
-        )
-        columns = [*G.T, *K.T]
-    return over_frequency(head, loop.hz, *columns, special=special)
 
 
 def _singular_values(response: NDArray[np.complex128]) -> Array:

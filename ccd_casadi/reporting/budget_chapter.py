@@ -10,7 +10,6 @@ from ccd_casadi.drawing.svg import BLACK, CYCLE
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.reporting.tables import ROWS, over_frequency
 from ccd_casadi.support.units import number
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
@@ -90,13 +89,9 @@ def _figure(model: BudgetFigures) -> Figure:
     panel = Panel("frequency (Hz)", "RMS error up to it (µm)", (*curves, total), log_x=True,
                   log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top))  # fmt: skip
     lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
-    grid = np.geomspace(*x, ROWS)
-    columns = (1e6 * np.sqrt(np.interp(grid, hz, part)) for part in (*parts, whole))
-    head = ("Hz", *(f"{item.source.name} µm" for item in shown), "together µm")
-    table = over_frequency(head, grid, *columns)
     words = (
         "Dynamic error budget: the RMS error that has come together up to each frequency, by "
         "source; the squares of the curves add up to the black one's. Where a curve rises is "
         "where its source is felt."
     )
-    return Figure(lines, words, (table,))
+    return Figure(lines, words)

@@ -1,13 +1,14 @@
 """A design in words and numbers: the conclusion, the table of the design, and what binds."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.support.units import HZ, counted, number, shown_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, number
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
@@ -53,6 +54,13 @@ def _prediction(result: Mapping[str, Any]) -> str:
     return f" The prediction errs by {number(result['verification_error'], 2)} of the truth."
 
 
+def run_name(place: Path) -> str:
+    """Of a run by its folder or its case; what `ccd new` makes is named by the folder around it."""
+    place = place.resolve()
+    names = (place.name.removesuffix(".toml"), *(parent.name for parent in place.parents))
+    return next((name for name in names if name != "case"), "case")
+
+
 def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:
     """The hardware cost with its unit, where the case gives one."""
     return f"{number(result['hardware_cost'], digits)} {result.get('cost_unit', '')}".strip()
@@ -66,7 +74,7 @@ def cost_axis(problem: CoDesignProblem) -> str:
 def theta_axes(problem: CoDesignProblem) -> list[tuple[str, str, float]]:
     """Name, unit for the eye and the factor to it of every parameter."""
     ends = zip(problem.names, problem.units, problem.upper, strict=True)
-    return [(name, *shown_unit(unit, upper)) for name, unit, upper in ends]
+    return [(name, *display_unit(unit, upper)) for name, unit, upper in ends]
 
 
 def theta_words(result: Mapping[str, Any]) -> str:
@@ -74,10 +82,10 @@ def theta_words(result: Mapping[str, Any]) -> str:
     units = result.get("units", {})
     words = []
     for name, value in {**result["theta"], **result.get("fixed", {})}.items():
-        unit, factor = shown_unit(units.get(name, ""), value)
+        unit, factor = display_unit(units.get(name, ""), value)
         words.append(f"{name} = {number(factor * value)} {unit}".strip())
     for name, (low, high) in result.get("varies", {}).items():
-        unit, factor = shown_unit(units.get(name, ""), high)
+        unit, factor = display_unit(units.get(name, ""), high)
         words.append(f"every {name} from {factor * low:.5g} to {factor * high:.5g} {unit}".strip())
     return ", ".join(words)
 
@@ -93,11 +101,11 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
         rows.append((name, unit or "–", *numbers, place))
     lists = result.get("listed", {}).get("values", {})
     for name, value in result.get("fixed", {}).items():
-        unit, factor = shown_unit(problem.parameter_units[name], value)
+        unit, factor = display_unit(problem.parameter_units[name], value)
         place = f"one of {len(lists[name])}" if name in lists else "fixed"
         rows.append((name, unit or "–", factor * value, "–", "–", "–", place))
     for name, ends in result.get("varies", {}).items():
-        unit, factor = shown_unit(problem.parameter_units[name], ends[1])
+        unit, factor = display_unit(problem.parameter_units[name], ends[1])
         low, high = (factor * end for end in ends)
         rows.append((name, unit or "–", "–", low, high, "–", "varies"))
     head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")
@@ -320,4 +328,4 @@ def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
         step = number(0.01 * factor * (problem.upper[i] - problem.lower[i]), 3)
         words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
         return words, 0.01, f"moving the bound outwards by {step} {unit}".rstrip()
-    return f"The constraint {name} binds", 1.0, "loosening it by one unit"
+    return f"The constraint “{name}” binds", 1.0, "loosening it by one unit"

@@ -6,13 +6,13 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.drawing.content import Chapter, Figure, Lines, Modes, Picture, Place, Table
+from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.loops import S_panel, margin_words, marked
+from ccd_casadi.reporting.loops import S_panel, margin_words
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
-from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.units import counted, number
 
 HEIGHT = 3.0  # inches of a row
@@ -40,13 +40,8 @@ def glance(
         f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
         f"from -1 in the Nyquist plot.{margin_words(view)} {move.caption}"
     )
-    head, columns = ["Hz", f"largest {view.named('S')}"], [view.sizes[0].max(axis=0)]
-    if view.scalar:
-        L = view.open[0, :, 0, 0]
-        head, columns = [*head, "Re L", "Im L"], [*columns, L.real, L.imag]
-    table = over_frequency(head, view.hz, *columns, special=marked(view))
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
-    return Chapter("At a glance", (Figure(lines, words, (table, *move.tables)),))
+    return Chapter("At a glance", (Figure(lines, words, (*tables_of(lines), move.tables[0])),))
 
 
 def loci(view: LoopView) -> list[np.ndarray]:

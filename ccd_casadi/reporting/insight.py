@@ -9,35 +9,23 @@ from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.drawing.content import (
-    Block,
-    Bullets,
-    Chapter,
-    Curve,
-    Figure,
-    Lines,
-    Mark,
-    Page,
-    Panel,
-    Table,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_axes, theta_words
+from ccd_casadi.reporting.facts import cost_axis, cost_words, run_name, theta_axes, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, display_unit, number
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
 
 
-def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: str = "") -> Page:
+def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: str = "") -> c.Page:
     """insight.html; `index`: the page that it links as that of the whole run."""
     problem = run.problem
     bandwidth_hz = bandwidth_of(run) / HZ
@@ -46,7 +34,7 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     verified = sum(point.verified for point in front.points)
     whole = verified == len(front.points)
     head = head_of(
-        f"Insight: {run.case.path.parent.name}",
+        f"Insight: {run_name(run.folder)}",
         whole,
         "verified" if whole else "not all verified",
         f"{verified} of {len(front.points)} points of the front",
@@ -58,19 +46,19 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     v = problem.figure
     own = v.factor * float(run.result.get(f"{v.entry}_of_set", bandwidth_of(run)))
     drawn = front_figure(problem, front, (cost, own, "this run's design"))
-    answers = [Words(text) for text in response_sentences(responses)]
+    answers = [c.Words(text) for text in response_sentences(responses)]
     chapters = (
-        Chapter(f"Weight against {v.words}", (drawn, *front_walk(run, front))),
-        Chapter(
+        c.Chapter(f"Weight against {v.words}", (drawn, *front_walk(run, front))),
+        c.Chapter(
             "What each parameter of the case would change",
             (*answers, table_responses(problem, responses)),
         ),
-        Chapter("What limits the bandwidth", _limits(run, rule)),
+        c.Chapter("What limits the bandwidth", _limits(run, rule)),
     )
-    return Page(head, chapters, index)
+    return c.Page(head, chapters, index)
 
 
-def _limits(run: FinishedRun, rule: str) -> tuple[Block, ...]:
+def _limits(run: FinishedRun, rule: str) -> tuple[c.Block, ...]:
     """The shares of γ; of a fixed structure, which has no γ, the bounds that hold it."""
     if run.result.get("gamma") is None:
         held = binding_words(run.problem, run.result)
@@ -78,13 +66,13 @@ def _limits(run: FinishedRun, rule: str) -> tuple[Block, ...]:
             "A fixed structure has no γ, and no weights' frequencies to move: what holds ω_b are "
             "the bounds above."
         )
-        return Bullets(tuple(held)), Words(without), Words(rule)
+        return c.Bullets(tuple(held)), c.Words(without), c.Words(rule)
     return limit_blocks(run_view(run), rule)
 
 
 def front_figure(
     problem: CoDesignProblem, front: Front, design: tuple[float, float, str]
-) -> Figure:
+) -> c.Figure:
     """What J counts over hardware cost, and where each θ lies in its bounds along the curve.
 
     `design` is (f, v in its shown unit, words) of the run's own optimum.
@@ -94,23 +82,25 @@ def front_figure(
     values = v.factor * np.array([point.value for point in front.points])
     good = np.array([point.verified for point in front.points])
     curves = [
-        Curve(cost, values, "", GREY, marker="."),
-        Curve(cost[good], values[good], "the best design for some weights", line="", marker="o"),
+        c.Curve(cost, values, "", GREY, marker="."),
+        c.Curve(cost[good], values[good], "the best design for some weights", line="", marker="o"),
     ]
     if not good.all():
-        curves.append(Curve(cost[~good], values[~good], "not stationary", CYCLE[1], "", "x"))
-    mark = Mark(design[0], design[1], design[2], "+", offset=(8.0, 3.0))
-    top = Panel("", f"{v.words} {v.symbol} ({v.unit})", tuple(curves), marks=(mark,))
+        curves.append(c.Curve(cost[~good], values[~good], "not stationary", CYCLE[1], "", "x"))
+    mark = c.Mark(design[0], design[1], design[2], "+", offset=(8.0, 3.0))
+    top = c.Panel("", f"{v.words} {v.symbol} ({v.unit})", tuple(curves), marks=(mark,))
     low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
     theta = (np.array([point.theta for point in front.points]) - low) / width
     parts = tuple(
-        Curve(cost, theta[:, i], name, CYCLE[i % len(CYCLE)], marker=".")
+        c.Curve(cost, theta[:, i], name, CYCLE[i % len(CYCLE)], marker=".")
         for i, name in enumerate(problem.names)
     )
-    bottom = Panel(cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
+    bottom = c.Panel(
+        cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05)
+    )
     title = f"Hardware cost against {v.words} as the weights of J change, and the hardware there"
-    lines = Lines(((top,), (bottom,)), title, (3.3, 2.8))
-    return Figure(lines, _caption(front), (_table(problem, front),))
+    lines = c.Lines(((top,), (bottom,)), title, (3.3, 2.8))
+    return c.Figure(lines, _caption(front), (_table(problem, front),))
 
 
 def _caption(front: Front) -> str:
@@ -151,7 +141,7 @@ def front_answer(problem: CoDesignProblem, front: Front) -> str:
     )
 
 
-def _table(problem: CoDesignProblem, front: Front) -> Table:
+def _table(problem: CoDesignProblem, front: Front) -> c.Table:
     """One row a point."""
     axes, v = theta_axes(problem), problem.figure
     rows = tuple(
@@ -162,10 +152,10 @@ def _table(problem: CoDesignProblem, front: Front) -> Table:
     )  # fmt: skip
     heads = (axis_label(name, unit) for name, unit, _ in axes)
     head = ("f", f"{v.symbol} ({v.unit})", *heads, "what binds", "status")
-    return Table(head, rows)
+    return c.Table(head, rows)
 
 
-def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
+def table_responses(problem: CoDesignProblem, found: PostOptimal) -> c.Table:
     """The parameters that the optimum answers to, per unit, in the units of the case file."""
     rows = []
     swept = any(item.ln_omega for item in found.responses)
@@ -197,7 +187,7 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
         )
     moving = "how θ, ln ω_S and ln ω_T move per unit" if swept else "how θ moves per unit"
     head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", moving)
-    return Table(head, tuple(rows))
+    return c.Table(head, tuple(rows))
 
 
 def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float, float, str]:
@@ -206,7 +196,7 @@ def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float
     if variable in ("omega_S", "omega_T"):
         return name.replace("omega", "ω"), value / HZ, 1.0 / HZ, "Hz"
     if variable in problem.names:
-        unit, factor = shown_unit(problem.units[problem.names.index(variable)], value)
+        unit, factor = display_unit(problem.units[problem.names.index(variable)], value)
         return name, factor * value, factor, unit
     return name, value, 1.0, ""
 

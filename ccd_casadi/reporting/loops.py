@@ -8,11 +8,10 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import NAMES, LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, Mark, Panel, Table
+from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.synthesis import Design, synthesise
@@ -143,21 +142,24 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
     return over_hz(label, curves, ends, levels=tuple(bare), **{**found, **more})
 
 
-def figure_gains(views: Sequence[LoopView], *, bounds: bool = True) -> Lines:
-    """S over the full width, KS and T below it; of one design GS where it is bounded."""
+def figure_gains(
+    views: Sequence[LoopView], *, bounds: bool = True, compliance: bool = False
+) -> Lines:
+    """S over the full width, KS and T below it; of one design GS where it is bounded, or asked."""
     S, *others = gain_panels(views, bounds=bounds)
-    most = views[0].bounded.compliance_max
-    more = [] if len(views) > 1 or most is None else [(compliance_panel(views[0], most),)]
+    bounded = len(views) == 1 and views[0].bounded.compliance_max is not None
+    more = [(compliance_panel(views[0]),)] if bounded or compliance else []
     title = "Largest singular values of S, KS and T over frequency, with their bounds"
     return Lines(((S,), tuple(others), *more), title, (3.3, *[2.7] * (1 + len(more))))
 
 
-def compliance_panel(view: LoopView, most: float) -> Panel:
-    """|GS| of the model in a band of all plants, with its bound in m/N."""
+def compliance_panel(view: LoopView) -> Panel:
+    """|GS| of the model in a band of all plants, with its bound in m/N where there is one."""
     curves, bands = of_plants(view.hz, 1e6 * view.sizes[3])
-    level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
+    most = 1e6 * (view.bounded.compliance_max or 0.0)
+    levels = (Level(most, f"compliance_max {most:g} µm/N", colour=GREY),) if most else ()
     label = f"{view.named('GS')} (µm/N)"
-    return over_hz(label, curves, view.ends, levels=(level,), bands=bands)
+    return over_hz(label, curves, view.ends, levels=levels, bands=bands)
 
 
 def margin_words(view: LoopView) -> str:
@@ -210,8 +212,8 @@ def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:
 
 
 def gains(view: LoopView) -> Figure:
-    """S, KS and T of one design with their words and numbers."""
-    return Figure(figure_gains([view]), _caption(view), (table_gains(view),))
+    """S, KS and T of one design with their words."""
+    return Figure(figure_gains([view]), _caption(view))
 
 
 def _caption(view: LoopView) -> str:
@@ -243,22 +245,3 @@ def _caption(view: LoopView) -> str:
     ]
     closest = f" {'; '.join(near)}." if near else ""
     return f"{band}{first}{words}{closest} Shaded: beyond a bound."
-
-
-def table_gains(view: LoopView) -> Table:
-    """Gains and bounds at some frequencies, the marked ones among them."""
-    if len(view.open) > 1:
-        S, KS, T = view.sizes[:3]
-        head: tuple[str, ...] = ("Hz", f"{view.named('S')} model", f"{view.named('S')} least",
-                                 f"{view.named('S')} largest", f"{view.named('KS')} largest N/m",
-                                 f"{view.named('T')} largest")  # fmt: skip
-        columns = [S[0], S.min(axis=0), *(of.max(axis=0) for of in (S, KS, T))]
-    else:
-        head = ("Hz", "|S|", "bound", "|KS| N/m", "bound N/m", "|T|", "bound")
-        columns = [c for pair in zip(view.gains, view.bounds, strict=True) for c in pair]
-    return over_frequency(head, view.hz, *columns, special=marked(view))
-
-
-def marked(view: LoopView) -> list[float]:
-    """Frequencies in Hz that a table of the loop does not leave out."""
-    return [view.bandwidth_hz, *(hz for hz, _ in view.peaks)]

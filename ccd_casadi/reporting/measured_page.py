@@ -8,17 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
-from ccd_casadi.drawing.content import (
-    Chapter,
-    Curve,
-    Facts,
-    Figure,
-    Head,
-    Level,
-    Lines,
-    Page,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.fixed_structure.measured_loop import between, controller_response
 from ccd_casadi.lti.closed_loop import largest, open_alone, sensitivity
@@ -27,14 +17,13 @@ from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.structured_page import controller_blocks
-from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.reporting.verdict import advice
-from ccd_casadi.support.units import HZ, number, shown
+from ccd_casadi.support.units import HZ, number, with_unit
 
 HEIGHT = 3.0  # inches of a row
 
 
-def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> Page:
+def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> c.Page:
     """report.html of a stable design; `answer` is what `inner` prints of it."""
     good = answer["status"] == "verified"
     lines = f"{len(case.responses[0].hz)} lines of {case.file}"
@@ -47,21 +36,24 @@ def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[st
         f"A controller of order {answer['controller']['order']} with a bandwidth of "
         f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}{basis}."
     )
-    head = Head(
+    head = c.Head(
         f"Controller on {case.file}", "good" if good else "bad",
         "verified" if good else "not verified", answer["reason"], f"{case.path.name} · {lines}",
         lead, decision=advice(answer),
     )  # fmt: skip
-    figures = Facts(tuple(_facts(case, answer))), Words(f"What this rests on: {answer['words']}.")
-    chapters = (
-        Chapter("The loop on the lines", (_loop(case, controller, answer),)),
-        Chapter("The figures", figures),
-        Chapter("The controller", controller_blocks(answer)),
+    figures = (
+        c.Facts(tuple(_facts(case, answer))),
+        c.Words(f"What this rests on: {answer['words']}."),
     )
-    return Page(head, chapters, index="")
+    chapters = (
+        c.Chapter("The loop on the lines", (_loop(case, controller, answer),)),
+        c.Chapter("The figures", figures),
+        c.Chapter("The controller", controller_blocks(answer)),
+    )
+    return c.Page(head, chapters, index="")
 
 
-def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> Figure:
+def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> c.Figure:
     """|S| and the Nyquist plot, |G| and |L|, |KS| and |T|: values at the lines, joined straight.
 
     Of several channels the largest singular values, and the loops opened one at a time.
@@ -73,14 +65,14 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
         S = sensitivity(joint)
         if not one.modelled:  # of a model ‖S‖∞ is known
             reach = between(one, joint, K)  # drawn at the middle of two lines
-            curves["at most"].append(Curve(np.sqrt(hz[1:] * hz[:-1]),
-                                           np.where(reach < np.inf, reach, np.nan), colour=GREY,
-                                           width=0.9))  # fmt: skip
+            curves["at most"].append(c.Curve(np.sqrt(hz[1:] * hz[:-1]),
+                                           np.where(reach < np.inf, reach, np.nan),
+                                           "between lines, at most", GREY, width=0.9))  # fmt: skip
         gains = {"G": one.matrix, "S": S, "KS": K @ S, "T": joint @ S}
         for name, M in gains.items():
-            curves[name].append(Curve(hz, largest(M), colour=colour))
+            curves[name].append(c.Curve(hz, largest(M), colour=colour))
         loops = [open_alone(joint, i) for i in range(joint.shape[1])]
-        curves["L"] += [Curve(hz, np.abs(L), colour=colour) for L in loops]
+        curves["L"] += [c.Curve(hz, np.abs(L), colour=colour) for L in loops]
         loci += loops
     hz, size = curves["S"][0].x, curves["S"][0].y
     ends = (float(hz[0]), float(hz[-1]))
@@ -90,11 +82,11 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
     rows = (
         (sensitivity_panel(
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",
-            y_range=(0.5 * float(size.min()), top),
+            legend=None, y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
          nyquist_panel(hz, shown, bounds.S_max, HEIGHT, ("the first", "the others"))),
         (over_hz("|G| (m/N)", curves["G"], ends),
-         over_hz("|L| (–)", curves["L"], ends, levels=(Level(1.0, "1"), at))),
+         over_hz("|L| (–)", curves["L"], ends, levels=(c.Level(1.0, "1"), at))),
         (over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),
          over_hz("|T| (–)", curves["T"], ends, levels=(at,))),
     )  # fmt: skip
@@ -104,14 +96,8 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
             " Grey: what |S| may reach between two lines, if GK bends there as around them. A "
             "resonance that fits between two lines is not seen."
         )
-    table = over_frequency(
-        ("Hz", "|G| m/N", "|S|", "Re L", "Im L", "|KS| N/m", "|T|"),
-        hz, curves["G"][0].y, size, loci[0].real, loci[0].imag, curves["KS"][0].y,
-        curves["T"][0].y,
-        special=[answer["bandwidth_hz"], answer["sensitivity_peak_hz"]],
-    )  # fmt: skip
-    lines = Lines(rows, "The loop on the measured lines", (HEIGHT, 2.6, 2.6))
-    return Figure(lines, words, (table,))
+    lines = c.Lines(rows, "The loop on the measured lines", (HEIGHT, 2.6, 2.6))
+    return c.Figure(lines, words)
 
 
 def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
@@ -129,7 +115,7 @@ def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
          f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
         ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} µm/N", "the largest |GS|"),
         *loop_facts(answer),
-        ("Largest |KS|", shown(answer["KS_max"], "N/m", 4), ""),
+        ("Largest |KS|", with_unit(answer["KS_max"], "N/m", 4), ""),
     ]  # fmt: skip
     names = {"S_max": "S_max", "S_low": "S_low", "KS": "weighted KS", "T": "weighted T",
              "GS": "compliance_max"}  # fmt: skip

@@ -7,34 +7,23 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis import loop_figures
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.analysis.motor import UNLIMITED, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
-from ccd_casadi.drawing.content import (
-    Band,
-    Chapter,
-    Curve,
-    Figure,
-    Level,
-    Lines,
-    Panel,
-    Table,
-    Words,
-)
+from ccd_casadi.drawing import content as c
+from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
 from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import of_plants
-from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import counted, number, shown, shown_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
 
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
@@ -52,41 +41,39 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
 }
 
 
-def move_figure(
-    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
-    loops: Sequence[Loop], bandwidth_hz: float,
-) -> Figure:  # fmt: skip
-    """The case's move, or the default one of `robustness`, on the plants of `loops`, their rigid
+def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
+    """The case's move, or the default one of `robustness`, on all plants of a design, their rigid
     bodies free: without and with feedforward."""
+    loops = view.loops
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
         profile, window = motion.cycle.profile, motion.motion.window
-        name, other = "with feedforward up to snap", "the move of [move]"
+        name, other = "with feedforward up to snap", ", that of [move]"
         ahead: Array | None = motion.forward
     else:
         profile, window = setpoint(LIMITS), WINDOW
         modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
-        other = "for other moves [move] of the case, or the options of robustness"
+        other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
-    free = free_loops(problem, theta, controller)
+    free = free_loops(problem, theta, view.loop.controller)
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
-                  bandwidth_hz=bandwidth_hz)  # fmt: skip
+                  bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
-    several = " on every plant of the set (band; words and numbers are of the worst)"
+    several = " The band spans every plant of the set, and the numbers are of the worst."
     words = (
-        f"The move: {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
-        f"{number(1e3 * end, 4)} ms"
-        f"{several if len(loops) > 1 else ''}, "
-        f"{'without the suspension' if model.free else 'on the soft suspension'} "
-        f"({'continuous loop' if loops[0].sampling is None else 'hold and delay exact'}; {other})."
+        f"The move is {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
+        f"{number(1e3 * end, 4)} ms{other}, "
+        f"{'with rigid bodies free' if model.free else 'on the soft suspension'} and "
+        f"{'without hold and delay' if loops[0].sampling is None else 'hold and delay exact'}."
+        f"{several if len(loops) > 1 else ''}"
     )
     return ways_figure(dict(zip(ways, found, strict=True)), words)
 
 
 def cycle_chapter(
     problem: CoDesignProblem, theta: Sequence[float], result: Mapping[str, Any]
-) -> list[Chapter]:
+) -> list[c.Chapter]:
     """Force and heat over a cycle of the case's move, what limits it, and its time over the heat
     that is allowed; nothing for a case without a motor."""
     own, told = problem.source.motion, result.get("move")
@@ -98,20 +85,20 @@ def cycle_chapter(
     time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
     force = np.outer(profile.at(time)[2], forces)
     heat = R / k**2 * (force**2).sum(axis=1)
-    end = Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
-    mean = Level(told["power"], "mean")
+    end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
+    mean = c.Level(told["power"], "mean")
     ms = 1e3 * time
     panels = [
-        Panel("time (ms)", "force of a motor (N)", (Curve(ms, force[:, 0]),), levels=(end,)),
-        Panel("time (ms)", "heat (W)", (Curve(ms, heat),), levels=(mean,)),
+        c.Panel("time (ms)", "force of a motor (N)", (c.Curve(ms, force[:, 0]),), levels=(end,)),
+        c.Panel("time (ms)", "heat (W)", (c.Curve(ms, heat),), levels=(mean,)),
     ]
     if not own.required:
         watts = told["power"] * np.linspace(0.1, 2.0, 39)
         limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
         times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
         late = 0.0 if settled is None else settled - profile.duration
-        curve = Curve(watts, 1e3 * (np.array(times) + late))
-        panels.append(Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
+        curve = c.Curve(watts, 1e3 * (np.array(times) + late))
+        panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
     share = f"{number(100.0 * told['heat_share'], 3)} % of the heat"
     if motor.peak_current[0] < UNLIMITED:
         share += f" and {number(100.0 * told['peak_share'], 3)} % of the peak force"
@@ -125,82 +112,72 @@ def cycle_chapter(
         f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
         f"{settling}."
     )
-    table = over_time(("ms", "N", "W"), ms, force[:, 0], heat)
-    lines = Lines((tuple(panels),), "A cycle of the motor", (3.0,))
-    return [Chapter("The motor", (Figure(lines, words, (table,)),))]
+    lines = c.Lines((tuple(panels),), "A cycle of the motor", (3.0,))
+    return [c.Chapter("The motor", (c.Figure(lines, words),))]
 
 
-def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
+def force_step(view: LoopView) -> c.Figure:
     """The position of every plant after a step of force at the actuator."""
+    loops = view.loops
     slow = min(float(-loop.poles.real.max()) for loop in loops)
-    times = np.geomspace(0.02 / (2.0 * np.pi * bandwidth_hz), SETTLED / slow, STEPS)
+    times = np.geomspace(0.02 / (HZ * view.bandwidth_hz), SETTLED / slow, STEPS)
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
     curves, bands = of_plants(1e3 * t, y)
-    panel = Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
-    head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
-    on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
-        "the stage, until it rests"
-    )  # fmt: skip
-    words = f"A force of 1 N at the actuator moves {on}."
-    lines = Lines(((panel,),), "A step of force", (3.2,))
-    return Figure(lines, words, (over_time(head, 1e3 * t, *_columns(y)),))
+    panel = c.Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
+    on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
+    words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
+    lines = c.Lines(((panel,),), "A step of force", (3.2,))
+    return c.Figure(lines, words)
 
 
-def _columns(values: Array) -> list[Array]:
-    found = [values[0]]
-    return [*found, values.min(axis=0), values.max(axis=0)] if len(values) > 1 else found
-
-
-def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
+def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    ways = {way.words: [way.move] for way in found.ways}
-    words = "The plant has its soft suspension, hold and delay are exact."
-    return ways_figure(ways, words), Words(_limit_words(found))
+    ways = {words: [move] for words, move in found.ways.items()}
+    words = "The plant has its soft suspension. Hold and delay are exact."
+    return ways_figure(ways, words), c.Words(_limit_words(found))
 
 
-def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> Figure:
+def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     """Error and first force of one move made in several ways, each on one plant or on several, the
     model first, and a table of the largest; `words` end the caption."""
     made = list(ways.values())
     first, until = made[0][0], max(shown_until(m) for each in made for m in each)
-    end = Level(1e3 * first.duration, "setpoint ends", vertical=True)
+    end = c.Level(1e3 * first.duration, "setpoint ends", vertical=True)
     peaks = [max(m.peak_error for m in each) for each in made]
     kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False)
             if way[2] < 1e3 * peaks[0]]  # fmt: skip
     top = max(peak for _, _, peak, _ in kept)
     time = np.linspace(0.0, until, DRAWN)
-    ms, numbers = 1e3 * time, {}
+    ms = 1e3 * time
     panels, force = [], []
     for large in (True, False):  # those that are flat beside the large ones by themselves
         same = [way for way in kept if (FLAT * way[2] > top) == large]
-        unit, scale = shown_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
+        unit, scale = display_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
         curves, bands = [], []
         for name, each, _, colour in same:
             error = scale * np.array([_over(time, e, _error(e)) for e in each])
-            curves.append(Curve(ms, error[0], name, colour))
-            force.append(Curve(ms, _over(time, each[0], each[0].force[:, 0]), "", colour))
-            numbers[f"{unit}, {name}"] = error[0]
+            curves.append(c.Curve(ms, error[0], name, colour))
+            force.append(c.Curve(ms, _over(time, each[0], each[0].force[:, 0]), "", colour))
             if len(each) > 1:
-                bands.append(Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
+                bands.append(c.Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
         if curves:
-            panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
+            panels.append(c.Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
                                 levels=(end,)))  # fmt: skip
             end = replace(end, text="")  # said once
     heights = (*[2.6] * len(panels), 2.2)
-    panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
-    lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
+    panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
+    lines = c.Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
     rows = tuple(
         (name, *(max(map(read, each)) for read in FIGURES.values())) for name, each in ways.items()
     )
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
-        f"{shown(first.window, 'm')}. {words}"
+        f"{with_unit(first.window, 'm')}. {words}"
     )
-    table = over_time(("ms", *numbers), ms, *numbers.values())
-    return Figure(lines, caption, (Table(("way", *FIGURES), rows), table))
+    return c.Figure(lines, caption, (c.Table(("way", *FIGURES), rows), *tables_of(lines)))
 
 
 def _over(time: Array, m: Move, values: Array) -> Array:
@@ -222,13 +199,13 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     when = "does not settle" if np.isinf(settled) else (
-        f"settled after {shown(settled, 's')}" if settled > 0.0 else "never out of its window"
+        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "never out of its window"
     )  # fmt: skip
-    words = f"{name}: {when}, error of at most {shown(peak, 'm')}"
+    words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, of {shown(float(after.max()), 'm')} after the figure's end"
+    return f"{words}, of {with_unit(float(after.max()), 'm')} after the figure's end"
 
 
 def _limit_words(found: OnHardware) -> str:
@@ -240,7 +217,7 @@ def _limit_words(found: OnHardware) -> str:
             "The unlimited move itself does not end in its window within the time watched: ask for "
             "more stiffness at low frequencies (compliance_max, S_low), or widen the window."
         )
-    peak = max(float(way.move.peak_force.max()) for way in found.ways[:2])
+    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
     if found.least_limit == 1.0:
         return (
             words + "Of the limits tried none below the peak force lets the move end in its window."

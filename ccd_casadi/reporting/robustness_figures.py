@@ -4,9 +4,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
-from ccd_casadi.drawing.svg import BLUE, CYCLE, GREY, ORANGE
-from ccd_casadi.reporting.loops import over_hz
-from ccd_casadi.reporting.tables import ROWS, over_frequency
+from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.robust.structured import StructuredBound
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
@@ -15,45 +13,18 @@ from ccd_casadi.support.units import HZ
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 
 
-def named(run: FinishedRun, name: str) -> str:
-    """`|S|` of a loop with one input and output, `σ_max(S)` of others."""
-    scalar = run.plant.B.shape[1] == run.plant.C.shape[0] == 1
-    return f"|{name}|" if scalar else f"σ_max({name})"
-
-
-def gains(run: FinishedRun, found: Study, caption: str) -> Figure:
-    """S and T in one panel, GS and KS in one each; some frequencies, the peaks among them."""
-    hz, shown = found.hz, found.gains * np.array([[1.0], [1.0], [1e6], [1.0]])
-    ends = (float(hz[0]), float(hz[-1]))
-
-    def panel(label: str, *curves: tuple[int, str]) -> Panel:
-        drawn = tuple(Curve(hz, shown[i], name, CYCLE[k]) for k, (i, name) in enumerate(curves))
-        return over_hz(label, drawn, ends)
-
-    rows = (
-        (panel(f"{named(run, 'S')}, {named(run, 'T')} (–)", (0, "S"), (1, "T")),),
-        (panel(f"{named(run, 'GS')} (µm/N)", (2, "")), panel(f"{named(run, 'KS')} (N/m)", (3, ""))),
-    )
-    special = hz[found.gains.argmax(axis=1)].tolist()
-    table = over_frequency(("Hz", "S", "T", "GS µm/N", "KS N/m"), hz, *shown, special=special)
-    return Figure(Lines(rows, "S, T, GS and KS over frequency"), caption, (table,))
-
-
 def perturbed(run: FinishedRun, found: Study, caption: str) -> Figure:
     """Peak and bandwidth over the shift, and over the damping."""
     S_max = run.problem.inner.S_max
-    rows, tables = [], []
-    for line, name, label, factor in (
-        (found.shift, "shift", "resonance shift (%)", 100.0),
-        (found.damping, "damping ×", "damping × (–)", 1.0),
+    rows = []
+    for line, label, factor in (
+        (found.shift, "resonance shift (%)", 100.0),
+        (found.damping, "damping × (–)", 1.0),
     ):
         judged = line.judged
         x = np.array([item.place[0] for item in judged])
         peak = np.array([item.peak if item.stable else np.nan for item in judged])
         bandwidth = np.array([item.bandwidth / HZ for item in judged])
-        stable = ("yes" if item.stable else "NO" for item in judged)
-        peaks = (item.peak for item in judged)
-        tables.append(Table.of((name, "stable", "ω_b Hz", "‖S‖∞"), x, stable, bandwidth, peaks))
         # the axis shows what matters about S_max; a loop near instability has any peak
         top = min(float(np.nanmax(peak)) * 1.05, SHOWN_PEAK * S_max)
         limit = (Level(S_max, f"S_max {S_max:g}", colour=GREY),)
@@ -67,8 +38,7 @@ def perturbed(run: FinishedRun, found: Study, caption: str) -> Figure:
                   y_range=span),
             Panel(label, "ω_b (Hz)", (faster,), x_range=ends),
         ))  # fmt: skip
-    return Figure(Lines(tuple(rows), "Peak of S and bandwidth off the model"), caption,
-                  tuple(tables))  # fmt: skip
+    return Figure(Lines(tuple(rows), "Peak of S and bandwidth off the model"), caption)
 
 
 def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:
@@ -114,10 +84,7 @@ def tolerances(run: FinishedRun, found: Study, caption: str) -> Figure:
 
 
 def structured(bound: StructuredBound, caption: str) -> Figure:
-    """1/μ is what is allowed of complex errors; the level is what is allowed of real ones.
-
-    The table is of the surroundings of the highest peak.
-    """
+    """1/μ is what is allowed of complex errors; the level is what is allowed of real ones."""
     panel = Panel(
         "frequency (Hz)", "μ (–)", (Curve(bound.hz, bound.mu, "complex errors", BLUE),),
         levels=(
@@ -126,6 +93,4 @@ def structured(bound: StructuredBound, caption: str) -> Figure:
         log_x=True, log_y=True,
         y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
     )  # fmt: skip
-    best = np.sort(np.argsort(-bound.mu)[:ROWS])
-    table = Table.of(("Hz", "μ, complex errors"), bound.hz[best], bound.mu[best])
-    return Figure(Lines(((panel,),), "Structured singular value"), caption, (table,))
+    return Figure(Lines(((panel,),), "Structured singular value"), caption)

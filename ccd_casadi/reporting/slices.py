@@ -5,19 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
+from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel
 from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
-from ccd_casadi.reporting.landscape import known_bandwidths
-from ccd_casadi.reporting.true_samples import Truths
+from ccd_casadi.reporting.landscape import Truths, known_bandwidths
 from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
 from surrogates.gaussian_process import TWO_SIDED_95
 
 SLICE = 61
 NEARBY = 0.1  # share of the box within which a sample is shown beside a slice
-TABLE_STEP = 4
 
 
 def slices_figure(
@@ -32,14 +30,14 @@ def slices_figure(
     known = known_bandwidths(problem, process, truths)
     places, values = np.array([*known]).reshape(-1, len(at)), np.array([*known.values()])
     away = np.abs(places - at) / (upper - lower)
-    panels, tables, seen = [], [], [np.array([best_hz])]
+    panels, seen = [], [np.array([best_hz])]
     spans: dict[str, tuple[float, float]] = {}  # the prediction's, and the band's half width
     for k, (name, unit, factor) in enumerate(theta_axes(problem)):
         axis, ends = axis_label(name, unit), (factor * lower[k], factor * upper[k])
         near = (np.delete(away, k, axis=1) <= NEARBY).all(axis=1) & np.isfinite(values)
         dots = factor * places[near, k], values[near]
         curves = [Curve(*dots, "truth nearby", GREEN, "", "o")] if near.any() else []
-        bands, table = [], Table.of((axis, "true ω_b (Hz)"), *dots)
+        bands = []
         seen.append(values[near])
         if process is not None:
             points = np.tile(at, (SLICE, 1))
@@ -48,8 +46,6 @@ def slices_figure(
             x, half = factor * points[:, k], TWO_SIDED_95 * deviation
             curves.insert(0, Curve(x, hz, "surrogate"))
             bands = [Band(x, hz - half, hz + half, "95 % band")]
-            columns = (column[::TABLE_STEP] for column in (x, hz, half))
-            table = Table.of((axis, "ω_b* (Hz)", "± 95 % (Hz)"), *columns)
             spans[name] = float(np.ptp(hz)), float(half.max())
             seen.append(hz)
         optimum = Level(factor * at[k], "" if k else "optimum", True, GREY)
@@ -57,7 +53,6 @@ def slices_figure(
             axis, "largest bandwidth ω_b* (Hz)", tuple(curves), tuple(bands), levels=(optimum,),
             x_range=ends, legend=None if k else "best",
         ))  # fmt: skip
-        tables.append(table)
     if not any(panel.curves for panel in panels):
         return None
     all_hz = np.concatenate(seen)
@@ -69,7 +64,7 @@ def slices_figure(
     rows = tuple(tuple(full[i : i + per_row]) for i in range(0, len(full), per_row))
     heights = (3.2 if len(rows) == 1 else 2.5,) * len(rows)
     lines = Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
-    return Figure(lines, _caption(spans, len(same) > 1, best_hz) + extra, tuple(tables))
+    return Figure(lines, _caption(spans, len(same) > 1, best_hz) + extra)
 
 
 def _caption(spans: dict[str, tuple[float, float]], many: bool, best_hz: float) -> str:

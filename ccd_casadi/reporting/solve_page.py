@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,35 +17,22 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.deployment.channels import split
-from ccd_casadi.drawing.content import (
-    Bullets,
-    Chapter,
-    Facts,
-    Figure,
-    Head,
-    Heading,
-    Page,
-    Source,
-    Table,
-    ThetaPath,
-    Words,
-)
-from ccd_casadi.inner_problem.design_loops import design_loops
+from ccd_casadi.deployment.channels import scalar_channels
+from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_chapter import budget_chapter
-from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table
+from ccd_casadi.reporting.facts import binding, conclusion, design_facts, run_name, theta_table
 from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.landscape import (
+    Truths,
     bandwidth_process,
     caption_disagreement,
     caption_landscape,
     landscape_data,
-    tables_landscape,
+    read_truths,
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
@@ -60,7 +47,6 @@ from ccd_casadi.reporting.structured_page import (
     limits_blocks,
     structured_facts,
 )
-from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import table_trust, trust_figure
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.progress import Progress
@@ -74,35 +60,30 @@ ORDER = (
 )  # fmt: skip
 
 
-Part = Callable[[], list[Chapter]]
+Part = Callable[[], list[c.Chapter]]
 
 
-def write_report(
-    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
-) -> Path:
+def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
-    publish(folder, path, solve_page(folder, case, problem, solution, quiet=quiet))
+    publish(folder, path, solve_page(folder, case, problem, solution))
     return path
 
 
-def solve_page(
-    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
-) -> Page:
+def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> c.Page:
     """What the report shows; the bar counts its sections."""
     parts = _parts(folder, case, problem, solution)
-    chapters: list[Chapter] = []
-    with Progress(len(parts), "drawing the report", quiet) as bar:
+    chapters: list[c.Chapter] = []
+    with Progress(len(parts), "drawing the report") as bar:
         for part in parts:
             chapters += part()
             bar.advance()
-    return Page(solve_head(case, solution.result), (*chapters, provenance(case, solution.result)))
+    return c.Page(solve_head(case, solution.result), (*chapters, provenance(case, solution.result)))
 
 
-def page_of_run(run: FinishedRun) -> Page:
+def page_of_run(run: FinishedRun) -> c.Page:
     """The report of a run that kept none, as far as its folder holds it: the design by itself."""
-    view = cache(partial(run_view, run))
-    parts = design_parts(run.problem, run.problem, run.theta, run.controller, view, run.result)
+    parts = design_parts(run.problem, run.problem, run.theta, run_view(run), run.result)
     chapters = []
     for name in (name for name in ORDER if name in parts):
         with suppress(KeyError):  # a result.json of an earlier version knows less
@@ -112,17 +93,15 @@ def page_of_run(run: FinishedRun) -> Page:
         "not kept."
     )
     head = solve_head(run.case, run.result)
-    note = Chapter("About this page", (Words(words),))
-    return Page(head, (*chapters, note, provenance(run.case, run.result)))
+    note = c.Chapter("About this page", (c.Words(words),))
+    return c.Page(head, (*chapters, note, provenance(run.case, run.result)))
 
 
-def solve_head(case: Case, result: Mapping[str, Any]) -> Head:
+def solve_head(case: Case, result: Mapping[str, Any]) -> c.Head:
     """Of the report, drawn now."""
-    # what `ccd new` makes is named by its folder
-    named = case.path.absolute().parent.name if case.path.stem == "case" else case.path.stem
     now = datetime.now().strftime("%Y-%m-%d %H:%M")
     meta = f"{case.path.name} · {result['formulation']} formulation · {now}"
-    return run_head(f"Co-design of {named}", result, meta, conclusion(result))
+    return run_head(f"Co-design of {run_name(case.path)}", result, meta, conclusion(result))
 
 
 def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> list[Part]:
@@ -130,12 +109,11 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
     verified, result = solution.verified, solution.result
     if verified is None:
         return []
-    own, theta, K = verified.problem, verified.theta, verified.controller
-    view = cache(partial(view_of, verified))
-    parts = design_parts(problem, own, theta, K, view, result)
+    own, theta, view = verified.problem, verified.theta, view_of(verified)
+    parts = design_parts(problem, own, theta, view, result)
     if isinstance(verified, VerifiedStructured):
         table = bandwidths_table(verified)
-        parts["loop"] = lambda: _loop(own, theta, K, view(), table)
+        parts["loop"] = lambda: _loop(own, theta, view, table)
     elif isinstance(verified, VerifiedDesign):
         truths = read_truths(folder / "samples.sqlite", problem)
         parts |= {
@@ -148,43 +126,30 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
 
 
 def design_parts(
-    problem: CoDesignProblem,
-    own: CoDesignProblem,
-    theta: Sequence[float],
-    K: StateSpace,
-    view: Callable[[], LoopView],
+    problem: CoDesignProblem, own: CoDesignProblem, theta: Sequence[float], view: LoopView,
     result: Mapping[str, Any],
-) -> dict[str, Part]:
-    """The sections about a design by itself; `own`: the problem with its design plant chosen."""
-    loops = cache(lambda: design_loops(own, theta, K))
-
-    @cache
-    def move() -> Figure:
-        return move_figure(own, theta, K, loops(), view().bandwidth_hz)
-
+) -> dict[str, Part]:  # fmt: skip
+    """The chapters about a design by itself; `own`: the problem with its design plant chosen."""
+    move = cache(lambda: move_figure(own, theta, view))
     parts: dict[str, Part] = {
-        "glance": lambda: [glance(own, theta, view(), move())],
+        "glance": lambda: [glance(own, theta, view, move())],
         "design": lambda: [design_chapter(problem, result)],
-        "move": lambda: [Chapter("A move", (move(),))],
+        "move": lambda: [c.Chapter("A move", (move(),))],
         "motor": lambda: cycle_chapter(own, theta, result),
-        "force": lambda: [Chapter("A step of force", (force_step(loops(), view().bandwidth_hz),))],
+        "force": lambda: [c.Chapter("A step of force", (force_step(view),))],
         "stage": lambda: stage_chapters(problem, {"start": problem.start, "optimum": theta}),
-        "budget": lambda: budget_chapter(own, theta, K),
+        "budget": lambda: budget_chapter(own, theta, view.loop.controller),
+        "loop": lambda: _loop(own, theta, view),
     }
-    parts["loop"] = lambda: _loop(own, theta, K, view())
-    if "proof" not in result:  # of mixed sensitivity
-        return parts
-    return parts | {
-        "controller": lambda: [Chapter("The controller", controller_blocks(result))],
-        "limits": lambda: (
-            [Chapter("What limits the bandwidth", limits_blocks(problem, result))]
-            if "costs" in result
-            else []
-        ),
-    }
+    if "proof" in result:  # of a fixed structure
+        parts["controller"] = lambda: [c.Chapter("The controller", controller_blocks(result))]
+    if "costs" in result:
+        limits = "What limits the bandwidth"
+        parts["limits"] = lambda: [c.Chapter(limits, limits_blocks(problem, result))]
+    return parts
 
 
-def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> Chapter:
+def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
     words, facts = (
         (binding_words, structured_facts) if "proof" in result else (binding, design_facts)
@@ -192,65 +157,65 @@ def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> Chapt
     binds = words(problem, result)
     body = (
         theta_table(problem, result),
-        Facts(tuple(facts(problem, result))),
-        Heading("What binds"),
-        Bullets(tuple(binds)) if binds else Words("Nothing binds: an interior optimum."),
-        *(Words(f"Note: {words}.") for words in result.get("notes", ())),
+        c.Facts(tuple(facts(problem, result))),
+        c.Heading("What binds"),
+        c.Bullets(tuple(binds)) if binds else c.Words("Nothing binds: an interior optimum."),
+        *(c.Words(f"Note: {words}.") for words in result.get("notes", ())),
     )
-    return Chapter("The design", body)
+    return c.Chapter("The design", body)
 
 
 def _theta(
     problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign", truths: Truths
-) -> Chapter:
+) -> c.Chapter:
     iterates = solution.outcome.iterates
     process = bandwidth_process(solution.outcome.surrogates)
     best = float(solution.result["bandwidth_hz"])
-    extra = caption_disagreement(problem, process, truths, verified.theta)
+    extra = caption_disagreement(process, truths)
     if len(problem.names) == 2:
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, process, truths, radius, verified.theta)
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
-        paths = (ThetaPath("iterates", path),) if len(path) else ()
+        paths = (c.ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
-        figure = Figure(land, caption_landscape(land, best) + extra, tables_landscape(land))
-        return Chapter("Bandwidth over the hardware", (figure,))
+        figure = c.Figure(land, caption_landscape(land, best) + extra)
+        return c.Chapter("Bandwidth over the hardware", (figure,))
     slices = slices_figure(problem, process, truths, verified.theta, best, extra)
     words = "There is no surrogate, and no design near the optimum to show in its place."
-    return Chapter("Bandwidth over the hardware", (slices or Words(words),))
+    return c.Chapter("Bandwidth over the hardware", (slices or c.Words(words),))
 
 
 def stage_chapters(
     problem: CoDesignProblem, thetas: Mapping[str, Sequence[float]]
-) -> list[Chapter]:
+) -> list[c.Chapter]:
     """The plant's drawing and its mode shapes at the last of `thetas`, where it has them."""
     plant, found = plant_of(problem), []
     if plant.drawing is not None and thetas:
-        found.append(Chapter("The stage, before and after", (plant.drawing(thetas),)))
+        found.append(c.Chapter("The stage, before and after", (plant.drawing(thetas),)))
     if plant.shapes is not None and thetas:
         name, theta = list(thetas.items())[-1]
         figure = mode_shape_figure(plant.shapes(theta, SHOWN))
-        found.append(Chapter(f"Mode shapes: {name}", (figure,)))
+        found.append(c.Chapter(f"Mode shapes: {name}", (figure,)))
     return found
 
 
 def _loop(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView, *more: Table
-) -> list[Chapter]:
-    channels = split(scaled_plant(problem, theta), K)
-    plots = Chapter("Loop, plant and controller", (bode(loop, channels),))
+    problem: CoDesignProblem, theta: Sequence[float], loop: LoopView, *more: c.Table
+) -> list[c.Chapter]:
+    channels = scalar_channels(scaled_plant(problem, theta), loop.loop.controller)
+    plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),))
     if loop.bounded.asked:  # of a fixed structure
-        return [Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
+        return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
-        Chapter("Closed loop: S, KS and T against their bounds", (gains(loop),)),
-        Chapter("What limits the bandwidth", limit_blocks(loop)),
+        c.Chapter("Closed loop: S, KS and T against their bounds", (gains(loop),)),
+        c.Chapter("What limits the bandwidth", limit_blocks(loop)),
         plots,
     ]
 
 
 def _history(
     case: Case, problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign"
-) -> Chapter:
+) -> c.Chapter:
     heading = "Prediction against truth"
     outcome, result = solution.outcome, solution.result
     if not outcome.iterates:
@@ -259,30 +224,30 @@ def _history(
             + ("IPOPT worked on the true quantities, nothing was predicted."
                if result["formulation"] == "direct" else (result["reason"] or "none was run."))
         )  # fmt: skip
-        return Chapter(heading, (Words(words),))
+        return c.Chapter(heading, (c.Words(words),))
     blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
         lifted=len(outcome.surrogates) > 1,
     )  # fmt: skip
-    return Chapter(heading, blocks)
+    return c.Chapter(heading, blocks)
 
 
-def _trust(solution: "Solution") -> list[Chapter]:
+def _trust(solution: "Solution") -> list[c.Chapter]:
     """Nothing where nothing was predicted."""
     qualities = solution.quality
     if not qualities:
         return []
-    body = (Words(recommendation(qualities)), table_trust(qualities), trust_figure(qualities))
-    return [Chapter("Can the surrogate be trusted?", body)]
+    body = (c.Words(recommendation(qualities)), table_trust(qualities), trust_figure(qualities))
+    return [c.Chapter("Can the surrogate be trusted?", body)]
 
 
-def provenance(case: Case, result: Mapping[str, Any]) -> Chapter:
+def provenance(case: Case, result: Mapping[str, Any]) -> c.Chapter:
     """Seed, versions, and the case file."""
     rows = [("seed", str(result["seed"])), *result["versions"].items()]
     body = (
-        Heading("Seed and versions"),
-        Table(("what", "version"), tuple((a, str(b)) for a, b in rows)),
-        Heading("The resolved case file"),
-        Source(case_to_toml(case)),
+        c.Heading("Seed and versions"),
+        c.Table(("what", "version"), tuple((a, str(b)) for a, b in rows)),
+        c.Heading("The resolved case file"),
+        c.Source(case_to_toml(case)),
     )
-    return Chapter("Provenance", body, own_page=True)
+    return c.Chapter("Provenance", body, own_page=True)

@@ -42,12 +42,6 @@ def start_chapter(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
     thetas = (problem.start, verified.theta)
     costs = [hardware_cost(plant_of(problem), theta) for theta in thetas]
     poles = [_roots(loop) for loop in loops]
-    rows = [
-        (loop.label, hz, zeta)
-        for loop, roots in zip(loops, poles, strict=True)
-        for hz, zeta in zip(*roots, strict=True)
-    ]
-    table = Table(("loop", "Hz", "damping ratio"), tuple(rows))
     lines = Lines(_panels(loops[::-1]), HEADING, HEIGHTS)
     least = [number(float(damping.min()), 2) for _, damping in poles]
     gained = 100.0 * (loops[1].bandwidth_hz / start.bandwidth_hz - 1.0)
@@ -58,7 +52,7 @@ def start_chapter(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
         f"ratio; the least damped one has {least[0]} at the start and {least[1]} at the optimum."
     )
     beside = _table(problem, thetas, loops, costs)
-    return [Chapter(HEADING, (Figure(lines, words, (table,)), beside))]
+    return [Chapter(HEADING, (Figure(lines, words), beside))]
 
 
 def _roots(loop: LoopView) -> tuple[np.ndarray, np.ndarray]:

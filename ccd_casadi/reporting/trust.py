@@ -22,7 +22,7 @@ def trust_figure(qualities: Sequence[Quality]) -> Figure:
     """A column for each output: predicted without the sample over true, and residuals below."""
     rows = tuple(tuple(map(panel, qualities)) for panel in (_predicted, _residuals))
     title = "samples predicted without themselves, and their standardised residuals"
-    return Figure(Lines(rows, title, (3.3, 2.6)), _caption(qualities), _data(qualities))
+    return Figure(Lines(rows, title, (3.3, 2.6)), _caption(qualities))
 
 
 def _predicted(q: Quality) -> Panel:
@@ -73,13 +73,3 @@ def table_trust(qualities: Sequence[Quality]) -> Table:
         for q in qualities
     )  # fmt: skip
     return Table(head, rows)
-
-
-def _data(qualities: Sequence[Quality]) -> tuple[Table, ...]:
-    """The numbers behind the figure."""
-    unit = {q.name: AXES[q.name] for q in qualities}
-    return tuple(
-        Table.of((f"{WORDS[q.name]}, true ({unit[q.name]})", f"predicted ({unit[q.name]})",
-                  "residual / deviation"), q.true, q.predicted, q.standardised)
-        for q in qualities
-    )  # fmt: skip

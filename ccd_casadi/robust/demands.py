@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import dataclass
 
-from ccd_casadi.analysis.move_limits import LIMITS, WINDOW, Limits
+from ccd_casadi.analysis.move_limits import LIMITS, WINDOW, MoveLimits
 from ccd_casadi.support.options import positive
 
 
@@ -20,7 +20,7 @@ class Demands:
     samples: int = 200
     sensor: float = 1.0
     disturbance: float = 1.0
-    limits: Limits = LIMITS
+    limits: MoveLimits = LIMITS
     window: float = WINDOW
     axis: int = 0
 
@@ -45,6 +45,6 @@ def add_move_options(arguments: argparse.ArgumentParser) -> None:
         )  # fmt: skip
 
 
-def move_limits(options: argparse.Namespace) -> Limits:
+def move_limits(options: argparse.Namespace) -> MoveLimits:
     """What these options ask for."""
-    return Limits(*(getattr(options, name) for name, _, _ in _MOVE[:-1]))
+    return MoveLimits(*(getattr(options, name) for name, _, _ in _MOVE[:-1]))

@@ -7,11 +7,10 @@ notebook it is on stdout, since stderr is painted there as a failure.
 
 import sys
 import time
-from types import TracebackType
 from typing import Self, TextIO
 
 from ccd_casadi.support.notebook import in_notebook
-from ccd_casadi.support.terminal import columns
+from ccd_casadi.support.terminal import QUIET, columns
 
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
@@ -20,6 +19,8 @@ CELL = 100  # characters of a line in a notebook
 class Progress:
     """`with Progress(total, label) as bar: bar.advance()`; nothing is printed if quiet or empty.
 
+    `quiet`: by default as `kept_quiet` says.
+
     On a terminal, and in a notebook's cell, one line is rewritten a few times a second; elsewhere
     a plain line is printed every few seconds and at the end. Work that ends before its total ends
     the bar, and a single step leaves no line behind. A stream that fails ends the printing, not the
@@ -27,12 +28,12 @@ class Progress:
     """
 
     def __init__(
-        self, total: int, label: str, quiet: bool = False, stream: TextIO | None = None
+        self, total: int, label: str, quiet: bool | None = None, stream: TextIO | None = None
     ) -> None:
         self.total, self.label, self.note = total, label, ""
         cell = in_notebook(sys.stdout)
         self.stream = stream or (sys.stdout if cell else sys.stderr)
-        self.silent = quiet or total <= 0
+        self.silent = (QUIET.get() if quiet is None else quiet) or total <= 0
         self.cell = in_notebook(self.stream)
         self.terminal = not self.silent and (self.cell or self.stream.isatty())
         self.interval = (0.25 if self.cell else 0.1) if self.terminal else 5.0
@@ -44,10 +45,7 @@ class Progress:
             self._show(end="")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:  # fmt: skip
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None and self.done:
             single, self.total = self.total == 1, self.done
             if single and not self.cell:

@@ -11,9 +11,9 @@ from helpers import few
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.c_code import COMPILE, c_files, write_c
-from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.deployment.realisation import Realisation, difference_equation, realise
 from ccd_casadi.deployment.sections import Section, sections_of
 from ccd_casadi.lti.state_space import StateSpace
@@ -42,7 +42,7 @@ def random_controller(seed: int, pairs: int, reals: int, inputs: int = 1) -> Sta
 
 def of_one_channel(K: StateSpace, saturation: float | None = None) -> Realisation:
     eye = np.eye(len(K.D))
-    channel = Channel("all", eye, eye, None, StateSpace(K.A, K.B, K.C, K.D))  # type: ignore[arg-type]
+    channel = LoopChannel("all", eye, eye, None, StateSpace(K.A, K.B, K.C, K.D))  # type: ignore[arg-type]
     return realise([channel], [K], saturation)
 
 
@@ -69,7 +69,7 @@ def test_channels_are_put_together() -> None:
     U = np.array([[0.6, -0.8], [0.8, 0.6]])
     parts = [random_controller(i, 1, 1) for i in range(2)]
     channels = [
-        Channel(str(i), U[:, [i]], U[:, [1 - i]], None, StateSpace(K.A, K.B, K.C, K.D))  # type: ignore[arg-type]
+        LoopChannel(str(i), U[:, [i]], U[:, [1 - i]], None, StateSpace(K.A, K.B, K.C, K.D))  # type: ignore[arg-type]
         for i, K in enumerate(parts)
     ]
     omega = HZ * np.array([1.0, 30.0, 900.0])
@@ -115,7 +115,7 @@ def test_c_equals_python_bit_by_bit(
     plain = of_one_channel(random_controller(5, pairs, reals, inputs))
     e = 1e-6 * np.random.default_rng(7).normal(size=(400, inputs))
     limit = None if share is None else share * float(np.abs(difference_equation(plain, e)).max())
-    found = limited(Realisation(plain.system, plain.blocks, limit), 500.0)
+    found = with_anti_windup(Realisation(plain.system, plain.blocks, limit), 500.0)
     program = build(tmp_path, found)
     assert subprocess.run([program], capture_output=True, check=False).returncode == 0
     lines = "\n".join(" ".join(f"{v:.17g}" for v in row) for row in e)

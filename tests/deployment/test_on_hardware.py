@@ -14,11 +14,11 @@ from test_deploy_code import of_one_channel, random_controller
 
 from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.deployment.anti_windup import back_calculation, limited, takeover
+from ccd_casadi.deployment.anti_windup import back_calculation, takeover, with_anti_windup
 from ccd_casadi.deployment.c_code import vectors
-from ccd_casadi.deployment.move import PARTS, Hardware, move
+from ccd_casadi.deployment.move import PARTS, Electronics, move
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
 from ccd_casadi.deployment.structured_text import structured_text
 from ccd_casadi.lti.hold import sampled
@@ -27,7 +27,7 @@ from ccd_casadi.support.errors import UserError
 
 PERIOD = DELAY = 1e-4
 CROSSOVER = 2.0 * np.pi * 40.0
-PROFILE = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+PROFILE = setpoint(MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4))
 
 
 def stage(inputs: int = 1) -> StateSpace:
@@ -118,9 +118,9 @@ def test_nothing_changes_between_the_limits() -> None:
     K = pid()
     e = 1e-6 * np.random.default_rng(0).normal(size=(300, 1))
     u = difference_equation(K, e)
-    wide = limited(replace(K, saturation=1.01 * float(np.abs(u).max())), CROSSOVER)
+    wide = with_anti_windup(replace(K, saturation=1.01 * float(np.abs(u).max())), CROSSOVER)
     np.testing.assert_array_equal(difference_equation(wide, e), u)
-    narrow = limited(replace(K, saturation=0.5 * float(np.abs(u).max())), CROSSOVER)
+    narrow = with_anti_windup(replace(K, saturation=0.5 * float(np.abs(u).max())), CROSSOVER)
     only_clipped = np.clip(u, -(narrow.saturation or 0.0), narrow.saturation)
     assert np.abs(difference_equation(narrow, e) - only_clipped).max() > 0.0
 
@@ -151,8 +151,8 @@ def test_an_unlimited_move_is_the_linear_loop() -> None:
     found = made(K)
     errors, _ = simulate(plant, K.system, found.position[:, None, None])
     np.testing.assert_allclose(found.error, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)
-    late = made(K, hardware=Hardware(jitter=PERIOD / PARTS / 4))
-    np.testing.assert_array_equal(made(K, hardware=Hardware()).error, found.error)
+    late = made(K, hardware=Electronics(jitter=PERIOD / PARTS / 4))
+    np.testing.assert_array_equal(made(K, hardware=Electronics()).error, found.error)
     assert 0.0 < np.abs(late.error - found.error).max() < 1e-2 * found.peak_error
 
 
@@ -162,7 +162,7 @@ def test_a_limited_move_ends_as_fast_and_without_a_cycle() -> None:
     free = made(K)
     limit = 0.9 * float(np.abs(free.force).max())
     clipped = replace(K, saturation=limit)
-    held = made(limited(clipped, CROSSOVER))
+    held = made(with_anti_windup(clipped, CROSSOVER))
     assert held.saturated > 0.05
     assert held.settled <= 1.2 * free.settled
     assert held.last_error(0.25) < 1e-7  # of a window of 1e-6
@@ -171,7 +171,7 @@ def test_a_limited_move_ends_as_fast_and_without_a_cycle() -> None:
 
 
 def test_steps_of_sensor_and_force_bound_what_is_left() -> None:
-    found = made(pid(), hardware=Hardware(sensor_step=1e-8, force_step=1e-3))
+    found = made(pid(), hardware=Electronics(sensor_step=1e-8, force_step=1e-3))
     assert 0.0 < found.last_error(0.25) < 1e-7
     np.testing.assert_allclose(found.force / 1e-3, np.round(found.force / 1e-3), atol=1e-6)
 
@@ -182,7 +182,8 @@ def test_steps_of_sensor_and_force_bound_what_is_left() -> None:
 def test_structured_text_is_the_c_code_line_by_line(
     pairs: int, reals: int, inputs: int, limit: float | None
 ) -> None:
-    found = limited(of_one_channel(random_controller(5, pairs, reals, inputs), limit), 500.0)
+    K = of_one_channel(random_controller(5, pairs, reals, inputs), limit)
+    found = with_anti_windup(K, 500.0)
     errors, forwards, first, forces = vectors(found)
     text = structured_text(found, title="x *) y", delay=1e-4, verified=True)
     calls = [

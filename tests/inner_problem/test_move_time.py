@@ -12,7 +12,7 @@ from differences import slopes
 from ccd_casadi.analysis.driven_plant import with_motion
 from ccd_casadi.analysis.motor import STEP, UNLIMITED, Motion, Motor, cycle_of
 from ccd_casadi.analysis.move import simulate
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import _Crossing
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -35,11 +35,11 @@ from ccd_casadi.plants.plant import (
 
 moves = benchmark("random_moves")
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
-BANG = Limits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
+BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
 MOTOR = Motor((30.0,), (4.0,), (10.0,), (2.0,), 50.0)
 
 
-def moving(motor: Motor, limits: Limits = BANG, dwell: float = 0.0) -> Motion:
+def moving(motor: Motor, limits: MoveLimits = BANG, dwell: float = 0.0) -> Motion:
     return Motion(limits, 1e-6, dwell, motor=motor)
 
 
@@ -212,7 +212,7 @@ def test_the_example_is_a_case_of_move_time() -> None:
 @pytest.mark.slow
 def test_the_envelope_gradient_is_the_slope_of_the_least_time() -> None:
     problem, made = prepared(small())
-    problem, made = least_from(problem, problem.start, made)
+    problem, made, _ = least_from(problem, problem.start, made)
     assert made.certified
     theta = np.array([0.0155, 0.85])
     value = structured_value(problem, theta)

@@ -29,7 +29,8 @@ from ccd_casadi.synthesis.synthesis import synthesise
 
 def loop_of(plant, K: StateSpace, weights=WEIGHTS):  # type: ignore[no-untyped-def]
     parts = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
-    return weighted_loop(plant.A, plant.B, plant.C, *parts, weights.scaled(plant.omega_0))
+    w = weights.scaled(plant.omega_0)
+    return weighted_loop(plant.A, plant.B, plant.C, *parts, w, 0.0)
 
 
 @pytest.fixture(scope="module", params=["two masses", "flexible"])

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import control
 import numpy as np
 import pytest
-from helpers import HZ, SUSPENSION, random_plant, scaled
+from helpers import HZ, SUSPENSION, random_plant, responses, scaled
 from scipy.integrate import trapezoid
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
@@ -33,7 +33,6 @@ from ccd_casadi.robust.perturbed import (
 from ccd_casadi.robust.signals import gains, noise
 from ccd_casadi.robust.structured import structured_bound
 from ccd_casadi.robustness import main
-from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights
@@ -171,11 +170,11 @@ def test_the_worst_of_a_box_is_worse_than_all_that_was_seen(run: FinishedRun) ->
 
 def test_random_hardware_repeats_and_its_worst_is_at_a_corner(run: FinishedRun) -> None:
     """Both masses 1 % lighter: k falls with their fourth powers, and the resonance with it."""
-    first = tolerances(run, 0.01, 25, 3, quiet=True)
-    again = tolerances(run, 0.01, 25, 3, quiet=True)
+    first = tolerances(run, 0.01, 25, 3)
+    again = tolerances(run, 0.01, 25, 3)
     # as texts, in which one NaN is another
     assert repr(first) == repr(again)
-    assert repr(first) != repr(tolerances(run, 0.01, 25, 4, quiet=True))
+    assert repr(first) != repr(tolerances(run, 0.01, 25, 4))
     assert len(first.judged) == 25
     for item in first.judged:
         assert (np.abs(np.array(item.place) / run.theta - 1.0) <= 0.01).all()

@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.analysis.move import mass_feedforward, simulate
-from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.lti.hold import Sampling
@@ -52,7 +52,7 @@ positive = st.floats(1e-3, 1e3)
 def test_a_setpoint_arrives_at_rest_within_its_bounds(
     stroke: float, v: float, a: float, j: float, s: float
 ) -> None:
-    limits = Limits(stroke, v, a, j, s)
+    limits = MoveLimits(stroke, v, a, j, s)
     profile = setpoint(limits)
     assert (profile.durations >= 0.0).all()
     _, states = flown(profile)
@@ -73,13 +73,13 @@ def test_a_setpoint_arrives_at_rest_within_its_bounds(
 def test_more_room_never_takes_longer(values: Sequence[float], which: int) -> None:
     wider = list(values)
     wider[which] *= 1.5
-    before, after = setpoint(Limits(*values)), setpoint(Limits(*wider))
+    before, after = setpoint(MoveLimits(*values)), setpoint(MoveLimits(*wider))
     assert after.duration <= before.duration * (1.0 + 1e-9)
 
 
 def test_a_setpoint_by_hand() -> None:
     """100 m/s³ in 10 ms of snap, 2 m/s² after 10 ms more, 0.1 m/s after 20 ms more, 0.01 m."""
-    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    profile = setpoint(MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4))
     assert profile.durations[:8] == pytest.approx(
         [0.01, 0.01, 0.01, 0.02, 0.01, 0.01, 0.01, 0.02], rel=1e-9
     )
@@ -88,7 +88,7 @@ def test_a_setpoint_by_hand() -> None:
 
 def test_the_shortest_of_moves_has_snap_alone() -> None:
     """8 s t⁴ = stroke: eight equal pieces."""
-    profile = setpoint(Limits(1e-6, 1e3, 1e3, 1e3, 1.0))
+    profile = setpoint(MoveLimits(1e-6, 1e3, 1e3, 1e3, 1.0))
     t = (1e-6 / 8.0) ** 0.25
     assert profile.durations[profile.durations > 1e-12] == pytest.approx([t] * 8, rel=1e-6)
 
@@ -111,7 +111,7 @@ def rigid_loop(mass: float, gain: float, zeta: float) -> tuple[StateSpace, State
 def test_a_mass_driven_by_its_own_feedforward_has_no_error() -> None:
     plant, controller = rigid_loop(3.0, 3e4, 0.7)
     loop = Loop(plant, controller)
-    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    profile = setpoint(MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4))
     move = simulate(loop, profile, axis=0, forces=np.array([3.0]), window=1e-9, bandwidth_hz=15.0)
     assert move.peak_error < 1e-13
     assert move.settling == 0.0
@@ -123,7 +123,7 @@ def test_a_move_against_python_control() -> None:
     """forced_response on a fine grid, the setpoint held linear between its points."""
     plant, controller = rigid_loop(3.0, 3e4, 0.7)
     loop = Loop(plant, controller)
-    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    profile = setpoint(MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4))
     move = simulate(loop, profile, axis=0, forces=None, window=1e-7, bandwidth_hz=15.0)
     dense = np.linspace(0.0, 0.36, 20001)
     times, states = flown(profile)
@@ -142,7 +142,7 @@ def test_a_move_against_python_control() -> None:
 def test_a_sampled_move_tends_to_the_continuous_one() -> None:
     """The difference, of hold and delay alone, halves with the period."""
     plant, controller = rigid_loop(3.0, 3e4, 0.7)
-    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    profile = setpoint(MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4))
     loop = Loop(plant, controller)
     move = simulate(loop, profile, axis=0, forces=None, window=1e-7, bandwidth_hz=15.0)
     apart = []
@@ -159,7 +159,7 @@ def test_a_sampled_move_tends_to_the_continuous_one() -> None:
 
 
 def test_positions_and_accelerations_at_any_time() -> None:
-    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    profile = setpoint(MoveLimits(0.01, 0.1, 2.0, 100.0, 1e4))
     times, states = flown(profile)
     place, _, rate, _, _ = profile.at(np.append(times, 1.0))
     assert place == pytest.approx(np.append(states[:, 0], 0.01), abs=1e-12)

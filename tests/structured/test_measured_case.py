@@ -64,8 +64,9 @@ def test_inner_designs_on_the_lines(
     shown = (tmp_path / "run" / "report.html").read_text().replace("\u00a0", " ")
     assert escape(answer["words"]) in shown
     assert ("sampled at 10000 Hz" in shown) == sampled
-    data = re.findall(r"<tr>((?:<td[^>]*>[^<]*</td>){7})</tr>", shown)
-    cells = np.array([[float(v) for v in re.findall(r">([^<]+)</td>", row)] for row in data])
+    data = re.findall(r"<tr>((?:<td[^>]*>[^<]*</td>){9})</tr>", shown)
+    texts = [re.findall(r">([^<]+)</td>", row) for row in data]
+    cells = np.array([[np.nan if v == "–" else float(v) for v in row] for row in texts])
     k = controller_response(K, case.responses[0].hz, case.period)[:, 0, 0]
     S = np.abs(1.0 / (1.0 + case.responses[0].G * k))
     at = [int(np.abs(case.responses[0].hz - hz).argmin()) for hz in cells[:, 0]]
@@ -87,7 +88,7 @@ def test_a_mat_file_is_the_same_plant(tmp_path: Path) -> None:
     [
         ("stage.csv", "none.csv", "plant.file.*No such file"),
         ('file = "stage.csv"', "", "plant.file: is missing"),
-        ('file = "stage.csv"', 'file = "stage.csv"\nzeta = 0.1', "plant.zeta: is not an option"),
+        ('file = "stage.csv"', 'file = "stage.csv"\nzeta = 0.1', "plant.zeta: unknown key"),
         ('file = "stage.csv"', 'file = "stage.csv"\nunstable_poles = -1', "unstable_poles"),
         ("biquads = 0", "[theta.m]\nlower = 1.0\nupper = 2.0", "theta: has no effect"),
         ('structure = "sections"', "", "controller.structure: needs"),

@@ -53,14 +53,16 @@ ROUNDING = 1e-8  # the same of a mode
 COUPLED = 24  # lowest modes of each symmetry that point masses couple
 RIGID = {"A1": 1, "A2": 1, "SA": 2, "AS": 2}  # rigid motions of a symmetry
 
+STAGES = 3  # whose last bases are kept: a plant, its finer model, and one with a payload
+
 Theta = tuple[float, ...]
 Terms = tuple[np.ndarray, sparse.csr_matrix]
 
 
 @dataclass(frozen=True)
 class Basis:
-    """Of a group: V (n, r); the forms of K and of M to each coefficient, (terms, r, r); u on the
-    nodes of the lower face (nodes, 3, r) of every image."""
+    """Of a group: V (n, r); the forms of K and of M to each coefficient, their lower triangles row
+    by row (terms, r(r + 1)/2); u on the nodes of the lower face (nodes, 3, r) of every image."""
 
     vectors: Array
     stiff: Array
@@ -78,6 +80,9 @@ class Small:
     dM: Array
     u: Array
     du: Array
+
+
+_bases: dict[RibStage, tuple[tuple[Theta, ...], tuple[Basis, ...]]] = {}
 
 
 def applies(stage: RibStage) -> bool:
@@ -113,20 +118,25 @@ def mechanics(stage: RibStage, made: Sequence[Basis], theta: Sequence[float]) ->
     return assembled(stage, lam[3:], u, du, dK)
 
 
-@lru_cache(maxsize=6)  # of three stages the last and the one that it grows from
 def bases(stage: RibStage, known: tuple[Theta, ...]) -> tuple[Basis, ...]:
-    """Those of the groups of the square, from what is known at some θ."""
-    disc, here = discretisation(stage), np.array(known[-1])
-    before = bases(stage, known[:-1]) if len(known) > 1 else None
+    """Those of the groups of the square, from what is known at some θ; grown from the stage's last
+    ones where these know the first of them."""
+    have, made = _bases.pop(stage, ((), ()))
+    if have != known[: len(have)]:
+        have, made = (), ()
+    if len(_bases) == STAGES:
+        del _bases[next(iter(_bases))]
+    disc = discretisation(stage)
+    for theta in map(np.array, known[len(have) :]):
+        before = made or [_of_rigid(stage, disc, group, theta) for group in SQUARE_GROUPS]
 
-    def grown(index: int) -> Basis:
-        group = SQUARE_GROUPS[index]
-        if before is None:
-            return _grown(stage, disc, group, _of_rigid(stage, disc, group, here), here)
-        return _grown(stage, disc, group, before[index], here)
+        def grown(index: int, here: Array = theta, before: Sequence[Basis] = before) -> Basis:
+            return _grown(stage, disc, SQUARE_GROUPS[index], before[index], here)
 
-    # That of the tilts takes longest.
-    return tuple(side_by_side(grown, range(len(SQUARE_GROUPS))[::-1])[::-1])
+        # That of the tilts takes longest.
+        made = tuple(side_by_side(grown, range(len(SQUARE_GROUPS))[::-1])[::-1])
+    _bases[stage] = known, made
+    return made
 
 
 def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array) -> Basis:
@@ -134,7 +144,7 @@ def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array)
     step = 0.1 * (np.array(UPPER) - np.array(LOWER))
     motions = [rigid_vectors(disc, group, place) for place in (theta, *(theta + np.diag(step)))]
     of_K, of_M = _terms(stage.order, disc.side, stage.geometry.material)
-    empty = np.zeros((len(of_K[0]), 0, 0)), np.zeros((len(of_M[0]), 0, 0))
+    empty = np.zeros((len(of_K[0]), 0)), np.zeros((len(of_M[0]), 0))
     nothing = Basis(np.zeros((len(motions[0]), 0)), *empty, ())
     return _wider(stage, disc, group, nothing, np.hstack(motions), ROUNDING)
 
@@ -170,13 +180,12 @@ def _wider(
     n, sector = V.shape[1], sector_of(disc, group.solved[0])
     fresh = disc.assembler.bilinear(sector, V, V[:, r:])
 
+    below = np.arange(n) <= np.arange(r, n)[:, None]
+
     def forms(before: Array, new: Array, of: Terms) -> Array:
-        out = np.empty((len(before), n, n))
-        out[:, :r, :r] = before
         flat = of[1] @ new.reshape(of[1].shape[1], n * (n - r))
-        out[:, :, r:] = flat.reshape(len(before), n, n - r)
-        out[:, r:, :r] = out[:, :r, r:].transpose(0, 2, 1)
-        return out
+        rows = flat.reshape(len(before), n, n - r).transpose(0, 2, 1)
+        return np.hstack([before, rows[:, below]])
 
     of_K, of_M = _terms(stage.order, disc.side, stage.geometry.material)
     mesh = disc.assembler.mesh
@@ -212,19 +221,22 @@ def _modes(stage: RibStage, group: Group, basis: Basis, theta: Array) -> tuple[S
     c, dc = disc.assembler.coefficients(theta)
     both, count = np.concatenate([c[None], dc]), len(theta) + 1
     of_K, of_M = _terms(stage.order, disc.side, stage.geometry.material)
-    K = np.tensordot(both[:, :, :6].reshape(count, -1)[:, of_K[0]], basis.stiff, 1)
-    M = np.tensordot(both[:, :, 6][:, of_M[0]], basis.mass, 1)
+    K = _whole(both[:, :, :6].reshape(count, -1)[:, of_K[0]] @ basis.stiff)
+    M = _whole(both[:, :, 6][:, of_M[0]] @ basis.mass)
     values, modes = eigh(K[0], M[0])
     kept = RIGID.get(group.solved[0].name, 0) + stage.modes.of(group)
     lower = disc.assembler.mesh.number[:, :, 0].ravel()
     found = []
     for (symmetry,), face in zip(group.images, basis.faces, strict=True):
-        fields = []
+        known, fields = dict[tuple[float, float], Array](), []
         for x, y in [*points_of(stage), *((p.x, p.y) for p in masses)]:
+            here = abs(x), abs(y)
+            if here not in known:  # the corners are one point of the quarter
+                N = np.vstack(disc.assembler.mesh.interpolate(theta, *here))[:, lower]
+                flat = N @ face.reshape(len(face), -1)
+                known[here] = flat.reshape(count, 3, -1) @ modes
             signs = np.array(mirror_signs(symmetry, x < 0.0, y < 0.0), float)[:, None]
-            N = np.vstack(disc.assembler.mesh.interpolate(theta, abs(x), abs(y)))[:, lower]
-            field = (N @ face.reshape(len(face), -1)).reshape(count, 3, -1) @ modes
-            fields.append((signs * field).transpose(0, 2, 1))
+            fields.append((signs * known[here]).transpose(0, 2, 1))
         u, lam, left = np.stack(fields, 3), values, modes
         if masses:
             lam, turn = _lowest(values, u[0, :, :, -len(masses) :])
@@ -233,6 +245,15 @@ def _modes(stage: RibStage, group: Group, basis: Basis, theta: Array) -> tuple[S
         dK, dM = (left.T @ (part[1:] @ right) for part in (K, M))
         found.append(Small(lam, dK, dM, u[0], u[1:]))
     return tuple(found)
+
+
+def _whole(triangles: Array) -> Array:
+    """Symmetric matrices (k, r, r) of their lower triangles."""
+    r = int(np.sqrt(2 * triangles.shape[1]))
+    i, j = np.tril_indices(r)
+    out = np.empty((len(triangles), r, r))
+    out[:, i, j] = out[:, j, i] = triangles
+    return out
 
 
 def _lowest(values: Array, G: Array) -> tuple[Array, Array]:

@@ -3,12 +3,13 @@
 ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
+from ccd_casadi.kernels.disturbance import four_block_plant
+from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -29,18 +30,6 @@ class StandardPlant:
     D21: Array
     D22: Array
 
-    @classmethod
-    def from_parts(
-        cls, A: Array, B: Array, C: Array, D: Array, measured: int, controls: int
-    ) -> "StandardPlant":
-        """Partition a state space: the last `measured` outputs and last `controls` inputs."""
-        A, B, C, D = (np.array(part, dtype=float, ndmin=2) for part in (A, B, C, D))
-        w, z = B.shape[1] - controls, C.shape[0] - measured
-        return cls(
-            A, B[:, :w], B[:, w:], C[:z], C[z:],
-            D[:z, :w], D[:z, w:], D[z:, :w], D[z:, w:],
-        )  # fmt: skip
-
     def whole(self) -> StateSpace:
         """The plant as one state space."""
         return StateSpace(
@@ -56,42 +45,23 @@ def mixed_sensitivity(plant: ScaledPlant, weights: Weights) -> StandardPlant:
 
     With `weights.disturbance` the four blocks, (r, d) to [W_S e; W_KS u; W_T u].
     """
+    p, m = len(plant.C), plant.B.shape[1]
+    given = (plant.A, plant.B, plant.C, weights.scaled(plant.omega_0))
     if weights.delta:
-        return _four_block(plant, weights)
-    A, B1, B2, C1, C2, d1, d2 = generalized_plant(
-        plant.A, plant.B, plant.C, weights.scaled(plant.omega_0)
-    )
-    p, m = C2.shape[0], B2.shape[1]
+        A, B1, B2, C1, C2, D11, D12 = four_block_plant(*given, weights.delta)
+        return StandardPlant(A, B1, B2, C1, C2, D11, D12, np.eye(p, p + m), np.zeros((p, m)))
+    A, B1, B2, C1, C2, d1, d2 = generalized_plant(*given)
     D11, D12 = np.zeros((2 * p + m, p)), np.zeros((2 * p + m, m))
     D11[:p], D12[p : p + m] = d1 * np.eye(p), d2 * np.eye(m)
     return StandardPlant(A, B1, B2, C1, C2, D11, D12, np.eye(p), np.zeros((p, m)))
-
-
-def _four_block(plant: ScaledPlant, weights: Weights) -> StandardPlant:
-    """Reference and input disturbance in; states [plant; W_S; W_KS; W_T]."""
-    A, B, C = plant.A, plant.B, plant.C
-    n, m, p = len(A), B.shape[1], len(C)
-    f = first_order_weights(weights.scaled(plant.omega_0))
-    of_S, of_u = slice(n, n + p), slice(n + p, n + p + 2 * m)
-    N, channels = of_u.stop, [p, m, m]
-    pole, into, out, direct = (np.repeat(f[:, k], channels) for k in range(4))
-    Ag, B1, B2 = np.zeros((N, N)), np.zeros((N, p + m)), np.zeros((N, m))
-    Ag[:n, :n], Ag[n:, n:], Ag[of_S, :n] = A, -np.diag(pole), -f[0, 1] * C
-    B1[:n, p:], B1[of_S, :p], B2[:n] = weights.delta * B, f[0, 1] * np.eye(p), B
-    twice = np.vstack([np.eye(m), np.eye(m)])
-    B2[of_u] = into[p:, None] * twice
-    C1, D11, D12 = np.zeros((p + 2 * m, N)), np.zeros((p + 2 * m, p + m)), np.zeros((p + 2 * m, m))
-    C1[:, n:], C1[:p, :n] = np.diag(out), -f[0, 3] * C
-    D11[:p, :p], D12[p:] = f[0, 3] * np.eye(p), direct[p:, None] * twice
-    C2, D21 = np.hstack([-C, np.zeros((p, N - n))]), np.eye(p, p + m)
-    return StandardPlant(Ag, B1, B2, C1, C2, D11, D12, D21, np.zeros((p, m)))
 
 
 def balance(plant: StandardPlant) -> StandardPlant:
     """The same plant in balanced coordinates of its state."""
     whole = plant.whole()
     A, B, C = balanced(whole.A, whole.B, whole.C)
-    return StandardPlant.from_parts(A, B, C, whole.D, plant.C2.shape[0], plant.B2.shape[1])
+    w, z = plant.D11.shape[1], len(plant.D11)
+    return replace(plant, A=A, B1=B[:, :w], B2=B[:, w:], C1=C[:z], C2=C[z:])
 
 
 @dataclass(frozen=True)
@@ -107,7 +77,5 @@ class Attempt:
     reason: str = ""
 
 
-class Solver(Protocol):
-    """H∞ synthesis for any standard plant at gamma_backoff times its own γ_opt."""
-
-    def __call__(self, plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt: ...
+# (plant, gamma_backoff=1.02): H∞ synthesis for any standard plant at that many times its own γ_opt
+Solver = Callable[..., Attempt]
