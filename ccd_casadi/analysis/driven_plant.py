@@ -1,6 +1,6 @@
-"""A plant with its motors: their mass on it, their heat in its cost, their limits as constraints.
+"""A plant with its motors: their mass on it, their limits as constraints.
 
-M(θ) + m Σ b bᵀ,   f(θ) + price · P(θ),   peak force, motor power <= what the motor allows
+M(θ) + m Σ b bᵀ,   peak force, motor power <= what the motor allows
 """
 
 from collections.abc import Mapping, Sequence
