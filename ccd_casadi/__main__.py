@@ -8,7 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from ccd_casadi.support.command_line import ExitCode
-from ccd_casadi.support.interrupts import begun
+from ccd_casadi.support.interrupts import raise_on_ctrl_c
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.package_text import package_text
 from ccd_casadi.support.terminal import say
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     named = ALIASES.get(words[0], words[0]) if words else ""
     if named in COMMANDS:
         return int(import_module(COMMANDS[named][0]).main(words[1:]))
-    begun()
+    raise_on_ctrl_c()
     if not words or words in (["--help"], ["-h"], ["help"]):
         print(overview(Path()))
         return ExitCode.DONE

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from ccd_casadi.support.command_line import ExitCode, run, run_parser
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.terminal import inform
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -32,8 +33,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         publish(folder, report, page_of_run(read_run(folder)))
         drawn.append(report)
     write_index(folder)
-    if not options.quiet:
-        print("\n".join(f"drawn         {path}" for path in drawn))
+    inform("\n".join(f"drawn         {path}" for path in drawn))
     return ExitCode.DONE
 
 

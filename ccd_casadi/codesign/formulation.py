@@ -45,7 +45,7 @@ class FormulationResult:
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownSamples:
     """What a formulation may begin with in place of its own plan: θ (n, n_θ), designs there."""
 
     thetas: Array

@@ -43,7 +43,7 @@ from ccd_casadi.lti.closed_loop import open_alone
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
@@ -132,7 +132,7 @@ def _design(
     figures = made.figures
     feasible = problem.inner.feasible(figures)
     answer = {
-        **clean(mixed_dict(problem, theta, made)),
+        **json_values(mixed_dict(problem, theta, made)),
         "active": list(active_constraints(problem.inner, figures)) if feasible else [],
         "feasible": feasible,
         "local_peaks": [

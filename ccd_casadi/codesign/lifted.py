@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, Known
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -60,7 +60,7 @@ class Lifted:
 
 
 def solve_lifted(
-    sampler: Sampler, options: Lifted, *, seed: int, given: Known | None = None
+    sampler: Sampler, options: Lifted, *, seed: int, given: KnownSamples | None = None
 ) -> FormulationResult:
     """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, Known
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -62,7 +62,7 @@ def solve_nested(
     options: Nested,
     *,
     seed: int,
-    given: Known | None = None,
+    given: KnownSamples | None = None,
     gradients: bool = False,
 ) -> FormulationResult:
     """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.

@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult, Known
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.lifted import Lifted
@@ -108,7 +108,7 @@ class Outer(ABC):
         return self
 
     def formulated(
-        self, formulation: Formulation, seed: int, given: Known | None = None
+        self, formulation: Formulation, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """One formulation, from the samples that are given where there are any."""
         if isinstance(formulation, Direct):
@@ -118,7 +118,7 @@ class Outer(ABC):
 
     @abstractmethod
     def fitted(
-        self, formulation: Nested | Lifted, seed: int, given: Known | None = None
+        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """A formulation on surrogates, from the samples that are given where there are any."""
 

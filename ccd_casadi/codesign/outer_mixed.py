@@ -14,7 +14,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.direct import acceptable, polish, true_objective
-from ccd_casadi.codesign.formulation import FormulationResult, Known
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.kinked import SETTLED, descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -62,7 +62,7 @@ class MixedOuter(Outer):
         return lifted_bounds(self.problem)
 
     def fitted(
-        self, formulation: Nested | Lifted, seed: int, given: Known | None = None
+        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         if isinstance(formulation, Nested):
             return solve_nested(self.sampler, formulation, seed=seed, given=given)

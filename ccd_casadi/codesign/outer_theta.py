@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Known
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
@@ -34,7 +34,7 @@ class ThetaOuter(Outer, ABC):
         return False
 
     def fitted(
-        self, formulation: Nested | Lifted, seed: int, given: Known | None = None
+        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """Nested; what is lifted are the exact gradients, as x is θ."""
         if isinstance(formulation, Nested):

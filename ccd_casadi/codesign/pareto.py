@@ -18,6 +18,7 @@ import numpy as np
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
@@ -81,8 +82,12 @@ def pareto_front(
     size, sign = begun[0].value, 1.0 if problem.figure.larger_is_better else -1.0
 
     def solved(a: float, b: float, begin: Sequence[BandwidthSample]) -> FrontPoint | None:
-        """The best design for these weights, of local solves from some designs."""
-        outer = outer_of(sampler.of(replace(problem, w1=a, w2=-sign * b), traced=False, quiet=True))
+        """The best design for these weights, of local solves from some designs; where each value
+        is a search over the controller, from the best of them alone."""
+        weighted = replace(problem, w1=a, w2=-sign * b)
+        outer = outer_of(sampler.of(weighted, traced=False, quiet=True))
+        if not outer.look_is_cheap:
+            begin = [min(begin, key=lambda sample: objective_of(weighted, sample))]
         places = [outer.solved_from(sample, ()) for sample in begin]
         found = [place for place in places if place is not None]
         if not found:

@@ -31,7 +31,7 @@ from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.json_files import clean, write_json
+from ccd_casadi.support.json_files import json_values, write_json
 from ccd_casadi.support.versions import versions
 from surrogates import Quality
 
@@ -94,7 +94,7 @@ def result_dict(
         **budget_entry(problem, verified.theta, verified.controller),
         **move_entry(problem, verified.theta, verified.controller),
     }
-    return clean(result)
+    return json_values(result)
 
 
 def verdict_of(
@@ -209,7 +209,7 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return before if isinstance(before, Mapping) else line
 
 
-def told(run: FinishedRun, out: Path, name: str, line: Line) -> FinishedRun:
+def with_verdict_line(run: FinishedRun, out: Path, name: str, line: Line) -> FinishedRun:
     """The run with a line of its verdict, written into its folder if `out` lies in that.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays

@@ -18,7 +18,7 @@ from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult, Known, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Terms
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
@@ -147,7 +147,7 @@ class Job:
         """Syntheses a sample, as far as is known of whole inner problems."""
         return max(self.spent, 1) / max(samples, 1) if self.over_theta else 1.0
 
-    def _known(self) -> Known | None:
+    def _known(self) -> KnownSamples | None:
         """What the store holds within the bounds, a first design added where that is too little.
 
         None where the truth has no value at most of its points. Raises UserError where the budget
@@ -173,7 +173,7 @@ class Job:
             raise UserError(f"--budget {self.budget} {words}")
         thetas = np.array([sample.x for sample in kept])[:, : len(self.outer.problem.names)]
         quantities = [sample for sample in kept if isinstance(sample, QuantitySample)]
-        return Known(thetas, tuple(quantities))
+        return KnownSamples(thetas, tuple(quantities))
 
     def _stored(self) -> "list[Seen]":
         """Samples of the store within the bounds, oldest first, failures among them."""

@@ -19,7 +19,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import counted, metres, shown
+from ccd_casadi.support.units import counted, metres, with_unit
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -288,7 +288,7 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
         return Line(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
-        f"run deploy; the loops' least delay margin is {shown(found.delay, 's')}, and below "
+        f"run deploy; the loops' least delay margin is {with_unit(found.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     ).replace("µ", "u")
     return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})

@@ -30,7 +30,7 @@ from ccd_casadi.inner_problem.structured_search import joined
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ, counted
 
 
@@ -134,7 +134,7 @@ class VerifiedStructured(Verified):
             "anchors": [list(kappa) for kappa in structured.anchors],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
-            "costs": clean({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
+            "costs": json_values({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
             | {"tolerances_hz": {name: 0.01 * w / HZ for name, w in self.prices.items()}},
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
+from ccd_casadi.drawing.content import Lines, Modes, Panel, Picture, Place, Table
 from ccd_casadi.drawing.labels import (
     POINT,
     SIZE,
@@ -111,12 +111,13 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         )  # fmt: skip
     for i, area in enumerate(panel.forbidden):
         axes.fill(area.x, area.y, color=area.colour, alpha=0.2, linewidth=0.0, gid=f"area{i}")
+    top = np.inf if panel.y_range is None else panel.y_range[1]
     for i, curve in enumerate(panel.curves):
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",
             marker=curve.marker or None, linewidth=curve.width, label=curve.label or None,
             markerfacecolor="white" if curve.line else curve.colour,
-            clip_on=not curve.marker or _leaves(panel, curve),
+            clip_on=not curve.marker or bool(np.nanmax(curve.y, initial=0.0) > top),
             gid=f"curve{i}",
         )  # fmt: skip
     for i, mark in enumerate(panel.marks):
@@ -171,11 +172,6 @@ def _raised(axes: "Axes", strip: float, log: bool) -> None:
 def _labels(axes: "Axes", panel: Panel) -> Labels:
     ranges = axes.get_xlim(), axes.get_ylim()  # where they follow the data: settled now
     return Labels(panel, inside(axes), partial(in_points, axes), ranges)
-
-
-def _leaves(panel: Panel, curve: Curve) -> bool:
-    """Whether a curve goes on beyond the top of its panel."""
-    return panel.y_range is not None and bool(np.nanmax(curve.y, initial=0.0) > panel.y_range[1])
 
 
 def _ranges(axes: "Axes", panel: Panel) -> None:

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data
-from ccd_casadi.reporting.true_samples import read_truths
+from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths
 from surrogates import GaussianProcess, SurrogateFileError, load
 
 

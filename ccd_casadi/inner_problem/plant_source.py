@@ -17,7 +17,7 @@ from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
-from ccd_casadi.support.user_code import limited, require_user_code
+from ccd_casadi.support.user_code import require_user_code, with_time_limit
 
 Names = tuple[str, ...]
 Ends = tuple[float, ...]
@@ -167,12 +167,12 @@ def _own_function(source: PlantSource) -> ModelFunction:
         "correct it, or give it longer with plant_seconds in a table [limits]"
     )
     try:
-        limited(loader.exec_module, source.seconds, late)(module)
-        function = limited(getattr, source.seconds, late)(module, source.function, None)
+        with_time_limit(loader.exec_module, source.seconds, late)(module)
+        function = with_time_limit(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:
         raise
     except Exception as error:
         raise UserError(f"{path}: cannot be loaded: {described(error)}") from error
     if not callable(function):
         raise UserError(f"{path}: defines no function {source.function}; check plant.function")
-    return limited(function, source.seconds, late)
+    return with_time_limit(function, source.seconds, late)

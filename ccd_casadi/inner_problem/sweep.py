@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 from ccd_casadi.synthesis.weights import Weights
@@ -89,7 +89,7 @@ class InnerStatus(StrEnum):
 
 
 @dataclass(frozen=True)
-class InnerResult(Shown):
+class InnerResult(NotebookHtml):
     """The optimum (None if infeasible), what binds there, and every synthesis on the way.
 
     `violation` is the least one, in ln of the bounds, of any certified design; zero if solved.

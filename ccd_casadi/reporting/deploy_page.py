@@ -21,10 +21,9 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.facts import run_name, theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
-from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, shown
+from ccd_casadi.support.units import HZ, number, with_unit
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for
@@ -77,7 +76,8 @@ def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, s
 
 
 def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
-    nyquist = 0.5 * found.rate_hz
+    scalar = run.plant.B.shape[1] == len(run.plant.C) == 1
+    nyquist, named = 0.5 * found.rate_hz, "|{}|" if scalar else "σ_max({})"
     low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
     hz = frequency_grid(low, high, POINTS, run.plant.grid * run.plant.omega_0 / HZ)
     curves, drawn = [], []
@@ -90,10 +90,10 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     crossing = bandwidth_level(own, text=", sampled") if np.isfinite(own) else (
         bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")
     )  # fmt: skip
-    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named(run, 'S')} (–)")
-    bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist), legend=None)
+    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
+    bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
     title = f"Sensitivity and controller over frequency: {', '.join(k.label for k in drawn)}"
-    ends = (f"{shown(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
+    ends = (f"{with_unit(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
         "up to half the sampling rate. The gain of the controller there amplifies sensor noise and "
@@ -142,25 +142,22 @@ def _rates(found: Deployment) -> c.Words:
 
 
 def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
-    head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
-    rows = []
-    for row in item.rows:
-        f = row.figures
-        chosen = "chosen" if row is item.chosen else ""
-        result = chosen if f.certified else f.outcome.value
-        rows.append((
-            row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
-            f.gamma / run.figures.gamma if f.certified else float("nan"), result,
-        ))  # fmt: skip
     if item.designed is not None:
         words = f"Channel {item.channel.name}: {item.chosen.order} states, as designed."
         return (c.Words(words),)
+    head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
+    rows = tuple(
+        (row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
+         f.gamma / run.figures.gamma if f.certified else float("nan"),
+         f.outcome.value if not f.certified else "chosen" if row is item.chosen else "")
+        for row in item.rows for f in [row.figures]
+    )  # fmt: skip
     words = (
         f"Channel {item.channel.name}: {item.chosen.order} of {item.rows[0].order} states are "
         f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
         f"above twice its bound; {item.strict.order} keep S_max itself."
     )
-    return c.Words(words), c.Table(head, tuple(rows))
+    return c.Words(words), c.Table(head, rows)
 
 
 def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
@@ -171,8 +168,8 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     if item.designed is not None:
         structure, kappa = item.designed
         words = (
-            f"Channel {item.channel.name}: gain {shown(gain_of(kappa), 'N/m', 4)}; the sections as "
-            "they were designed."
+            f"Channel {item.channel.name}: gain {with_unit(gain_of(kappa), 'N/m', 4)}; the "
+            "sections as they were designed."
         )
         return c.Words(words), structured_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
@@ -181,9 +178,9 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
-        f"Channel {item.channel.name}: gain {shown(found.gain, 'N/m', 4)} at s = 0, "
-        f"{shown(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at s = 0."
-        " A negative ζ, or a negative frequency of a single root, is in the right half plane."
+        f"Channel {item.channel.name}: gain {with_unit(found.gain, 'N/m', 4)} at s = 0, "
+        f"{with_unit(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at "
+        "s = 0. A negative ζ, or a negative frequency of a single root, is in the right half plane."
     )
     return c.Words(words), c.Table(head, rows)
 

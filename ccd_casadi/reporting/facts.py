@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.support.units import HZ, counted, number, shown_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, number
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
@@ -77,7 +77,7 @@ def cost_axis(problem: CoDesignProblem) -> str:
 def theta_axes(problem: CoDesignProblem) -> list[tuple[str, str, float]]:
     """Name, unit for the eye and the factor to it of every parameter."""
     ends = zip(problem.names, problem.units, problem.upper, strict=True)
-    return [(name, *shown_unit(unit, upper)) for name, unit, upper in ends]
+    return [(name, *display_unit(unit, upper)) for name, unit, upper in ends]
 
 
 def theta_words(result: Mapping[str, Any]) -> str:
@@ -85,10 +85,10 @@ def theta_words(result: Mapping[str, Any]) -> str:
     units = result.get("units", {})
     words = []
     for name, value in {**result["theta"], **result.get("fixed", {})}.items():
-        unit, factor = shown_unit(units.get(name, ""), value)
+        unit, factor = display_unit(units.get(name, ""), value)
         words.append(f"{name} = {number(factor * value)} {unit}".strip())
     for name, (low, high) in result.get("varies", {}).items():
-        unit, factor = shown_unit(units.get(name, ""), high)
+        unit, factor = display_unit(units.get(name, ""), high)
         words.append(f"every {name} from {factor * low:.5g} to {factor * high:.5g} {unit}".strip())
     return ", ".join(words)
 
@@ -104,11 +104,11 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
         rows.append((name, unit or "–", *numbers, place))
     lists = result.get("listed", {}).get("values", {})
     for name, value in result.get("fixed", {}).items():
-        unit, factor = shown_unit(problem.parameter_units[name], value)
+        unit, factor = display_unit(problem.parameter_units[name], value)
         place = f"one of {len(lists[name])}" if name in lists else "fixed"
         rows.append((name, unit or "–", factor * value, "–", "–", "–", place))
     for name, ends in result.get("varies", {}).items():
-        unit, factor = shown_unit(problem.parameter_units[name], ends[1])
+        unit, factor = display_unit(problem.parameter_units[name], ends[1])
         low, high = (factor * end for end in ends)
         rows.append((name, unit or "–", "–", low, high, "–", "varies"))
     head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")

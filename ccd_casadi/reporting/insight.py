@@ -19,7 +19,7 @@ from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, display_unit, number
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
@@ -196,7 +196,7 @@ def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float
     if variable in ("omega_S", "omega_T"):
         return name.replace("omega", "ω"), value / HZ, 1.0 / HZ, "Hz"
     if variable in problem.names:
-        unit, factor = shown_unit(problem.units[problem.names.index(variable)], value)
+        unit, factor = display_unit(problem.units[problem.names.index(variable)], value)
         return name, factor * value, factor, unit
     return name, value, 1.0, ""
 

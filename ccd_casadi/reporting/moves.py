@@ -23,7 +23,7 @@ from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, number, shown, shown_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
 
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
@@ -134,7 +134,7 @@ def force_step(view: LoopView) -> c.Figure:
 
 def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    ways = {way.words: [way.move] for way in found.ways}
+    ways = {words: [move] for words, move in found.ways.items()}
     words = "The plant has its soft suspension. Hold and delay are exact."
     return ways_figure(ways, words), c.Words(_limit_words(found))
 
@@ -154,7 +154,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     panels, force = [], []
     for large in (True, False):  # those that are flat beside the large ones by themselves
         same = [way for way in kept if (FLAT * way[2] > top) == large]
-        unit, scale = shown_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
+        unit, scale = display_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
         curves, bands = [], []
         for name, each, _, colour in same:
             error = scale * np.array([_over(time, e, _error(e)) for e in each])
@@ -175,7 +175,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
-        f"{shown(first.window, 'm')}. {words}"
+        f"{with_unit(first.window, 'm')}. {words}"
     )
     return c.Figure(lines, caption, (c.Table(("way", *FIGURES), rows), *tables_of(lines)))
 
@@ -199,13 +199,13 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     when = "does not settle" if np.isinf(settled) else (
-        f"settled after {shown(settled, 's')}" if settled > 0.0 else "never out of its window"
+        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "never out of its window"
     )  # fmt: skip
-    words = f"{name}: {when}, error of at most {shown(peak, 'm')}"
+    words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, after the figure's end {shown(float(after.max()), 'm')}"
+    return f"{words}, after the figure's end {with_unit(float(after.max()), 'm')}"
 
 
 def _limit_words(found: OnHardware) -> str:
@@ -217,7 +217,7 @@ def _limit_words(found: OnHardware) -> str:
             "The unlimited move itself does not end in its window within the time watched: ask for "
             "more stiffness at low frequencies (compliance_max, S_low), or widen the window."
         )
-    peak = max(float(way.move.peak_force.max()) for way in found.ways[:2])
+    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
     if found.least_limit == 1.0:
         return (
             words + "Of the limits tried none below the peak force lets the move end in its window."

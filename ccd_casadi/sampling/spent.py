@@ -8,7 +8,7 @@ from typing import Any
 SHOWN = {"races": "multi-start searches", "box_look": "global check"}
 
 
-class Spent:
+class SynthesisCounts:
     """Counts of true syntheses; `purpose` is what is being done."""
 
     def __init__(self) -> None:

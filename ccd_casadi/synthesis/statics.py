@@ -16,7 +16,7 @@ from ccd_casadi.lti.grid import climbed
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ, metres, shown
+from ccd_casadi.support.units import HZ, metres, with_unit
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
@@ -53,7 +53,7 @@ class Statics:
         if self.integrates:
             return f"The controller integrates: a constant force does not move the stage; {low}."
         found = (
-            f"Static stiffness K(0) = {shown(self.stiffness, 'N/m')}: a constant force of 1 N "
+            f"Static stiffness K(0) = {with_unit(self.stiffness, 'N/m')}: a constant force of 1 N "
             f"moves the stage {metres(self.compliance)}, {low}."
         )
         if self.differentiates:

@@ -297,7 +297,7 @@ def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: boo
         controller=loops.run,
         sampling=sampling,
     )
-    good = perturbed.Judged((0.0,), True, 1.0, 1.0, -1.0)
+    good = perturbed.PerturbedLoop((0.0,), True, 1.0, 1.0, -1.0)
     with mock.patch.object(perturbed, "judge", return_value=good):
         line = perturbed.shift_line(run, case.system(), REACH, 2)
         damped = perturbed.damping_line(run, case.system(), *FACTORS, 2)

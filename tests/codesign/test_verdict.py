@@ -324,7 +324,7 @@ def test_every_place_shows_the_same_lines() -> None:
     for name in shown.LINES:
         assert f"{name} words" in terminal
         assert f"{name} words" in page
-    assert shown.worst(result) is v.State.WARNED
+    assert shown.worst_state(result) is v.State.WARNED
     assert shown.head_words(result) == "with warnings: survives"
     assert "all checks passed" not in shown.head_words(result)
     assert "survives" in shown.head_words(result)

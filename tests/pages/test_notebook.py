@@ -18,7 +18,7 @@ from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.support.errors import MissingPackage
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,7 +50,7 @@ class _Text(HTMLParser):
             self.text += data
 
 
-def shown(item: Shown) -> str:
+def shown(item: NotebookHtml) -> str:
     return _Text(item._repr_html_()).text.replace("\u00a0", " ")  # a unit stays with its number
 
 

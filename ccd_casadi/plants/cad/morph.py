@@ -110,7 +110,7 @@ def draw_morph(
         for row in theta:
             try:
                 solid.load(gmsh, drawn(row)[0])
-                samples.append(solid.moved(gmsh, mesh))
+                samples.append(solid.moved_points(gmsh, mesh))
             except PlantError as refused:
                 words = f"the solid at {named_values(names, row)}: {refused}"
                 raise PlantError(words) from refused

@@ -80,8 +80,8 @@ def table_of_samples(
 
     return ModalTable(
         names=tuple(names),
-        input_names=named(folder, dofs, "in"),
-        output_names=named(folder, dofs, "out"),
+        input_names=names_of_kind(folder, dofs, "in"),
+        output_names=names_of_kind(folder, dofs, "out"),
         constraint_names=tuple(name.split(":", 1)[1] for name in constraints),
         theta=numbers(*names),
         omega=omega,
@@ -138,7 +138,7 @@ def _shape_values(folder: Path, dofs: list[dict[str, str]], bases: list[Array]) 
 
 def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) -> Array:
     """(n, k) columns that pick the dofs of each name of this kind."""
-    names = named(folder, dofs, kind)
+    names = names_of_kind(folder, dofs, kind)
     found = np.zeros((size, len(names)))
     for row in dofs:
         if row["kind"] == kind:
@@ -151,7 +151,7 @@ def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) ->
     return found
 
 
-def named(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
+def names_of_kind(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
     """Names of this kind in dofs.csv. Raises PlantError where there is no input or no output."""
     names = tuple(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
     if kind != "shape" and not names:
