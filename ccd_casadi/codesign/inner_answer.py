@@ -35,7 +35,7 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
-from ccd_casadi.inner_problem.structured_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.inner_problem.structured_robustness import certify_lattice, proof_of, worst_case
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
@@ -221,8 +221,8 @@ def structured_answer(
     structured = replace(structured_of(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, controller=structured)), start=theta)
     if begin_at is not None:
-        anchors = (sections_kappa(begin_at, structure_of(asked)),)
-        asked = replace(asked, controller=replace(structured_of(asked), anchors=anchors))
+        warm_starts = (sections_kappa(begin_at, structure_of(asked)),)
+        asked = replace(asked, controller=replace(structured_of(asked), warm_starts=warm_starts))
     asked, made = prepared(asked, progress, workers, begin_at is not None)
     fastest = made.bandwidth
     asked, made, least = least_from(asked, theta, made, progress)
@@ -238,11 +238,11 @@ def structured_answer(
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
-    looks = [(look, asked, theta, made) for look in (worst_members, proof_of)]
+    looks = [(look, asked, theta, made) for look in (worst_case, proof_of)]
     found = dict(workers.map_unordered(_looked, looks))
-    (worst, _), proof = found[worst_members.__name__], found[proof_of.__name__]
+    (worst, _), proof = found[worst_case.__name__], found[proof_of.__name__]
     assert made.controller is not None
-    wide, checked = judged_widely(asked, theta, made.controller, worst, workers)
+    wide, checked = certify_lattice(asked, theta, made.controller, worst, workers)
     passed = wide.passed and not proof.refuted
     figures = head | {
         **design_dict(asked, theta, made),

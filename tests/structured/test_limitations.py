@@ -25,7 +25,7 @@ from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import handed_out
+from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights
 
@@ -194,7 +194,7 @@ def test_no_h_infinity_design_exceeds_the_bound(seed: int) -> None:
     made = synthesise(
         plant, weights, omega_low=omega_low, gamma_backoff=problem.inner.gamma_backoff
     )
-    controller = handed_out(plant, made, omega_low).controller
+    controller = recertified_in_si(plant, made, omega_low).controller
     loose = Bounds(50.0, 1.0, omega_low, weighted_level=1e9, weights=weights)
     loop = judged([plant], controller, loose, None, False)[0]
     level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
