@@ -131,11 +131,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser(
         "ccd_casadi.cross_check",
-        "One synthesis by every back end; CASE.toml may also be the folder of a finished solve.",
+        "Compare one synthesis by every back end. CASE.toml may be the folder of a finished solve.",
         without_effect=["--seed"],
     )
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file")
-    add_break_frequencies(arguments, "a pair (default: the best at theta, or the run's)")
+    add_break_frequencies(arguments, "of a weight (default: the best at theta, or the run's)")
     arguments.add_argument(
         "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="time limit of each optional back end (default: 60)",

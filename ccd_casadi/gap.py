@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser(
         "ccd_casadi.gap",
-        "Bounds on the bandwidth of every controller on the model at one theta, as JSON on stdout; "
+        "Bound the bandwidth of every controller on the model at one theta; print JSON. "
         "CASE.toml may be the folder of a finished solve.",
         without_effect=("--out", "--workers", "--seed", "--quiet"),
     )

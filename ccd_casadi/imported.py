@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
         "ccd_casadi.imported",
-        "A modal table from result files or matrices; see docs/own_finite_elements.md.",
+        "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
         metavar="FOLDER",
         about="the folder with index.csv and dofs.csv",
         without_effect=["--workers", "--seed", "--no-user-code"],

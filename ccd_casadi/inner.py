@@ -101,7 +101,7 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser(
-        "ccd_casadi.inner", "The true inner problem at one theta, as JSON on stdout."
+        "ccd_casadi.inner", "Find the best controller at one theta; print it as JSON."
     )
     arguments.add_argument(
         "--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"
@@ -110,9 +110,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--begin-at",
         metavar="FOLDER",
         type=Path,
-        help="sections: search from the controller.json of a run alone, not from many starts",
+        help="sections: start one search from the controller of this run, not many",
     )
-    add_break_frequencies(arguments, "with the other one: a single synthesis there")
+    add_break_frequencies(arguments, "of a weight; with both: one synthesis, no search")
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 

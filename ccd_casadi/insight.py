@@ -57,7 +57,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = run_parser("ccd_casadi.insight", "Hardware cost against bandwidth around a design.")
+    arguments = run_parser("ccd_casadi.insight", "Trade hardware cost against bandwidth.")
     arguments.add_argument(
         "--points",
         metavar="N",

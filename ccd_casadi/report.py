@@ -40,7 +40,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.report", "The pages of a finished folder, drawn again; nothing is designed.",
+        "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
         without_effect=["--out", "--workers", "--seed"],
     )  # fmt: skip
     return run(command, arguments, argv, needs=["ccd_casadi.drawing.stored"])

@@ -73,7 +73,7 @@ PERCENT = real(0.0, 50.0, strict=True)
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.robustness", "Margins, uncertain plants, noise and a move of a design."
+        "ccd_casadi.robustness", "Find what a design survives: plants, tolerances, noise, a move."
     )
     add = arguments.add_argument
     words = "judge this controller, not the run's: .json, .mat or .toml, see docs/robustness.md"

@@ -88,8 +88,8 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     """What J counts of the controller, and what was predicted of it."""
     from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
+    from ccd_casadi.reporting.facts import prediction_words
 
-    sample = result.get("verdict", {}).get("predicted", {}).get("left_out") is not None
     where = " on every plant" if "plants" in result["certificate"] else ""
     bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{where}"
     v = FIGURES[result.get("minimise", BANDWIDTH.key)]
@@ -100,9 +100,7 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
             v.shown(result[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}")
         )
         lines = [f"{v.words:<13} {of} over the set", bandwidth]
-    error = f"predicted {told} (error {100.0 * result['verification_error']:.2g} %)"
-    lines[0] += "   a sample of the surrogate" if sample else f"   {error}"  # which it repeats
-    return lines
+    return [f"{lines[0]}   {prediction_words(result, told)}".rstrip(), *lines[1:]]
 
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:

@@ -73,7 +73,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.tune", "The fastest PID with notches for a plant that exists, with its C code.",
+        "ccd_casadi.tune", "Find the fastest PID with notches for a plant that exists.",
         metavar="DATA", nargs="+",
         about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
     )  # fmt: skip

@@ -36,7 +36,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = parser("ccd_casadi.worth", "What co-design gains over the sequential way.")
+    arguments = parser("ccd_casadi.worth", "Estimate what co-design gains over the sequential way.")
     return run(command, arguments, argv, needs=["ccd_casadi.studies.worth"])
 
 

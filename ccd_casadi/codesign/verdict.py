@@ -105,7 +105,7 @@ def optimal(
         return Line(State.FAILED, f"{words}; {known}", figures)
     words = (
         f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
-        f"controller together, {kink.one_gradient:.2g} with one side's gradient alone; "
+        f"controller together ({kink.one_gradient:.2g} with the gradient of one side); "
         f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
@@ -122,8 +122,8 @@ def _sides(kink: Kink) -> str:
     if not known:
         return "is not known beside it"
     if len(found) == 2 and known == 2:
-        words = f"grows by {found[0]:.2g} and {found[1]:.2g} of its gradient on the two sides"
-        return f"{words} of the one direction that is left"
+        words = f"{found[0]:.2g} and {found[1]:.2g} times its gradient"
+        return f"rises on both sides of the direction that no bound holds ({words})"
     return (
         f"grows by at least {kink.least_slope:.2g} of its gradient on {known} of {len(found)} "
         f"sides of {len(kink.slopes)} directions"

@@ -43,16 +43,16 @@ class Triangular:
         return found
 
     def _substituted(self, own: np.ndarray, s: np.ndarray) -> np.ndarray:
-        T, B, C = self.T[own, None], self.B[own, None], self.C[own, None]
-        total = self.D[own, None] + np.zeros((*s.shape, 1, 1), complex)
-        known: dict[int, np.ndarray] = {}
-        for i in reversed(range(T.shape[-1])):
-            right = B[..., i, :] + np.zeros((*s.shape, 1), complex)
-            for j in np.flatnonzero(self.coupled[i]).tolist():
-                right += T[..., i, j, None] * known[j]
-            known[i] = right / (s - T[..., i, i])[..., None]
-            total += C[..., :, i, None] * known[i][..., None, :]
-        return total
+        T, B, C, (N, k) = self.T[own], self.B[own], self.C[own], s.shape
+        n, m = B.shape[1:]
+        X = np.empty((N, n, k * m), complex)  # (s - T)⁻¹B
+        for i in reversed(range(n)):
+            right, j = B[:, i, None, :], np.flatnonzero(self.coupled[i])
+            if len(j):
+                right = right + (T[:, i, j][:, None] @ X[:, j]).reshape(N, k, m)
+            X[:, i] = (right / (s - T[:, i, i, None])[..., None]).reshape(N, k * m)
+        total = (C @ X).reshape(N, C.shape[1], k, m).transpose(0, 2, 1, 3)
+        return np.asarray(self.D[own, None] + total)
 
 
 class Responses:

@@ -61,7 +61,7 @@ def worst_members(
         seed = structured_of(problem).seed + turn
         time, option, point = latest_plant(problem, theta, made.controller, seed)
         if progress is not None:
-            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms told")
+            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
         if time > value:
             found = (*found, (option, tuple(map(float, point))))
     return worst, found

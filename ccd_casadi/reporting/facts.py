@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.drawing.content import Fact, Table
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.units import HZ, counted, display_unit, number
 
@@ -21,7 +22,9 @@ def conclusion(result: Mapping[str, Any]) -> str:
     cost = f"a hardware cost of {cost_words(result)} (J = {number(result['objective'], 6)})"
     if "race" in result:  # a fixed structure
         order = f"a controller of order {result['controller']['order']}"
-        return f"{begins}: {order} with a bandwidth of {hz} on {_plants(result)}, at {cost}."
+        v = FIGURES[result.get("minimise", BANDWIDTH.key)]
+        own = "" if v is BANDWIDTH else f"{v.words} {v.shown(result[f'{v.entry}_of_set'])} and "
+        return f"{begins}: {order} with {own}a bandwidth of {hz} on {_plants(result)}, at {cost}."
     certificate = result["certificate"]
     proof = (
         f"certified stable with ‖[W_S S; W_KS KS; W_T T]‖∞ ≤ {number(certificate['norm_bound'])}"
@@ -148,21 +151,31 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
 
 def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list[Fact]:
     """J and what it counts, true and predicted; `of`: which bandwidth it is, in words."""
-    figure, guess = problem.figure, r["surrogate_bandwidth_hz"]
-    value = ("Predicted bandwidth", f"{number(guess, 6)} Hz")
-    known = r.get("verdict", {}).get("predicted", {}).get("left_out") is not None
-    error = f"relative error {number(r['verification_error'], 2)}"
+    figure, guess = problem.figure, f"{number(r['surrogate_bandwidth_hz'], 6)} Hz"
     v, words, entry = figure.symbol, figure.words, figure.entry
+    bandwidth, value = ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz"), []
     if f"{entry}_of_set" in r and not figure.larger_is_better:
         e, guess = (figure.shown(r[key], 6) for key in (f"{entry}_of_set", f"surrogate_{entry}"))
-        value = (f"{words[0].upper()}{words[1:]} {v}", f"{e} over the set (predicted {guess})")
+        name = f"{words[0].upper()}{words[1:]} {v}"
+        value = [(name, f"{e} over the set", prediction_words(r, guess))]
+    else:
+        of = "; ".join(filter(None, (of, prediction_words(r, guess))))
     J = f"{problem.w1:g} f(θ) + ({problem.w2:g}) {v}, {v} in {figure.si_unit}"
     return [
         ("Objective J", number(r["objective"], 7), J),
         ("Hardware cost f(θ)", cost_words(r, 6), ""),
-        ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", of),
-        (*value, "a sample of the surrogate, which it repeats" if known else error),
+        (*bandwidth, of),
+        *value,
     ]
+
+
+def prediction_words(r: Mapping[str, Any], guess: str) -> str:
+    """What was predicted of the design: nothing without a surrogate, or of one of its samples."""
+    if r["formulation"] == "direct":
+        return ""
+    if r.get("verdict", {}).get("predicted", {}).get("left_out") is not None:
+        return "a sample of the surrogate"  # which repeats it
+    return f"predicted {guess} (error {100.0 * r['verification_error']:.2g} %)"
 
 
 def sensitivity_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:

@@ -205,7 +205,7 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, of {with_unit(float(after.max()), 'm')} after the figure's end"
+    return f"{words}, after the figure's end {with_unit(float(after.max()), 'm')}"
 
 
 def _limit_words(found: OnHardware) -> str:

@@ -26,6 +26,7 @@ USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.m
 )
 SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
 OVERSHOOT = 0.5  # of a step without feedforward
+BETWEEN = 1.1  # of the largest |S| on the lines of a response: what it may reach between them
 NO_SET = "[robust] names no plant"  # as verified_structured says it
 STATUS = {
     "verified": "verified",
@@ -106,7 +107,7 @@ def advice(result: Mapping[str, Any]) -> str:
     looked_at = loop_concerns(result)
     if not states:
         words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
-        return f"{words} Next: {NEXT['loop']}." if looked_at else ""
+        return f"{words} Next: a smaller S_max." if looked_at else ""
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
@@ -144,6 +145,9 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
             found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
         if result["settling_ms"] is None:
             found.append("a step does not settle within 160 periods of the bandwidth")
+    reach = result.get("sensitivity_peak_between_lines")  # of a measured response
+    if reach is not None and reach > BETWEEN * result["sensitivity_peak"]:
+        found.append(f"|S| may reach {reach:.3g} between two lines: measure more of them there")
     return [*found, *result.get("loop_warnings", ())]
 
 

@@ -26,7 +26,7 @@ from ccd_casadi.support.units import HZ, number
 from surrogates import design, to_casadi
 
 SLOW = 0.3  # seconds of processor time of a plant at a θ: finite elements
-LOOKS, LOOKS_SLOW = 8, 2  # true inner problems over the box for each parameter
+LOOKS, LOOKS_SLOW = 8, 1  # true inner problems over the box for each parameter
 STARTS, STARTS_SLOW = 8, 0  # of IPOPT on the hardware, besides the case's own
 ROUNDS = 12  # of surrogate, IPOPT and truth, at most
 SETTLED = 1e-3  # of |J|: a round that gains less, as expected, is the last

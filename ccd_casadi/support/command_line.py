@@ -73,7 +73,7 @@ def run_parser(
         "--seed", "seed of all random numbers (default: 0)", metavar="N", type=integer(0), default=0
     )
     add("--quiet", "print no progress and no summary", action="store_true")
-    words = "refuse a case whose plant is a Python function, which is code of its author"
+    words = "refuse a case whose plant is a Python function"
     add("--no-user-code", words, action="store_true")
     return result
 

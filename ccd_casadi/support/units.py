@@ -60,8 +60,8 @@ def counted(number: int, noun: str) -> str:
 def number(value: Any, digits: int = 5) -> str:
     """A number to `digits` significant digits; a dash where there is none.
 
-    >>> number(72.0451741), number(1.5e-9, 3), number(None), number(1800.0)
-    ('72.045', '1.5e-09', '–', '1800')
+    >>> number(72.0451741), number(1.5e-9, 3), number(None), number(1800.0), number(999.6, 3)
+    ('72.045', '1.5e-09', '–', '1800', '999.6')
     """
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "–"
@@ -72,5 +72,5 @@ def number(value: Any, digits: int = 5) -> str:
     size = abs(float(value))
     if 1.0 <= size < 1e7:
         # never fewer digits than the whole part has: 110023 stays 110023
-        digits = max(digits, len(str(int(size))))
+        digits = max(digits, len(str(round(size))))
     return f"{float(value):.{digits}g}"
