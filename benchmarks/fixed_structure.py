@@ -27,7 +27,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess, constraints, to_theta
 from ccd_casadi.fixed_structure.local_search import ascend
 from ccd_casadi.fixed_structure.race import started
-from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
@@ -129,7 +129,7 @@ def starts(seed: int, count: int = 16) -> dict[str, dict[str, object]]:
             problem = problem_for(plants, structure, limits, sampling)
             rng = np.random.default_rng(seed)
             draws = np.exp(rng.uniform(np.log(0.03), 0.0, 40 * count))
-            pool = kept(problem, at_random(problem, draws, rng))[:count]
+            pool = stabilising(problem, at_random(problem, draws, rng))[:count]
             tops = [ascend(problem, started(problem, kappa), iterations=150) for kappa in pool]
             good = [end for end in tops if end.point.assessment.violation < 1e-4]
             unit = problem.plants.omega_0 / HZ
@@ -168,7 +168,7 @@ def derivatives(seed: int, count: int = 200) -> dict[str, float]:
 
         base = at(theta)
         problem = problem_for([base], structure, bounds, sampling)
-        starts = kept(problem, at_random(problem, np.exp(rng.uniform(-3.0, 0.0, 30)), rng))
+        starts = stabilising(problem, at_random(problem, np.exp(rng.uniform(-3.0, 0.0, 30)), rng))
         if not len(starts):
             continue
         looked += 1

@@ -38,7 +38,7 @@ def main() -> None:
     at = dict(zip(case.names, case.start, strict=True)) | start
     case = replace(case, start=tuple(at.values()))
     anchored, made = prepared(case)
-    anchored, made = least_from(anchored, case.start, made)
+    anchored, made, _ = least_from(anchored, case.start, made)
     print(
         f"   {varied} mm   mass kg   Hz    move ms at that   Hz of the least   least ms   "
         "setpoint ms   W"

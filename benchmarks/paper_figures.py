@@ -29,7 +29,7 @@ from ccd_casadi.drawing.content import (
     Table,
     Words,
 )
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.drawing.svg import CYCLE
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.bode import bode
@@ -123,7 +123,7 @@ def main() -> None:
     given = parser.parse_args()
     found = sections(problem_of(load_case(given.case)), TWO_MASS)
     head = Head("The paper's figures 4 and 5", "good", "computed", "", "", "")
-    given.out.write_text(painted(Page(head, tuple(found), index="")))
+    given.out.write_text(page_html(Page(head, tuple(found), index="")))
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import FIRST, Curve, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import MARGIN, designed
-from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import build_plant, mechanics
@@ -187,7 +187,7 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     rng = np.random.default_rng(seed + 2 * 10**9)
     plants = asked.uncertain.plants(asked.uncertain.corners())
     free = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
-    starts = kept(free, at_random(free, np.exp(rng.uniform(np.log(0.03), 0.0, 24)), rng))
+    starts = stabilising(free, at_random(free, np.exp(rng.uniform(np.log(0.03), 0.0, 24)), rng))
     if not len(starts):
         return asked, None
     peaks = assess(free, starts[0], FIRST, depth=-50.0).peaks

@@ -36,7 +36,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
-    moved,
+    scaled_to_plant,
     structure_of,
     structured_of,
     with_options,
@@ -103,8 +103,8 @@ def climbs(
         for starts in (STARTS,) if race else (0, STARTS):
             made = synthesise_sections(
                 members, own, bounds_of(problem), sampling=sections.sampling,
-                initial=[start, moved(own, first, members[0], start)], only_initial=not starts,
-                starts=starts, frequencies=sections.frequencies,
+                initial=[start, scaled_to_plant(own, first, members[0], start)],
+                only_initial=not starts, starts=starts, frequencies=sections.frequencies,
             )  # fmt: skip
             if made.certified:
                 break

@@ -11,11 +11,11 @@ Names are imported when they are first used: this module alone loads neither num
 import sys as _sys
 
 from ccd_casadi.support import interrupts as _interrupts
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from surrogates.lazy_names import from_stub as _from_stub
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
-    _interrupts.starting()
+    _interrupts.exit_on_ctrl_c()
 
 del _interrupts
 
@@ -36,4 +36,4 @@ def _html_of(item: object) -> str:
     return html_of(item)
 
 
-Shown.drawn = _html_of  # loaded when something is shown, and not before
+NotebookHtml.drawn = _html_of  # loaded when something is shown, and not before

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 from ccd_casadi.support.command_line import ExitCode
-from ccd_casadi.support.interrupts import begun
+from ccd_casadi.support.interrupts import raise_on_ctrl_c
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.package_text import package_text
 from ccd_casadi.support.terminal import say
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     named = ALIASES.get(words[0], words[0]) if words else ""
     if named in COMMANDS:
         return int(import_module(COMMANDS[named][0]).main(words[1:]))
-    begun()
+    raise_on_ctrl_c()
     if not words or words in (["--help"], ["-h"], ["help"]):
         print(overview(Path()))
         return ExitCode.DONE
@@ -68,11 +68,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     if words[0] == "new" and len(words) == 2 and not words[1].startswith("-"):
         return new(Path(words[1]))
     if words[0] == "new":
-        wrong = "new takes one name, that of the folder to make, as in: ccd new my_stage"
+        wrong = f"ccd new NAME: {OWN['new']}"
     elif words[0] in OWN:
-        wrong = f"{words[0]} takes nothing more, as in: ccd {words[0]}"
+        wrong = f"ccd {words[0]}: {OWN[words[0]]}"
     else:
         wrong = f"{words[0]!r} is not a command; there are {', '.join((*COMMANDS, *OWN))}"
+    if words[0] in OWN and words[1:] in (["--help"], ["-h"]):
+        print(wrong)
+        return ExitCode.DONE
     say(one_line(wrong), sys.stderr)
     return ExitCode.BAD_INPUT
 

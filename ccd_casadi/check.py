@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, program, run, run_folder
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.units import counted
 
 
@@ -66,7 +66,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity
     from ccd_casadi.cases.plant_report import plant_report
-    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.json_files import json_values, write_json
 
     case = load_case(options.case)
     problem = problem_of(case)
@@ -76,12 +76,12 @@ def command(options: argparse.Namespace) -> ExitCode:
         say(f"{options.case}: plant: {item.words}", sys.stderr)
     if errors:
         return ExitCode.BAD_INPUT
-    found = clean(plant_report(case, problem, facts, findings))
+    found = json_values(plant_report(case, problem, facts, findings))
     if options.out is not None:
         write_json(run_folder(options.case, options.out) / "check.json", found)
     say(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
-    if not options.json and not options.quiet:
-        say(f"next          {program('ccd_casadi.solve')} {options.case}")
+    if not options.json:
+        inform(f"next          {program('ccd_casadi.solve')} {options.case}")
     return ExitCode.DONE
 
 

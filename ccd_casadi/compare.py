@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.studies.comparison import Comparison
@@ -55,8 +55,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.studies.compare_page import comparison_page
 
     write_page(folder / "report.html", comparison_page(folder, comparison, answer))
-    if not options.quiet:
-        say(f"page          {folder / 'report.html'}")
+    inform(f"page          {folder / 'report.html'}")
     statuses = {method.figures["status"] for method in comparison.methods if method.solution}
     if statuses == {"infeasible"}:
         return ExitCode.INFEASIBLE

@@ -25,7 +25,7 @@ def _problem(
     """Problem, θ and (ω_S, ω_T) in rad/s of a case file with --theta, or of a finished run."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
-    from ccd_casadi.cases.run_folder import read_run, refuse_structured
+    from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.inner_problem.problem import true_inner
 
     point = break_frequencies(options)
@@ -34,7 +34,10 @@ def _problem(
         if options.theta is not None:
             raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
         point = point or (done.weights.omega_S, done.weights.omega_T)
-        refuse_structured(done, "cross_check", "result.json holds the judge's own figures")
+        if done.kappa is not None:
+            words = 'cross_check is for controller.structure = "h_infinity" so far'
+            remedy = "result.json holds the judge's own figures"
+            raise CaseError(f"{done.folder}/case.toml: controller.structure: {words}; {remedy}")
         problem, theta = done.problem, done.theta
     else:
         case = load_case(options.case)
@@ -53,7 +56,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
     from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
-    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.versions import versions
     from ccd_casadi.support.worker_process import Runner
     from ccd_casadi.synthesis.backends.mixed import RICCATI, TITLES, synthesise_with, verdicts
@@ -88,7 +91,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             "backends": backends,
             "versions": versions(),
         }
-        write_json(folder / "cross_check.json", clean(answer))
+        write_json(folder / "cross_check.json", json_values(answer))
     own = next(item for item in found if item.backend == RICCATI)
     return ExitCode.DONE if own.holds else ExitCode.NOT_VERIFIED
 
@@ -128,11 +131,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser(
         "ccd_casadi.cross_check",
-        "One synthesis by every back end; CASE.toml may also be the folder of a finished solve.",
+        "Compare one synthesis by every back end. CASE.toml may be the folder of a finished solve.",
         without_effect=["--seed"],
     )
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file")
-    add_break_frequencies(arguments, "a pair (default: the best at theta, or the run's)")
+    add_break_frequencies(arguments, "of a weight (default: the best at theta, or the run's)")
     arguments.add_argument(
         "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="time limit of each optional back end (default: 60)",

@@ -3,15 +3,15 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import number, one_line, positive
+from ccd_casadi.support.options import one_line, positive, real
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform, say
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.result import told
+    from ccd_casadi.codesign.result import with_verdict_line
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
@@ -34,6 +34,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.structured_text import structured_text
     from ccd_casadi.deployment.words import deployed_line
     from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.reporting.facts import run_name
 
     finished = read_run(options.run)
     status = finished.result.get("status")
@@ -72,29 +73,25 @@ def command(options: argparse.Namespace) -> ExitCode:
         (folder / name).unlink(missing_ok=True)
     write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
-        naming = {
-            "title": options.run.resolve().name, "delay": found.delay, "verified": found.passed
-        }  # fmt: skip
-        texts = write_c(folder, found.realisation, **naming, forward=moved.forward)
-        (folder / ST_FILE).write_text(structured_text(found.realisation, **naming), "utf-8")
-        if options.fmu and not write_fmu(
-            folder / FMU_FILE, found.realisation, texts, str(naming["title"])
-        ):
+        K, name = found.realisation, run_name(options.run)
+        naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed}
+        texts = write_c(folder, K, **naming, forward=moved.forward)
+        (folder / ST_FILE).write_text(structured_text(K, **naming), "utf-8")
+        if options.fmu and not write_fmu(folder / FMU_FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
-    finished = told(finished, folder, "deployable", deployed_line(finished, found))
-    if not options.quiet:
-        say(_summary(finished, found))
+    finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
+    inform(_summary(finished, found))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.index import index_of, publish
     from ccd_casadi.reporting.moves import way_words
 
-    if moved is not None and not options.quiet:
-        say(f"{'a move':13s} {way_words(moved.ways[-1].words, [moved.ways[-1].move])}")
+    if moved is not None:
+        last = list(moved.ways)[-1]
+        inform(f"{'a move':13s} {way_words(last, [moved.ways[last]])}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
-    if not options.quiet:
-        say(f"page          {folder / 'report.html'}")
+    inform(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
     say(one_line(f"not verified: {_shortfall(finished, found)}"), sys.stderr)
@@ -144,42 +141,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         "ccd_casadi.deploy",
         "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
     )
-    arguments.add_argument(
-        "--rate-hz", metavar="X", type=positive,
-        help="sampling rate (default: the next round rate above what is needed)",
-    )  # fmt: skip
+    add = arguments.add_argument
+    words = "sampling rate (default: the next round rate above what is needed)"
+    add("--rate-hz", metavar="X", type=positive, help=words)
     delay = arguments.add_mutually_exclusive_group()
-    delay.add_argument(
-        "--delay", metavar="SECONDS", type=number(), help="time from reading y to the new u, in s"
-    )
-    delay.add_argument(
-        "--delay-samples", metavar="X", type=number(), default=Timing.delay_samples,
-        help="the same time in sampling periods (default: 1)",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--lead", choices=["on", "off"], default="on",
-        help="a lead that compensates hold and delay (default: on, which lowers the rate)",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--unverified", action="store_true",
-        help="deploy a run that is not verified; the result is not verified either",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--saturation", metavar="NEWTON", type=positive,
-        help="limit every u to plus or minus this, with anti-windup (default: off)",
-    )  # fmt: skip
-    arguments.add_argument(
-        "--fmu", action="store_true",
-        help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC names",
-    )  # fmt: skip
+    words = "time from reading y to the new u, in s"
+    delay.add_argument("--delay", metavar="SECONDS", type=real(), help=words)
+    delay.add_argument("--delay-samples", metavar="X", type=real(), default=Timing.delay_samples,
+                       help="the same time in sampling periods (default: 1)")  # fmt: skip
+    words = "a lead that compensates hold and delay (default: on, which lowers the rate)"
+    add("--lead", choices=["on", "off"], default="on", help=words)
+    words = "deploy a run that is not verified; the result is not verified either"
+    add("--unverified", action="store_true", help=words)
+    words = "limit every u to plus or minus this, with anti-windup (default: off)"
+    add("--saturation", metavar="NEWTON", type=positive, help=words)
+    words = "also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC names"
+    add("--fmu", action="store_true", help=words)
     for name, metavar, words in (
-        ("sensor-step", "METRE", "of the simulated sensor"),
-        ("force-step", "NEWTON", "of the simulated actuator"),
-        ("jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
+        ("--sensor-step", "METRE", "of the simulated sensor"),
+        ("--force-step", "NEWTON", "of the simulated actuator"),
+        ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
     ):
-        arguments.add_argument(
-            f"--{name}", metavar=metavar, type=number(), default=0.0, help=f"{words} (default: 0)"
-        )
+        add(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
     add_move_options(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])
 

@@ -17,7 +17,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.limitations.of_problem import gap_of
-    from ccd_casadi.support.json_files import clean
+    from ccd_casadi.support.json_files import json_values
     from ccd_casadi.support.versions import versions
 
     began, bandwidth = perf_counter(), None
@@ -37,7 +37,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         "seconds": perf_counter() - began,
         "versions": versions(),
     }
-    json.dump(clean(answer), sys.stdout, indent=2, allow_nan=False)
+    json.dump(json_values(answer), sys.stdout, indent=2, allow_nan=False)
     print()
     return ExitCode.DONE
 
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser(
         "ccd_casadi.gap",
-        "Bounds on the bandwidth of every controller on the model at one theta, as JSON on stdout; "
+        "Bound the bandwidth of every controller on the model at one theta; print JSON. "
         "CASE.toml may be the folder of a finished solve.",
         without_effect=("--out", "--workers", "--seed", "--quiet"),
     )

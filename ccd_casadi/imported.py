@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.options import whole
+from ccd_casadi.support.options import integer
+from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.plants.imported.modal_table import ModalTable
@@ -37,9 +38,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         raise UserError(str(error)) from error
     file = run_folder(folder, options.out or folder) / "modes.csv"
     write_modal_table(file, table)
-    if not options.quiet:
-        N, r = table.omega.shape
-        print(f"{file}: {N} samples of {r} modes, {', '.join(table.names)}")
+    N, r = table.omega.shape
+    inform(f"{file}: {N} samples of {r} modes, {', '.join(table.names)}")
     return ExitCode.DONE
 
 
@@ -47,13 +47,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
         "ccd_casadi.imported",
-        "A modal table from result files or matrices; see docs/own_finite_elements.md.",
+        "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
         metavar="FOLDER",
         about="the folder with index.csv and dofs.csv",
         without_effect=["--workers", "--seed", "--no-user-code"],
     )
     arguments.add_argument(
-        "--modes", type=whole(1), default=10, metavar="N", help="modes of matrices (default: 10)"
+        "--modes", type=integer(1), default=10, metavar="N", help="modes of matrices (default: 10)"
     )
     arguments.add_argument(
         "--static-correction", action="store_true", help="exact static compliance of matrices"

@@ -3,18 +3,21 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.options import add_break_frequencies, break_frequencies
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.measured_case import MeasuredCase
     from ccd_casadi.codesign.inner_answer import InnerAnswer
+
+PROGRESS = partial(inform, stream=sys.stderr)  # stdout is for the answer
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -44,7 +47,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     with Workers(options.workers) as workers:
         if isinstance(problem.controller, StructuredProblem):
             workers.begin(worst_members.__module__)  # which imports little more than searches need
-        how = InnerOptions(options.seed, workers, _progress(options), point, options.begin_at)
+        how = InnerOptions(options.seed, workers, PROGRESS, point, options.begin_at)
         try:
             found = answer[type(problem.controller)](problem, theta, how)
         except UserError as error:
@@ -61,7 +64,7 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -
     if any(value is not None for value in given):
         words = 'plant.model = "measured" has no theta and no weights to place; leave out --theta'
         raise CaseError(f"{case.path}: {words}, --omega-s-hz, --omega-t-hz and --begin-at")
-    found, made = measured_answer(case, seed=options.seed, progress=_progress(options))
+    found, made = measured_answer(case, seed=options.seed, progress=PROGRESS)
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:
         from ccd_casadi.drawing.stored import write_page
@@ -73,17 +76,10 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -
     return _print(found, options, began)
 
 
-def _progress(options: argparse.Namespace) -> Callable[[str], None] | None:
-    """Progress on stderr, as stdout is for the answer."""
-    if options.quiet:
-        return None
-    return lambda words: say(words, sys.stderr)
-
-
 def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> ExitCode:
     """Print the answer, after controller.json is written: the folder may be refused."""
     from ccd_casadi.codesign.design_entries import figures_dict
-    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.versions import versions
 
     if options.out is not None and found.controller is not None:
@@ -96,9 +92,9 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
         "seed": options.seed,
         "formulation": "inner",
         "versions": versions(),
-        "sweep": [clean(figures_dict(row)) for row in found.rows],
+        "sweep": [json_values(figures_dict(row)) for row in found.rows],
     }
-    json.dump(clean(answer), sys.stdout, indent=2, allow_nan=False)
+    json.dump(json_values(answer), sys.stdout, indent=2, allow_nan=False)
     print()
     return ExitCode.of(found.status)
 
@@ -106,7 +102,7 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser(
-        "ccd_casadi.inner", "The true inner problem at one theta, as JSON on stdout."
+        "ccd_casadi.inner", "Find the best controller at one theta; print it as JSON."
     )
     arguments.add_argument(
         "--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"
@@ -115,9 +111,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--begin-at",
         metavar="FOLDER",
         type=Path,
-        help="sections: search from the controller.json of a run alone, not from many starts",
+        help="sections: start one search from the controller of this run, not many",
     )
-    add_break_frequencies(arguments, "with the other one: a single synthesis there")
+    add_break_frequencies(arguments, "of a weight; with both: one synthesis, no search")
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from time import perf_counter
 
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
-from ccd_casadi.support.options import whole
+from ccd_casadi.support.options import integer
 from ccd_casadi.support.process_pool import PATIENCE
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -43,27 +43,25 @@ def command(options: argparse.Namespace) -> ExitCode:
     told = insight_dict(done, front, responses)
     write_json(folder / "insight.json", told | {"seed": options.seed, "seconds": seconds})
     verified = [point for point in front.points if point.verified]
-    if not options.quiet:
-        say(f"front         {len(verified)} of {len(front.points)} points verified, "
-            f"{front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
+    inform(f"front         {len(verified)} of {len(front.points)} points verified, "
+           f"{front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
     from ccd_casadi.reporting.index import index_of, publish
     from ccd_casadi.reporting.insight import insight_page
 
     page = insight_page(done, front, responses, index_of(folder))
     publish(folder, folder / "insight.html", page)
-    if not options.quiet:
-        say(f"answer        {page.head.decision}")
-        say(f"page          {folder / 'insight.html'}")
+    inform(f"answer        {page.head.decision}")
+    inform(f"page          {folder / 'insight.html'}")
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = run_parser("ccd_casadi.insight", "Hardware cost against bandwidth around a design.")
+    arguments = run_parser("ccd_casadi.insight", "Trade hardware cost against bandwidth.")
     arguments.add_argument(
         "--points",
         metavar="N",
-        type=whole(2, 9999),
+        type=integer(2, 9999),
         default=20,
         help="most points on the front (default: 20)",
     )

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from ccd_casadi.support.command_line import ExitCode, run, run_parser
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.terminal import inform
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -32,15 +33,14 @@ def command(options: argparse.Namespace) -> ExitCode:
         publish(folder, report, page_of_run(read_run(folder)))
         drawn.append(report)
     write_index(folder)
-    if not options.quiet:
-        print("\n".join(f"drawn         {path}" for path in drawn))
+    inform("\n".join(f"drawn         {path}" for path in drawn))
     return ExitCode.DONE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.report", "The pages of a finished folder, drawn again; nothing is designed.",
+        "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
         without_effect=["--out", "--workers", "--seed"],
     )  # fmt: skip
     return run(command, arguments, argv, needs=["ccd_casadi.drawing.stored"])

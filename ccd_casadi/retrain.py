@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_parser
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import number, whole
+from ccd_casadi.support.options import integer, real
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import say
 from surrogates.files import copy_run
@@ -91,9 +91,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         about="the run folder; with --out a copy there is retrained",
     )  # fmt: skip
     add = arguments.add_argument
-    add("--budget", metavar="N", type=whole(1), default=500,
+    add("--budget", metavar="N", type=integer(1), default=500,
         help="most syntheses that retraining adds in total (default: 500)")  # fmt: skip
-    add("--tolerance", metavar="X", type=number(1e-12, 0.5),
+    add("--tolerance", metavar="X", type=real(1e-12, 0.5),
         help="relative agreement of prediction and truth (default: the case's)")  # fmt: skip
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])

@@ -8,15 +8,15 @@ from time import perf_counter
 from ccd_casadi.robust.demands import Demands, add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import number, positive, whole
+from ccd_casadi.support.options import integer, positive, real
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.result import told
+    from ccd_casadi.codesign.result import with_verdict_line
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
     from ccd_casadi.robust.study import robustness, study_dict, survival_line
     from ccd_casadi.support.json_files import write_json
@@ -59,22 +59,21 @@ def command(options: argparse.Namespace) -> ExitCode:
 
     own = options.controller is None
     if own:
-        finished = told(finished, folder, "survives", survival_line(finished, found))
+        finished = with_verdict_line(finished, folder, "survives", survival_line(finished, found))
     page = robustness_page(finished, found, options.seed, index_of(folder), own=own)
     publish(folder, folder / "robustness.html", page)
-    if not options.quiet:
-        say("\n".join(filter(None, (page.head.decision, *conclusion(finished, found)))))
-        say(f"page          {folder / 'robustness.html'}")
+    inform("\n".join(filter(None, (page.head.decision, *conclusion(finished, found)))))
+    inform(f"page          {folder / 'robustness.html'}")
     return ExitCode.DONE
 
 
-PERCENT = number(0.0, 50.0, strict=True)
+PERCENT = real(0.0, 50.0, strict=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.robustness", "Margins, uncertain plants, noise and a move of a design."
+        "ccd_casadi.robustness", "Find what a design survives: plants, tolerances, noise, a move."
     )
     add = arguments.add_argument
     words = "judge this controller, not the run's: .json, .mat or .toml, see docs/robustness.md"
@@ -84,12 +83,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="range of factors of the damping; default 0.5 2")  # fmt: skip
     add("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
         help="tolerance of every hardware parameter; default 1")  # fmt: skip
-    add("--samples", type=whole(1), default=200, metavar="N",
+    add("--samples", type=integer(1), default=200, metavar="N",
         help="number of random sets of hardware; default 200")  # fmt: skip
     add("--noise", type=positive, default=1.0, metavar="X", help="sensor noise, m/√Hz; default 1")
     add("--disturbance", type=positive, default=1.0, metavar="X",
         help="density of the force at every actuator, N/√Hz; default 1")  # fmt: skip
-    add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
+    add("--axis", type=integer(1), default=1, metavar="N", help="output that moves; default 1")
     add_move_options(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
-from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import counted, shown
+from ccd_casadi.support.terminal import inform, say
+from ccd_casadi.support.units import counted
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.tables import Case
@@ -56,10 +56,10 @@ def summary(solution: "Solution") -> str:
 
 def controller_lines(controller: Mapping[str, Any]) -> list[str]:
     """A controller of fixed structure: its order and gain, its sections in Hz."""
-    from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.inner_problem.sections_words import SectionWords, gain_words
 
     return [
-        f"controller    order {controller['order']}, gain {_gains(controller)}",
+        f"controller    order {controller['order']}, gain {gain_words(controller)}",
         *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
     ]
 
@@ -85,27 +85,22 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
     return [f"design plant  {robust['design_at']}{beside}"]
 
 
-def _gains(controller: Mapping[str, Any]) -> str:
-    """`4.7e+05 N/m`, of several channels `z: 4.7e+05 N/m, tip: …`."""
-    channels = controller.get("channels")
-    if channels is None:
-        return shown(controller["gain"], "N/m", 4)
-    return ", ".join(f"{item['name']}: {shown(item['gain'], 'N/m', 4)}" for item in channels)
-
-
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     """What J counts of the controller, and what was predicted of it."""
     from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
+    from ccd_casadi.reporting.facts import prediction_words
 
-    error = f"(error {result['verification_error']:.1e})"
     where = " on every plant" if "plants" in result["certificate"] else ""
     bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{where}"
     v = FIGURES[result.get("minimise", BANDWIDTH.key)]
     if v is BANDWIDTH:
-        return [f"{bandwidth}   predicted {result['surrogate_bandwidth_hz']:.4f} Hz {error}"]
-    of, guess = (result[key] for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}"))
-    words = f"{v.words:<13} {v.shown(of, 6)} over the set   predicted {v.shown(guess, 6)} {error}"
-    return [words, bandwidth]
+        lines, told = [bandwidth], f"{result['surrogate_bandwidth_hz']:.4f} Hz"
+    else:
+        of, told = (
+            v.shown(result[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}")
+        )
+        lines = [f"{v.words:<13} {of} over the set", bandwidth]
+    return [f"{lines[0]}   {prediction_words(result, told)}".rstrip(), *lines[1:]]
 
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
@@ -156,7 +151,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.formulations import formulation_of, slow_words, usual_name
     from ccd_casadi.codesign.run import co_design
     from ccd_casadi.codesign.run_files import resolved, write_run
-    from ccd_casadi.codesign.stored import named_surrogate
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
@@ -173,31 +167,26 @@ def command(options: argparse.Namespace) -> ExitCode:
         slow = slow_words(formulation, len(problem.names))
         if slow:
             say(f"warning: {slow}", sys.stderr)
-    given = None
-    if options.surrogate is not None:
-        given = named_surrogate(folder, options.surrogate, name, problem)
     store = folder / "samples.sqlite"
     with (
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(store) as samples,
     ):
-        if options.resume and not options.quiet:
+        if options.resume:
             held = counted(samples.count(), "row") if samples.count() else "nothing yet"
-            say(f"resuming      {store} holds {held}", sys.stderr)
+            inform(f"resuming      {store} holds {held}", sys.stderr)
         sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
+        solution = with_units(co_design(sampler, formulation, options.seed), problem)
         write_run(folder, case, solution)
     code = ExitCode.of(solution.result["status"])
-    if not options.quiet:
-        say(summary(solution))
-        say(f"run folder    {folder}")
+    inform(summary(solution))
+    inform(f"run folder    {folder}")
     if not options.no_report:
         from ccd_casadi.reporting.solve_page import write_report
 
         plant_case, solved = resolved(case, solution), solution.problem or problem
         write_report(folder, plant_case, solved, solution)
-        if not options.quiet:
-            say(f"page          {folder / 'index.html'}")
+        inform(f"page          {folder / 'index.html'}")
     if options.quiet and code is not ExitCode.DONE:
         say(f"{options.case}: {solution.result['reason']}", sys.stderr)
     return code
@@ -206,26 +195,13 @@ def command(options: argparse.Namespace) -> ExitCode:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser("ccd_casadi.solve", "Design a stage and its controller together.")
-    arguments.add_argument(
-        "--formulation",
-        choices=FORMULATIONS,
-        help="default: nested, or direct with many parameters or lists",
-    )
-    arguments.add_argument(
-        "--resume",
-        action="store_true",
-        help="print what the run folder holds; every run continues from it",
-    )
-    arguments.add_argument(
-        "--surrogate",
-        metavar="NAME",
-        help="start from a version of the run folder's surrogates (0002), not by sampling",
-    )
-    arguments.add_argument(
-        "--no-report",
-        action="store_true",
-        help="write no pages, for jobs that only need result.json",
-    )
+    add = arguments.add_argument
+    words = "default: nested, or direct with many parameters or lists"
+    add("--formulation", choices=FORMULATIONS, help=words)
+    words = "print what the run folder holds; every run continues from it"
+    add("--resume", action="store_true", help=words)
+    words = "write no pages, for jobs that only need result.json"
+    add("--no-report", action="store_true", help=words)
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from time import perf_counter
 
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
-from ccd_casadi.support.options import number, one_line, positive, whole
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.options import integer, one_line, positive, real
+from ccd_casadi.support.terminal import inform, say
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -24,7 +24,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.facts import loop_lines
     from ccd_casadi.reporting.measured_page import measured_page
     from ccd_casadi.reporting.verdict import advice
-    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.versions import versions
 
@@ -37,11 +37,11 @@ def command(options: argparse.Namespace) -> ExitCode:
         found = tune(
             options.run, rate_hz=options.rate_hz, delay=options.delay, S_max=options.s_max,
             shape=options.shape, effort=options.effort, structure=structure, seed=options.seed,
-            progress=None if options.quiet else lambda words: say(words, sys.stderr),
+            progress=lambda words: inform(words, sys.stderr),
             workers=workers,
         )  # fmt: skip
     answer, case = answer_of(found.case, found.design), found.case
-    result = clean({
+    result = json_values({
         "status": answer.status, **answer.figures, "seconds": perf_counter() - began,
         "models": [norm for norm in found.norms if norm is not None],  # ‖S‖∞ of each model's loop
         "seed": options.seed, "formulation": "tune", "versions": versions(),
@@ -53,8 +53,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         write_page(folder / "report.html", measured_page(case, K, result))
         if case.period is not None:
             system, blocks = block_diagonal(tustin(K, case.period))
-            whole = Realisation(replace(system, period=case.period), tuple(blocks))
-            write_c(folder, whole, title=case.file, delay=options.delay,
+            realised = Realisation(replace(system, period=case.period), tuple(blocks))
+            write_c(folder, realised, title=case.file, delay=options.delay,
                     verified=found.design.usable)  # fmt: skip
         lines = [
             *(f"{'decision':14s}{words}" for words in (advice(result),) if words),
@@ -64,8 +64,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             *(f"{'':14s}{SectionWords(**item).text}" for item in result["controller"]["sections"]),
             f"{'page':14s}{folder / 'report.html'}",
         ]
-        if not options.quiet:
-            say("\n".join([f"{'status':14s}{answer.status}", *lines]))
+        inform("\n".join([f"{'status':14s}{answer.status}", *lines]))
     if answer.status != "verified":
         say(one_line(f"{case.file}: {answer.status}: {result['reason']}"), sys.stderr)
     return ExitCode.of(answer.status)
@@ -74,18 +73,18 @@ def command(options: argparse.Namespace) -> ExitCode:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.tune", "The fastest PID with notches for a plant that exists, with its C code.",
+        "ccd_casadi.tune", "Find the fastest PID with notches for a plant that exists.",
         metavar="DATA", nargs="+",
         about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
     )  # fmt: skip
     for name, metavar, kind, default, words in (
         ("--rate-hz", "X", positive, None, "sampling rate; responses include the hold"),
-        ("--delay", "SECONDS", number(), 0.0, "delay in s besides that in DATA"),
-        ("--s-max", "X", number(1.0, strict=True), 1.8, "bound of |S|"),
-        ("--shape", "X", number(1.0), 1.1, "bound of |S| over ω/(√2 ω_b)"),
+        ("--delay", "SECONDS", real(), 0.0, "delay in s besides that in DATA"),
+        ("--s-max", "X", real(1.0, strict=True), 1.8, "bound of |S|"),
+        ("--shape", "X", real(1.0), 1.1, "bound of |S| over ω/(√2 ω_b)"),
         ("--effort", "X", positive, 20.0, "bound of |KS| over 1/|G| about ω_b"),
-        ("--lead", "N", whole(0), 1, "number of leads, with --biquads"),
-        ("--biquads", "N", whole(0), None, "number of notches (default: by the resonances)"),
+        ("--lead", "N", integer(0), 1, "number of leads, with --biquads"),
+        ("--biquads", "N", integer(0), None, "number of notches (default: by the resonances)"),
     ):
         shown = words if default is None else f"{words} (default: {default:g})"
         arguments.add_argument(name, metavar=metavar, type=kind, default=default, help=shown)

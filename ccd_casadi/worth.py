@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import inform
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -17,7 +17,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.studies.baselines import case_to_compare
     from ccd_casadi.studies.worth import worth, worth_words
-    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.versions import versions
 
     case, problem = case_to_compare(options.case, "worth")
@@ -29,15 +29,14 @@ def command(options: argparse.Namespace) -> ExitCode:
     ):
         found = worth(case, Sampler(problem, store, workers, quiet=options.quiet), options.seed)
     answer = found | {"seed": options.seed, "versions": versions()}
-    write_json(folder / "worth.json", clean(answer))
-    if not options.quiet:
-        say("\n".join([*worth_words(found), f"file          {folder / 'worth.json'}"]))
+    write_json(folder / "worth.json", json_values(answer))
+    inform("\n".join([*worth_words(found), f"file          {folder / 'worth.json'}"]))
     return ExitCode.DONE
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = parser("ccd_casadi.worth", "What co-design gains over the sequential way.")
+    arguments = parser("ccd_casadi.worth", "Estimate what co-design gains over the sequential way.")
     return run(command, arguments, argv, needs=["ccd_casadi.studies.worth"])
 
 

@@ -1,6 +1,7 @@
 """Surrogates of one output, or of several, from samples."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,17 +102,8 @@ def fit_outputs(
     noises = noise if isinstance(noise, Sequence) else [noise] * k
     if len(noises) != k:
         raise SurrogateFitError(f"expected {k} noises, got {len(noises)}")
-    return tuple(
-        fit(
-            X,
-            values[:, i],
-            None if slopes is None else slopes[:, i],
-            lower=lower,
-            upper=upper,
-            kernel=kernel,
-            noise=noises[i],
-            seed=seed,
-            starts=starts,
-        )
-        for i in range(k)
+    options: dict[str, Any] = {"lower": lower, "upper": upper, "seed": seed, "starts": starts}
+    each = zip(
+        values.T, [None] * k if slopes is None else slopes.swapaxes(0, 1), noises, strict=True
     )
+    return tuple(fit(X, y, slope, kernel=kernel, noise=own, **options) for y, slope, own in each)

@@ -3,10 +3,10 @@
 The one module here that knows of control; nothing of the package imports it.
 """
 
-from ccd_casadi.support.interrupts import starting
+from ccd_casadi.support.interrupts import exit_on_ctrl_c
 
 if __name__ == "__main__":
-    starting()
+    exit_on_ctrl_c()
 
 from ccd_casadi.retrain import main
 

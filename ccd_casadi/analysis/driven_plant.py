@@ -1,6 +1,6 @@
-"""A plant with its motors: their mass on it, their heat in its cost, their limits as constraints.
+"""A plant with its motors: their mass on it, their limits as constraints.
 
-M(θ) + m Σ b bᵀ,   f(θ) + price · P(θ),   peak force, motor power <= what the motor allows
+M(θ) + m Σ b bᵀ,   peak force, motor power <= what the motor allows
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ from ccd_casadi.support.casadi_callback import VectorCallback
 REMEMBERED = 64  # θ whose figures are kept
 
 
-class Moved:
+class DrivenMechanics:
     """θ -> Mechanics of a plant with the motors' mass, which is a parameter of θ or fixed."""
 
     keep: Any = None  # what CasADi does not keep
@@ -69,8 +69,8 @@ def with_motion(
     place = names.index(size) if size in names else None
     fixed = 0.0 if motor is None else held.get(size, motor.moving_mass[0])
 
-    def of(evaluate: Evaluate) -> Moved:
-        return Moved(evaluate, motion, place, fixed)
+    def of(evaluate: Evaluate) -> DrivenMechanics:
+        return DrivenMechanics(evaluate, motion, place, fixed)
 
     own, domain = of(plant.evaluate), plant.domain
     if domain is not None and motor is not None and place is not None:
@@ -84,7 +84,9 @@ def with_motion(
     )  # fmt: skip
 
 
-def _hardware(plant: Plant, own: Moved, names: Sequence[str]) -> tuple[ca.Function, list[str]]:
+def _hardware(
+    plant: Plant, own: DrivenMechanics, names: Sequence[str]
+) -> tuple[ca.Function, list[str]]:
     """(f, λ) of the plant and its motors, and the names of the motors' constraints."""
     theta, motor = ca.MX.sym("theta", len(names)), own.motion.motor
     f, lam = plant.hardware(ca.vertcat(*(theta[i] for i in range(len(names)) if i != own.place)))

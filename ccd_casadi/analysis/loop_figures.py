@@ -5,7 +5,7 @@ are given; steps are of the model and of the plants where the margins are least.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,56 +33,10 @@ NEAR = 0.2
 RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
 
 
-@dataclass(frozen=True)
-class LoopFigures:
-    """The least margins of all plants, with the crossover of the model; the worst step.
-
-    Of a unit step of a reference `overshoot` and `settling`, the last time outside 2 % in s (inf:
-    not within the time that was looked at); `by_force`: the largest displacement by 1 N in m, that
-    at rest included. `growth`: the largest factor by which σ_max(S) grows within a tenth of an
-    octave above ω_b. `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near
-    ω_b; `ringing`: the closed-loop root of least damping within an octave of ω_b, on any plant,
-    where that is small.
-    """
-
-    margins: ClassicalMargins
-    overshoot: float
-    settling: float
-    by_force: float
-    growth: float
-    light_roots: tuple[tuple[float, float, str], ...]
-    ringing: tuple[float, float] | None
-
-
-def loop_figures(
-    plants: Sequence[StateSpace],
-    controller: StateSpace,
-    sampling: Sampling | None,
-    bandwidth: float,
-) -> LoopFigures:
-    """Of a stable loop on every plant, the model first; SI, ω_b in rad/s."""
-    loops = [Loop(plant, controller, sampling) for plant in plants]
-    margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
-    gain = [gain_margin(m) for m in margins]
-    worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
-    steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
-    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
-    sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
-    overshoot, settling, by_force = map(max, zip(*steps, strict=True))
-    return LoopFigures(
-        replace(least_of(margins), crossover=margins[0].crossover),
-        overshoot,
-        settling,
-        by_force,
-        growth=max(float((size / size[0]).max()) for size in sizes),
-        light_roots=light_roots(controller, bandwidth),
-        ringing=ringing(np.concatenate([loop.poles for loop in loops]), bandwidth),
-    )
-
-
 def step_figures(loop: Loop, bandwidth: float) -> tuple[float, float, float]:
-    """Overshoot, settling and displacement as in `LoopFigures`: of each reference and each force
-    in turn, the worst."""
+    """Of a unit step of a reference the overshoot, and the last time outside 2 % in s (inf: not
+    within the time looked at); the largest displacement by 1 N in m, that at rest included. Of
+    each reference and each force in turn, the worst."""
     duration = PERIODS * HZ / bandwidth
     steps = loop.over_a_step(duration / (PERIODS * PER_PERIOD))
     count = int(duration / steps.period) + 1
@@ -144,10 +98,13 @@ def force_step(loop: Loop, times: Array) -> tuple[Array, Array]:
 
 
 def loop_warnings(
-    growth: float, roots: Sequence[tuple[float, float, str]], bandwidth: float,
+    growth: float, controller: StateSpace, bandwidth: float,
     rings: tuple[float, float] | None = None,
 ) -> list[str]:  # fmt: skip
-    """By name, what an engineer would not build: ω_b that is held by something narrow, or rings."""
+    """By name, what an engineer would not build: ω_b that is held by something narrow, or rings.
+
+    `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
+    """
     hz = bandwidth / HZ
     words = []
     if growth > SHARP:
@@ -158,7 +115,7 @@ def loop_warnings(
     words += [
         f"the controller has a {word} at {w / HZ:.4g} Hz with damping {d:.3g}, within 20 % of the "
         f"bandwidth"
-        for w, d, word in roots
+        for w, d, word in light_roots(controller, bandwidth)
     ]
     if rings is not None:
         words.append(
@@ -184,9 +141,8 @@ def measured_entry(
         margins.append(classical_margins(response, omega))
         S = np.abs(1.0 / (1.0 + response(bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30))))
         growth = max(growth, float((S / S[0]).max()))
-    roots = light_roots(controller, bandwidth)
     return _entry(least_of(margins), sensitivity_peak) | {
-        "loop_warnings": loop_warnings(growth, roots, bandwidth)
+        "loop_warnings": loop_warnings(growth, controller, bandwidth)
     }
 
 
@@ -212,11 +168,23 @@ def loop_entry(
     bandwidth: float,
     sensitivity_peak: float,
 ) -> dict[str, Any]:
-    """The figures under the keys of `result.json`; the modulus margin is 1/‖S‖∞."""
-    found = loop_figures(plants, controller, sampling, bandwidth)
-    return _entry(found.margins, sensitivity_peak) | {
-        "step_overshoot": found.overshoot,
-        "settling_ms": 1e3 * found.settling,
-        "force_step_max": found.by_force,
-        "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth, found.ringing),
+    """Of a stable loop on every plant, the model first, under the keys of `result.json`; SI, ω_b
+    in rad/s. The least margins of all plants, with the crossover of the model, and 1/‖S‖∞ as the
+    modulus margin; the worst step."""
+    loops = [Loop(plant, controller, sampling) for plant in plants]
+    margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
+    gain = [gain_margin(m) for m in margins]
+    worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
+    steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
+    overshoot, settling, by_force = map(max, zip(*steps, strict=True))
+    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
+    sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
+    growth = max(float((size / size[0]).max()) for size in sizes)
+    rings = ringing(np.concatenate([loop.poles for loop in loops]), bandwidth)
+    least = replace(least_of(margins), crossover=margins[0].crossover)
+    return _entry(least, sensitivity_peak) | {
+        "step_overshoot": overshoot,
+        "settling_ms": 1e3 * settling,
+        "force_step_max": by_force,
+        "loop_warnings": loop_warnings(growth, controller, bandwidth, rings),
     }

@@ -23,9 +23,10 @@ from ccd_casadi.cases.checks import (
     POSITIVE,
     Check,
     Fail,
+    every,
     require_good,
     rows,
-    shown,
+    short_repr,
     text,
 )
 from ccd_casadi.cases.tables import BudgetTable
@@ -43,18 +44,16 @@ MOST_ROWS = 20_000  # of a table
 PATH = ("mass", "damping", "stiffness")
 
 
-def _corners(value: Any) -> str | None:
-    remedy = "give a list of Hz, or of [Hz, damping ratio], all above 0"
-    if not isinstance(value, list | tuple):
-        return f"is {shown(value)}; {remedy}"
-    for item in value:
-        parts = item if isinstance(item, list | tuple) else [item]
-        if len(parts) not in (1, 2) or any(POSITIVE(part) is not None for part in parts):
-            return f"is {shown(value)}; {remedy}"
-    return None
+def _corner(value: Any) -> str | None:
+    parts = value if isinstance(value, list | tuple) else [value]
+    good = len(parts) in (1, 2) and all(POSITIVE(part) is None for part in parts)
+    return None if good else "is none"
 
 
-CORNERS = Check(_corners, {"type": "array"})
+CORNERS = every(
+    Check(_corner, {"type": ["number", "array"]}),
+    "give a list of Hz, or of [Hz, damping ratio], all above 0",
+)
 TABLE_CHECKS: dict[str, Check] = {
     "name": text,
     "unit": text,
@@ -100,7 +99,7 @@ def _checked(
     require_good(place, entry, known, fail)
     if entry.get("unit") not in UNITS[kind]:
         choices = ", ".join(f'"{unit}"' for unit in UNITS[kind])
-        raise fail(f"{place}.unit", f"is {shown(entry.get('unit'))}; choose one of {choices}")
+        raise fail(f"{place}.unit", f"is {short_repr(entry.get('unit'))}; choose one of {choices}")
     ways = [key for key in ("level", "psd", "file") if key in entry]
     if len(ways) != 1:
         raise fail(place, "give one of level, psd and file, and not more")
@@ -151,7 +150,7 @@ def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
-        raise fail(f"{place}.file", f"{shown(path.name)} cannot be read: {reason}") from None
+        raise fail(f"{place}.file", f"{short_repr(path.name)} cannot be read: {reason}") from None
     found: list[list[float]] = []
     for i, line in enumerate((re.split(r"[,;\t]", one.split("#")[0].strip()) for one in lines), 1):
         if line == [""] or (not found and line[0].strip()[:1].isalpha()):
@@ -159,7 +158,7 @@ def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
         try:
             hz, density = map(float, line)
         except ValueError:
-            words = f"line {i} of {shown(path.name)} is not a pair Hz, density; correct it"
+            words = f"line {i} of {short_repr(path.name)} is not a pair Hz, density; correct it"
             raise fail(f"{place}.file", words) from None
         found.append([hz, density])
     if len(found) > MOST_ROWS:

@@ -11,17 +11,25 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget
-from ccd_casadi.cases.checks import CaseError, Fail, Test, check_of, closest, require_good, shown
+from ccd_casadi.cases.checks import (
+    CaseError,
+    Fail,
+    Test,
+    check_of,
+    closest,
+    require_good,
+    short_repr,
+)
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.kinds import check_kind
 from ccd_casadi.cases.motion import check_motion
-from ccd_casadi.cases.places import checked_places, place_names
+from ccd_casadi.cases.places import checked_places
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.tables import TABLES, Case
-from ccd_casadi.support.options import one_line
+from ccd_casadi.plants.nodes import names_in
+from ccd_casadi.support.options import DEFAULT_CASE, one_line
 
 TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
-DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
 
 
@@ -119,7 +127,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     --------
     >>> parse_case({"plant": {"model": "two_mas"}, "theta": {}})
     Traceback (most recent call last):
-    ccd_casadi.cases.case.CaseError: case: objective: is missing; add a table [objective]
+    ccd_casadi.cases.checks.CaseError: case: objective: is missing; add a table [objective]
     """
 
     fail = Fail(path)
@@ -128,7 +136,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         if name not in known:
             raise fail(name, f"unknown table{closest(name, known)}")
         if not isinstance(table, Mapping):
-            raise fail(name, f"is {shown(table)}; write a table [{name}]")
+            raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     for name in ("plant", "theta"):
         if name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
@@ -160,7 +168,8 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     for place in absolute:
         plant_table(dict(data["plant"]) | options_in(place, fail), path, fail)
     tables["robust"] = replace(tables["robust"], plants=absolute)
-    of_case = (*place_names(tables["places"]), *filter(None, [tables["motor"].size]))
+    places, size = tables["places"], tables["motor"].size
+    of_case = (*names_in((*places.actuators, *places.sensors)), *filter(None, [size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":
@@ -196,7 +205,7 @@ def table_of(kind: type, name: str, table: Mapping[str, Any], fail: Fail) -> Any
 
 
 def _number_of_the_whole(check: Test, value: Any) -> str | None:
-    return f"is {shown(value)}; {_PER_CHANNEL}" if isinstance(value, list) else check(value)
+    return f"is {short_repr(value)}; {_PER_CHANNEL}" if isinstance(value, list) else check(value)
 
 
 def options_in(place: str, fail: Fail) -> dict[str, Any]:
@@ -220,15 +229,17 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
     for part in text.split(","):
         name, equals, value = (item.strip() for item in part.partition("="))
         if not equals:
-            raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
+            raise fail(
+                f"{short_repr(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
+            )
         if name not in names:
-            raise fail(f"{shown(name)} is not a parameter of the case{closest(name, names)}")
+            raise fail(f"{short_repr(name)} is not a parameter of the case{closest(name, names)}")
         if name in found:
             raise fail(f"{name} is given twice; give it once")
         try:
             found[name] = float(value)
         except ValueError:
-            raise fail(f"{name} = {shown(value)} is not a number; give one") from None
+            raise fail(f"{name} = {short_repr(value)} is not a number; give one") from None
     for parameter in case.theta:
         if parameter.name not in found:
             raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")

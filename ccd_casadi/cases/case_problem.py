@@ -7,7 +7,7 @@ from ccd_casadi.cases.case import CaseError, options_in
 from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
-from ccd_casadi.cases.kinds import disturbance_of, structured_problem, weights_of
+from ccd_casadi.cases.kinds import structured_problem, weights_of
 from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.tables import Case, RobustTable
@@ -21,7 +21,7 @@ from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.options import one_line
-from ccd_casadi.support.progress import progress_shown
+from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.units import HZ
 
 
@@ -50,7 +50,7 @@ def problem_of(case: Case) -> CoDesignProblem:
     >>> problem.names, problem.w2, round(problem.inner.omega_low, 3)
     (('m1', 'm2'), -0.995, 6.283)
     """
-    inner, w = case.inner, case.weights
+    inner = case.inner
     file = function = None
     if case.plant.function is not None:
         name, function = case.plant.function.rsplit(":", 1)
@@ -77,7 +77,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         w1=case.objective.w1,
         w2=case.objective.w2,
         cost_unit=case.objective.cost_unit,
-        weights=weights_of(w, inner, disturbance_of(case.controller, w)),
+        weights=weights_of(case.controller, case.weights, inner),
         inner=InnerProblem(
             S_max=inner.S_max,
             S_low=inner.S_low,
@@ -105,7 +105,7 @@ def problem_of(case: Case) -> CoDesignProblem:
             require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
-            with progress_shown(False):
+            with kept_quiet(True):
                 found = diagnose(problem, case.suspension.rigid_modes)[1]
             for finding in found:
                 if finding.severity is Severity.ERROR:

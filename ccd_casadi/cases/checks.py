@@ -55,9 +55,9 @@ def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Che
 
     def check(value: Any) -> str | None:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            return f"is {shown(value)}, not a number; {remedy}"
+            return f"is {short_repr(value)}, not a number; {remedy}"
         if too_large(value) or not math.isfinite(value):
-            return f"is {shown(value)}; {remedy}"
+            return f"is {short_repr(value)}; {remedy}"
         if not (low < value < high or (closed and value == low)):
             return f"is {value:g}; {remedy}"
         if abs(value) > LARGEST or (not closed and 0.0 in (low, high) and abs(value) < SMALLEST):
@@ -90,7 +90,7 @@ def count(least: int) -> Check:
         good = isinstance(value, int) and not isinstance(value, bool) and value >= least
         if good and not too_large(value):
             return None
-        return f"is {shown(value)}; give a whole number of at least {least}"
+        return f"is {short_repr(value)}; give a whole number of at least {least}"
 
     return Check(check, {"type": "integer", "minimum": least})
 
@@ -99,30 +99,19 @@ def choice(*names: str) -> Check:
     def check(value: Any) -> str | None:
         if value in names:
             return None
-        return f"is {shown(value)}; choose one of {', '.join(names)}"
+        return f"is {short_repr(value)}; choose one of {', '.join(names)}"
 
     return Check(check, {"enum": list(names)})
 
 
 @_with({"type": "string"})
 def text(value: Any) -> str | None:
-    return None if isinstance(value, str) else f"is {shown(value)}; give a text in quotes"
+    return None if isinstance(value, str) else f"is {short_repr(value)}; give a text in quotes"
 
 
 @_with({"type": "boolean"})
 def flag(value: Any) -> str | None:
-    return None if isinstance(value, bool) else f"is {shown(value)}; give true or false"
-
-
-@_with(_list({"type": "number", "exclusiveMinimum": 0.0}, 2, 2))
-def interval(value: Any) -> str | None:
-    remedy = "give two positive numbers [low, high] with low < high"
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        return f"is {shown(value)}; {remedy}"
-    for item in value:
-        if POSITIVE(item) is not None:
-            return f"is {shown(value)}; {remedy}"
-    return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
+    return None if isinstance(value, bool) else f"is {short_repr(value)}; give true or false"
 
 
 @_with(
@@ -137,7 +126,7 @@ def one_or_more(value: Any) -> str | None:
     several = value if isinstance(value, list | tuple) else [value]
     if several and all(POSITIVE(item) is None for item in several):
         return None
-    return f"is {shown(value)}; give a number above 0, or a list of them"
+    return f"is {short_repr(value)}; give a number above 0, or a list of them"
 
 
 @_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
@@ -150,14 +139,14 @@ def text_or_rows(value: Any) -> str | None:
 @_with({"type": "object"})
 def table(value: Any) -> str | None:
     good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
-    return None if good else f"is {shown(value)}; write tables of that name"
+    return None if good else f"is {short_repr(value)}; write tables of that name"
 
 
 @_with({"anyOf": [{"type": "object"}, _list({"type": "object"})]})
 def tables(value: Any) -> str | None:
     several = value if isinstance(value, list | tuple) else [value]
     good = all(isinstance(item, Mapping) for item in several)
-    return None if good else f"is {shown(value)}; write a table, or several in double brackets"
+    return None if good else f"is {short_repr(value)}; write a table, or several in double brackets"
 
 
 def every(item: Check, remedy: str, least: int = 0, most: int | None = None) -> Check:
@@ -167,7 +156,7 @@ def every(item: Check, remedy: str, least: int = 0, most: int | None = None) -> 
         good = isinstance(value, list | tuple) and all(item(each) is None for each in value)
         if good and least <= len(value) <= (math.inf if most is None else most):
             return None
-        return f"is {shown(value)}; {remedy}"
+        return f"is {short_repr(value)}; {remedy}"
 
     return Check(check, _list(item.schema, least, most))
 
@@ -177,7 +166,7 @@ def too_large(value: Any) -> bool:
     return isinstance(value, int) and abs(value) >= 2**63
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     if too_large(value):
         return "an integer of more than 64 bits"
     try:
@@ -194,6 +183,7 @@ FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 DAMPING = number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True)
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
+_pair = every(POSITIVE, "give two positive numbers [low, high] with low < high", 2, 2)
 points = every(count(2), "give two whole numbers of at least 2", 2, 2)
 steps = every(FRACTION, "give a list of numbers between 0 and 1, both exclusive", 1)
 factors = every(POSITIVE, "give a list of numbers above 0")
@@ -217,12 +207,20 @@ places = every(
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
+@_with(_pair.schema)
+def interval(value: Any) -> str | None:
+    wrong = _pair(value)
+    if wrong is None and not value[0] < value[1]:
+        return f"is an empty range {short_repr(value)}; give [low, high] with low < high"
+    return wrong
+
+
 @_with(numbers.schema)
 def direction(value: Any) -> str | None:
     wrong = numbers(value)
     if wrong is not None:
         return f"{wrong}, one for each"
-    return None if any(value) else f"is {shown(value)}; give numbers that are not all 0"
+    return None if any(value) else f"is {short_repr(value)}; give numbers that are not all 0"
 
 
 def rows(width: int) -> Check:

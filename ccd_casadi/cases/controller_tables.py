@@ -67,9 +67,7 @@ class ControllerTable:
     """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
     of full order with an input disturbance beside the reference, or "sections".
 
-    The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
-    of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
-    The search starts at `starts` places. `channel` overrides the structure of single channels.
+    The sections: an integrator, leads, biquads (a pair of zeros and one of poles), a roll-off.
     """
 
     structure: str = key(

@@ -5,6 +5,7 @@ design can be made with; warnings what a designer must know; notes what explains
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from itertools import product
 
@@ -22,7 +23,7 @@ from ccd_casadi.cases.findings import (
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant, require_damping
-from ccd_casadi.plants.plant import Plant, mechanics, theta_words
+from ccd_casadi.plants.plant import Plant, mechanics, named_values
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
@@ -66,7 +67,7 @@ def diagnose(
     with Progress(len(points), "checking the plant") as progress:
         for index, theta in enumerate(points):
             progress.advance(int(index > 0))
-            place = f"at theta = {theta_words(plant, theta)}" if index else "at the start"
+            place = f"at theta = {named_values(plant.names, theta)}" if index else "at the start"
             try:
                 system = mechanics(plant, theta, derivatives=index == 0)
                 modal = modal_plant(system, problem.suspension)
@@ -79,14 +80,12 @@ def diagnose(
                 continue
             found = facts_of(theta, modal, scaled, free)
             doubt = plant.doubt(theta) if index < CHECKED else ""
-            if doubt:
-                findings.append(Finding(Severity.ERROR, Topic.DERIVATIVES, doubt, index))
-            findings += _rigid(found, modal, problem.suspension, rigid_modes, index, place)
-            findings += _hidden(modal, index, place)
-            findings += zero_findings(found, problem.inner.S_max, index, place)
+            here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
+            here += _rigid(modal, problem.suspension, rigid_modes, place)
+            here += [*_hidden(modal, place), *zero_findings(found, problem.inner.S_max, place)]
             if index == 0:
-                findings += unit_findings(problem, found, scaled)
-                findings += entry_findings(problem, system)
+                here += unit_findings(problem, found, scaled) + entry_findings(problem, system)
+            findings += [replace(item, index=index) for item in here]
             facts.append(found)
         progress.advance()
     findings = most_limiting(findings)
@@ -97,7 +96,7 @@ def diagnose(
             "that is free at one theta and held at another has no derivative between; narrow the "
             "bounds, or hold it everywhere"
         )
-        findings.append(Finding(Severity.WARNING, Topic.RIGID_MODES, words, 0))
+        findings.append(Finding(Severity.WARNING, Topic.RIGID_MODES, words))
     return tuple(facts), tuple(findings)
 
 
@@ -125,27 +124,18 @@ def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
                 f"theta.{name}: its bounds {low:g} to {high:g} go beyond the model's samples, "
                 f"{least:g} to {most:g}; narrow them, or add samples"
             )
-            found.append(Finding(Severity.ERROR, Topic.DOMAIN, words, 0))
+            found.append(Finding(Severity.ERROR, Topic.DOMAIN, words))
     return found
 
 
 def _clusters(modal: ModalPlant) -> list[np.ndarray]:
     """Modes of one frequency, whose shapes are one space; the rigid ones are one."""
-    groups: list[list[int]] = []
-    for i, w in enumerate(modal.natural):
-        last = groups[-1][-1] if groups else None
-        same = last is not None and (
-            (modal.rigid[i] and modal.rigid[last])
-            or (not modal.rigid[last] and w - modal.natural[last] <= HIDDEN * w)
-        )
-        if same:
-            groups[-1].append(i)
-        else:
-            groups.append([i])
-    return [np.array(group) for group in groups]
+    w, rigid = modal.natural, modal.rigid
+    same = (rigid[1:] & rigid[:-1]) | (~rigid[:-1] & (np.diff(w) <= HIDDEN * w[1:]))
+    return np.split(np.arange(len(w)), np.flatnonzero(~same) + 1)
 
 
-def _hidden(modal: ModalPlant, index: int, place: str) -> list[Finding]:
+def _hidden(modal: ModalPlant, place: str) -> list[Finding]:
     """Directions of each eigenspace that no input drives, or no output measures (rank of B, C)."""
     D = np.abs(modal.D - np.diag(np.diag(modal.D)))
     coupled = (COUPLED * np.diag(modal.D).max() < D).any(axis=1)
@@ -173,17 +163,12 @@ def _hidden(modal: ModalPlant, index: int, place: str) -> list[Finding]:
                 f"({', '.join(formal[name] for name in lacks)}): no controller damps it, and S "
                 "does not show it"
             )
-        found.append(Finding(Severity.WARNING, Topic.HIDDEN_MODE, words, index))
+        found.append(Finding(Severity.WARNING, Topic.HIDDEN_MODE, words))
     return found
 
 
 def _rigid(
-    facts: PlantFacts,
-    modal: ModalPlant,
-    suspension: Suspension,
-    expected: int | None,
-    index: int,
-    place: str,
+    modal: ModalPlant, suspension: Suspension, expected: int | None, place: str
 ) -> list[Finding]:
     count = int(modal.rigid.sum())
     flexible = modal.natural[~modal.rigid] / HZ
@@ -194,12 +179,12 @@ def _rigid(
             f"{expected}{least}; correct the stiffness (K v = 0 for a rigid-body motion v), or "
             "suspension.rigid_modes"
         )
-        return [Finding(Severity.ERROR, Topic.RIGID_MODES, words, index)]
+        return [Finding(Severity.ERROR, Topic.RIGID_MODES, words)]
     slow = flexible[flexible < 10.0 * suspension.frequency_hz]
     if count and slow.size:
         words = (
             f"a flexible mode at {slow[0]:.3g} Hz {place} lies next to the suspension's "
             f"{suspension.frequency_hz:g} Hz: is it a rigid-body mode that K holds by mistake?"
         )
-        return [Finding(Severity.WARNING, Topic.RIGID_MODES, words, index)]
+        return [Finding(Severity.WARNING, Topic.RIGID_MODES, words)]
     return []

@@ -58,17 +58,17 @@ class Finding:
     severity: Severity
     topic: Topic
     words: str
-    index: int
+    index: int = 0
     limit_hz: float = np.inf
 
 
-def zero_findings(facts: PlantFacts, S_max: float, index: int, place: str) -> list[Finding]:
+def zero_findings(facts: PlantFacts, S_max: float, place: str) -> list[Finding]:
     """The right half-plane zero that limits most, and the dips; `place` names the θ."""
     found = []
     right = [zero for zero in facts.zeros if zero.damping_ratio < -1e-9]
     true = [zero for zero in right if not zero.artefact]
     if true:
-        found.append(_right(min(true, key=lambda z: z.frequency_hz), facts, S_max, index, place))
+        found.append(_right(min(true, key=lambda z: z.frequency_hz), facts, S_max, place))
     elif right:
         z = right[0].frequency_hz
         words = (
@@ -76,14 +76,14 @@ def zero_findings(facts: PlantFacts, S_max: float, index: int, place: str) -> li
             "suspension's: without it the plant has none there; a softer suspension "
             "(suspension.frequency_hz) moves it away"
         )
-        found.append(Finding(Severity.NOTE, Topic.ZERO, words, index))
+        found.append(Finding(Severity.NOTE, Topic.ZERO, words))
     for zero in facts.zeros:
         if -1e-9 <= zero.damping_ratio < LIGHT:
-            found.append(_dip(zero, index))
+            found.append(_dip(zero))
     return found
 
 
-def _right(zero: Zero, facts: PlantFacts, S_max: float, index: int, place: str) -> Finding:
+def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
     z, limit = zero.frequency_hz, bandwidth_limit_hz(zero, S_max)
     words = (
         f"a transmission zero in the right half-plane at {z:.4g} Hz {place}: with a peak of S of "
@@ -92,10 +92,10 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, index: int, place: str) 
         "actuator closer together"
     )
     severity = Severity.WARNING if z < 2.0 * facts.effort_hz else Severity.NOTE
-    return Finding(severity, Topic.ZERO, words, index, limit)
+    return Finding(severity, Topic.ZERO, words, limit_hz=limit)
 
 
-def _dip(zero: Zero, index: int) -> Finding:
+def _dip(zero: Zero) -> Finding:
     z = zero.frequency_hz
     words = (
         f"a transmission zero at {z:.4g} Hz, damping {100 * zero.damping_ratio:.2g} %: the "
@@ -103,7 +103,7 @@ def _dip(zero: Zero, index: int) -> Finding:
         f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
         "Hz unless M_K pays for it"
     )
-    return Finding(Severity.NOTE, Topic.ZERO, words, index)
+    return Finding(Severity.NOTE, Topic.ZERO, words)
 
 
 def most_limiting(findings: Sequence[Finding]) -> list[Finding]:
@@ -120,7 +120,7 @@ def unit_findings(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlan
         *_resonances(problem, facts),
         *peak_words(problem.inner.S_max),
     ]
-    return [Finding(Severity.WARNING, Topic.UNITS, item, 0) for item in words]
+    return [Finding(Severity.WARNING, Topic.UNITS, item) for item in words]
 
 
 def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]:
@@ -145,7 +145,7 @@ def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]
                 f"theta.{name} is in {unit}, and {key} grows by {entries[0]:.4g} with each, where "
                 f"{units[unit]:g} is meant: is the matrix in another unit? {SI}"
             )
-            found.append(Finding(Severity.WARNING, Topic.UNITS, words, 0))
+            found.append(Finding(Severity.WARNING, Topic.UNITS, words))
     return found
 
 

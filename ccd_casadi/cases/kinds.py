@@ -122,26 +122,23 @@ def with_structure(case: Case, structure: str) -> Case:
     return replace(case, **tables)
 
 
-def disturbance_of(controller: ControllerTable, weights: WeightsTable) -> float:
-    """W_d in force over displacement; 0 where the kind has none."""
-    if controller.structure != WITH_DISTURBANCE:
-        return 0.0
-    return DISTURBANCE * weights.M_K if weights.disturbance is None else weights.disturbance
-
-
 def structure_of(controller: ControllerTable) -> Structure:
     """The structure that [controller] names."""
     return Structure(**{item.name: getattr(controller, item.name) for item in fields(Structure)})
 
 
-def weights_of(weights: WeightsTable, inner: InnerTable, disturbance: float) -> Weights:
+def weights_of(controller: ControllerTable, weights: WeightsTable, inner: InnerTable) -> Weights:
     """The weights, in SI, with ω_S and ω_T at the lower ends of their ranges."""
-    values = {name: value for name, value in vars(weights).items() if name != "omega_K_hz"} | {
-        "disturbance": disturbance,
+    values: dict[str, Any] = vars(weights) | {
         "omega_K": HZ * weights.omega_K_hz,
         "omega_S": HZ * inner.omega_S_hz[0],
         "omega_T": HZ * inner.omega_T_hz[0],
     }
+    if controller.structure != WITH_DISTURBANCE:
+        values["disturbance"] = 0.0
+    elif weights.disturbance is None:
+        values["disturbance"] = DISTURBANCE * weights.M_K
+    del values["omega_K_hz"]
     return Weights(**values)
 
 

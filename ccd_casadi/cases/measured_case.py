@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.case import read_toml, table_of
-from ccd_casadi.cases.checks import Fail, count, require_good, shown, text
+from ccd_casadi.cases.checks import Fail, count, require_good, short_repr, text
 from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
-from ccd_casadi.cases.tables import TABLES, BudgetTable, InnerTable, ObjectiveTable, RobustTable
+from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
@@ -56,7 +56,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
                 name, f'has no effect on plant.model = "{MODEL}", which has no theta; drop it'
             )
         if not isinstance(table, Mapping):
-            raise fail(name, f"is {shown(table)}; write a table [{name}]")
+            raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     response = _response(plant, path, fail)
     if "inner" not in data:
         raise fail("inner", "is missing; add a table [inner]")
@@ -69,13 +69,22 @@ def measured_case(path: Path) -> MeasuredCase | None:
     inner, controller, loop = (tables[name] for name in ("inner", "controller", "loop"))
     weights = None
     if controller.weighted_level is not None:
-        weights = weights_of(tables["weights"], inner, 0.0)
+        weights = weights_of(controller, tables["weights"], inner)
     return MeasuredCase(
         path=path,
         file=str(plant["file"]),
         responses=(response,),
         structure=structure_of(controller),
-        bounds=_bounds(inner, controller.weighted_level, weights),
+        bounds=Bounds(
+            S_max=inner.S_max,
+            S_low=inner.S_low,
+            omega_low=HZ * inner.omega_low_hz,
+            shape=SHAPE if inner.shape is None else inner.shape,
+            shape_ends=ShapeEnd(inner.shape_ends),
+            weighted_level=controller.weighted_level,
+            weights=weights,
+            compliance_max=inner.compliance_max,
+        ),
         period=None if loop.rate_hz is None else 1.0 / loop.rate_hz,
         starts=controller.starts,
     )
@@ -111,16 +120,3 @@ def _check(tables: Mapping[str, Any], fail: Fail) -> None:
               "budget": BudgetTable()}  # fmt: skip
     if "weights" in tables:
         check_kind({**tables, **others}, fail)
-
-
-def _bounds(inner: InnerTable, level: float | None, weights: Any) -> Bounds:
-    return Bounds(
-        S_max=inner.S_max,
-        S_low=inner.S_low,
-        omega_low=HZ * inner.omega_low_hz,
-        shape=SHAPE if inner.shape is None else inner.shape,
-        shape_ends=ShapeEnd(inner.shape_ends),
-        weighted_level=level,
-        weights=weights,
-        compliance_max=inner.compliance_max,
-    )

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ccd_casadi.cases.checks import ANY, Check, Fail, flag, listed, require_good, shown, text
+from ccd_casadi.cases.checks import ANY, Check, Fail, flag, listed, require_good, short_repr, text
 from ccd_casadi.cases.tables import Parameter
 
 MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
@@ -45,7 +45,7 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
     if not name.isidentifier():
         raise fail(place, "is not an identifier; use letters, digits and _")
     if not isinstance(entry, Mapping):
-        raise fail(place, f"is {shown(entry)}; write a table [theta.{name}]")
+        raise fail(place, f"is {short_repr(entry)}; write a table [theta.{name}]")
     require_good(place, entry, {key: check for key, (check, _) in KEYS.items()}, fail)
     unit = entry.get("unit", "")
     for key, others in (("fixed", ("values", "lower", "upper", "start", "integer", "varies")),

@@ -4,9 +4,8 @@ import csv
 from dataclasses import fields, replace
 from pathlib import Path
 
-from ccd_casadi.cases.checks import Fail, shown
+from ccd_casadi.cases.checks import Fail, short_repr
 from ccd_casadi.cases.tables import PlacesTable
-from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.plants.places import Places
 
 
@@ -25,17 +24,12 @@ def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
             text = (folder / rows).read_text(encoding="utf-8-sig")
             rows = tuple(tuple(map(float, row)) for row in list(csv.reader(text.splitlines()))[1:])
         except (OSError, ValueError, csv.Error) as error:
-            words = f"{shown(table.nodes)}: {error}; name a CSV file of numbers after a header"
+            words = f"{short_repr(table.nodes)}: {error}; name a CSV file of numbers after a header"
             raise fail("places.nodes", words) from None
     numbers = tuple(tuple(map(float, row)) for row in rows)
     if not numbers or len({len(row) for row in numbers}) != 1 or len(numbers[0]) not in (1, 2, 3):
         raise fail("places.nodes", "are not rows of as many coordinates, 1 to 3; correct them")
     return replace(table, nodes=numbers)
-
-
-def place_names(table: PlacesTable) -> tuple[str, ...]:
-    """The parameters that it names."""
-    return names_in((*table.actuators, *table.sensors))
 
 
 def places_of(table: PlacesTable) -> Places | None:

@@ -52,7 +52,10 @@ def plant_report(
                 plant.constraint_names, constraint_values(plant, problem.start), strict=True
             )
         ],
-        "budget": _sources(problem),
+        "budget": [  # each source by the RMS of its spectrum; None where it is white
+            {"name": s.name, "kind": s.kind.value, "rms": s.spectrum.rms(), "unit": s.unit}
+            for s in (problem.budget.sources if problem.budget else ())
+        ],
         "findings": [
             {"severity": f.severity.value, "topic": f.topic.value, "words": f.words}
             for f in first_seen(findings)
@@ -71,16 +74,6 @@ def size_words(facts: PlantFacts) -> str:
         low, high = (share * facts.effort_hz for share in WINDOW)
         parts.append(f"M_K suits a bandwidth of {number(low, 2)} to {number(high, 2)} Hz")
     return ", ".join(parts)
-
-
-def _sources(problem: CoDesignProblem) -> list[dict[str, Any]]:
-    """What moves the stage, each by the RMS of its spectrum; None where it is white."""
-    if problem.budget is None:
-        return []
-    return [
-        {"name": s.name, "kind": s.kind.value, "rms": s.spectrum.rms(), "unit": s.unit}
-        for s in problem.budget.sources
-    ]
 
 
 def _ranges(facts: Sequence[PlantFacts]) -> list[list[float]]:

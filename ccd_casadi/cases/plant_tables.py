@@ -17,7 +17,7 @@ from ccd_casadi.cases.checks import (
     count,
     names,
     number,
-    shown,
+    short_repr,
     too_large,
 )
 from ccd_casadi.cases.parameters import parameters_of
@@ -43,11 +43,13 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
     known = model_named(model) if isinstance(model, str) else None
     if model is not None and known is None:
         hint = closest(str(model), model_names())
-        raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
+        raise fail(
+            "plant.model", f"is {short_repr(model)}, not a known model{hint}; or use function"
+        )
     if function is not None:
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
         if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
-            raise fail("plant.function", f'is {shown(function)}; write "my_plant.py:model"')
+            raise fail("plant.function", f'is {short_repr(function)}; write "my_plant.py:model"')
         function = f"{_absolute(path, parts[0], 'plant.function', fail)}:{parts[1]}"
     options = {key: value for key, value in table.items() if key not in ("model", "function")}
     takes = {} if known is None else dict(inspect.signature(known.build).parameters)
@@ -75,7 +77,7 @@ def _absolute(case: Path, name: str, key: str, fail: Fail) -> str:
     with suppress(OSError, ValueError):
         if (place := (case.parent / name).resolve()).exists():
             return str(place)
-    raise fail(key, f"there is no {shown(name)}; give its path relative to the case file")
+    raise fail(key, f"there is no {short_repr(name)}; give its path relative to the case file")
 
 
 def _check_of(option: inspect.Parameter) -> Test:
@@ -88,7 +90,7 @@ def _option(value: Any) -> str | None:
     if isinstance(value, float) and not math.isfinite(value):
         return f"is {value}; give a finite number"
     if too_large(value):
-        return f"is {shown(value)}; write it as a float"
+        return f"is {short_repr(value)}; write it as a float"
     if isinstance(value, list):
         for item in value:
             wrong = _option(item)
@@ -97,7 +99,7 @@ def _option(value: Any) -> str | None:
         return None
     if isinstance(value, str | bool | int | float):
         return None
-    return f"is {shown(value)}; give a number, text, true or false, or a list of them"
+    return f"is {short_repr(value)}; give a number, text, true or false, or a list of them"
 
 
 def theta_tables(

@@ -30,7 +30,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
@@ -44,7 +44,7 @@ SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is n
 
 
 @dataclass(frozen=True)
-class FinishedRun(Shown):
+class FinishedRun(NotebookHtml):
     """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
 
     `figures` are measured when the folder is read, on the plant as the case describes it now;
@@ -231,13 +231,6 @@ _READERS: dict[type[ControllerProblem], Callable[..., dict[str, Any]]] = {
     MixedSensitivityProblem: _read_mixed,
     StructuredProblem: _read_structured,
 }
-
-
-def refuse_structured(run: FinishedRun, command: str, remedy: str) -> None:
-    """Raise UserError where a command is for mixed sensitivity only."""
-    if run.kappa is not None:
-        words = f'{command} is for controller.structure = "h_infinity" so far; {remedy}'
-        raise UserError(f"{run.folder / 'case.toml'}: controller.structure: {words}")
 
 
 def read_json(path: Path) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ Both are made of the definitions that check a case (`tables`), so that they cann
 The schema lets more pass than the checks do: what hangs on several keys is left to them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
@@ -94,34 +94,21 @@ def keys_page() -> str:
         "",
         "## [plant]",
         "",
-        *_rows([(key, "", "", says) for key, says in _PLANT.items()]),
+        *_rows((key, "", "", says) for key, says in _PLANT.items()),
         "",
         "Every other key goes to the model or the function as a keyword.",
         "",
         "## [theta.NAME]",
         "",
         *_rows(
-            [
-                (key, "required" if key in ("lower", "upper") else "", "", says)
-                for key, (_, says) in THETA.items()
-            ]
+            (key, "required" if key in ("lower", "upper") else "", "", says)
+            for key, (_, says) in THETA.items()
         ),
         "",
         "With `values` or `fixed` no bounds are given; see [own plant](own_plant.md).",
     ]
     for name, kind in {**TABLES, "controller.channel.NAME": ChannelTable}.items():
-        lines += ["", f"## [{name}]", ""]
-        lines += _rows(
-            [
-                (
-                    item.name,
-                    "required" if _required(item) else _shown(item.default),
-                    unit_of(item),
-                    item.metadata["says"] + _values(check_of(item).schema),
-                )
-                for item in fields(kind)
-            ]
-        )
+        lines += ["", f"## [{name}]", "", *_rows(map(_row, fields(kind)))]
         if name == "budget":
             lines += ["", "A spectrum is a table, or several in double brackets, with the keys "
                       + ", ".join(f"`{key}`" for key in TABLE_CHECKS)
@@ -164,7 +151,12 @@ def _values(schema: Mapping[str, Any]) -> str:
     return f" (one of {names})" if names else ""
 
 
-def _rows(rows: list[tuple[str, str, str, str]]) -> list[str]:
+def _row(item: Field[Any]) -> tuple[str, str, str, str]:
+    default = "required" if _required(item) else _shown(item.default)
+    return item.name, default, unit_of(item), item.metadata["says"] + _values(check_of(item).schema)
+
+
+def _rows(rows: Iterable[tuple[str, str, str, str]]) -> list[str]:
     head = ["| key | default | unit | meaning |", "|---|---|---|---|"]
     # a bar in the words would end the cell
     return head + [

@@ -37,7 +37,7 @@ from ccd_casadi.cases.controller_tables import (
 )
 from ccd_casadi.cases.motion import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,7 @@ class BudgetTable:
 
 
 @dataclass(frozen=True)
-class Case(Shown):
+class Case(NotebookHtml):
     """A checked case file."""
 
     path: Path

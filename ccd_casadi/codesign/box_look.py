@@ -27,6 +27,7 @@ from surrogates import design
 POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
 FEW = 8  # points at most where each takes a search over the controller, seconds or more
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
+CLUSTER = 0.02  # of the box: inner problems that are closer are one look
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
 TRIES = 4
@@ -108,27 +109,17 @@ def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
 def _spread(sampler: Sampler, points: int, seed: int) -> list[BandwidthSample]:
     """The inner problems that the run has solved, and as many more as make up `points`."""
     lower, upper = box(sampler.problem)
-    solved = list(sampler.solved.values())
-    apart = _apart(np.array([s.theta for s in solved]).reshape(-1, lower.size), upper - lower)
-    known = [sample for sample, keep in zip(solved, apart, strict=True) if keep]
+    known: list[BandwidthSample] = []
+    for sample in sampler.solved.values():
+        away = [np.abs((np.array(sample.theta) - one.theta) / (upper - lower)) for one in known]
+        if all(far.max() > CLUSTER for far in away):
+            known.append(sample)
     if len(known) < points:
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
         more = [theta for theta in spread if not unmet(sampler.problem, theta)]
         if more:
             known = [*known, *sampler.bandwidths(np.array(more), "global check")]
     return known
-
-
-def _apart(thetas: Array, width: Array) -> list[bool]:
-    """Which of them are no near repetition of an earlier one: a cluster is one look."""
-    kept: list[int] = []
-    out = []
-    for i, theta in enumerate(thetas):
-        far = all(np.abs((theta - thetas[k]) / width).max() > 0.02 for k in kept)
-        out.append(far)
-        if far:
-            kept.append(i)
-    return out
 
 
 def _starts(

@@ -26,7 +26,7 @@ from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.spent import spent_entry, was_moved
+from ccd_casadi.sampling.spent import with_all_spent
 from ccd_casadi.support.units import counted
 
 Lists = dict[str, tuple[float, ...]]
@@ -161,9 +161,8 @@ def best_of_lists(
         else:
             open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
     assert best is not None
-    result = best.result | {
+    result = with_all_spent(best.result, sampler.spent.by_purpose) | {
         "seconds": perf_counter() - began,
-        **spent_entry(sampler.spent.by_purpose, was_moved(best.result)),
         "listed": _listed(problem, best, [*nodes.values()], open_, judged),
     }
     words = _words(problem, result)

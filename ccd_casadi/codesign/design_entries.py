@@ -12,7 +12,7 @@ from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.statics import compliance_words
+from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
 
@@ -45,19 +45,22 @@ def compliance_dict(most: float, at_rest: float, low: float, low_hz: float) -> d
     }
 
 
-def loop_of_design(
-    problem: CoDesignProblem, theta: Sequence[float], design: Design
-) -> dict[str, Any]:
-    """Margins and steps on the plant and those of its robust set; nothing of an unstable loop."""
-    figures = design.figures
+def mixed_dict(problem: CoDesignProblem, theta: Sequence[float], design: Design) -> dict[str, Any]:
+    """A mixed-sensitivity design's figures, with compliance, margins and steps of a stable loop:
+    these on the plant and those of its robust set."""
+    figures, plant = design.figures, scaled_plant(problem, theta)
+    found = figures_dict(figures)
     if not figures.certified:
-        return {}
-    plant = scaled_plant(problem, theta)
-    members = (plant, *(() if plant.family is None else plant.family.perturbed))
-    return loop_entry(
-        [member.plant_si() for member in members], design.controller, None, figures.bandwidth,
-        figures.sensitivity_peak,
-    )  # fmt: skip
+        return found
+    plants = [plant.plant_si()]
+    rest = statics(plants[0], design.controller, bandwidth=figures.bandwidth,
+                   omega_low=problem.inner.omega_low)  # fmt: skip
+    plants += [] if plant.family is None else [one.plant_si() for one in plant.family.perturbed]
+    return (
+        found
+        | loop_entry(plants, design.controller, None, figures.bandwidth, figures.sensitivity_peak)
+        | compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
+    )
 
 
 def controller_dict(controller: StateSpace) -> dict[str, Any]:

@@ -14,20 +14,22 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.codesign.direct import acceptable, polish
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.outer import Outer
+from ccd_casadi.codesign.search import concluded_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
-from ccd_casadi.inner_problem.sweep import LABELS, missed_by
-from ccd_casadi.plants.plant import theta_words
+from ccd_casadi.inner_problem.sweep import missed_bounds
+from ccd_casadi.plants.plant import named_values
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.spent import spent_entry, was_moved
+from ccd_casadi.sampling.spent import with_all_spent
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.synthesis import DesignFigures
 
 FIRST = 0.25  # share of the range of the first step of a continuation
 POLISHES = 5  # at most in a continuation
+CONTINUED = "reached by continuation from narrower ranges"
 TOLD = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
 LEAST = 1.0 / 16.0  # share of the range under which a step is given up
 
@@ -53,54 +55,43 @@ def widen(sampler: Sampler, x: Array) -> tuple[Array, float]:
     return x, held
 
 
-def continued(sampler: Sampler, x: Array) -> tuple[FormulationResult | None, float]:
-    """What a formulation would hand on at the end of `widen`, None short of it; the share held."""
-    x, held = widen(sampler, x)
-    if held < 1.0:
-        return None, held
-    words = "reached by continuation from narrower ranges"
-    return FormulationResult(x, agreed=True, message=words), 1.0
-
-
 def best_over_design_plants(
     sampler: Sampler,
-    solve: Callable[[Sampler], Solution],
-    conclude: Callable[[Sampler, FormulationResult], Solution],
-    explain: Callable[[Sampler, Solution, float | None], str],
+    outer_of: Callable[[Sampler], Outer],
+    solve: Callable[[Outer], Solution],
+    terms: Terms,
 ) -> Solution:
     """The best of a problem's solutions over its design plants, by `solve` and continuation.
 
-    `conclude` verifies what a continuation ended with, `explain` says why there is no better one.
     A problem with one design plant, or none, is solved as it is.
     """
-    began = perf_counter()
     problem = sampler.problem
     choices = design_choices(problem)
     samplers = [sampler.of(choice) if len(choices) > 1 else sampler for choice in choices]
-    found = [solve(each) for each in samplers]
+    found = [solve(outer_of(each)) for each in samplers]
     share = None
     if problem.robust is not None and not any(map(_holds, found)):
         share = 0.0
-        alone = solve(sampler.of(replace(problem, robust=None), traced=False))
+        alone = solve(outer_of(sampler.of(replace(problem, robust=None), traced=False)))
         if alone.verified is not None:
             for i, each in enumerate(samplers):
-                outcome, held = continued(each, alone.verified.point)
+                x, held = widen(each, alone.verified.point)
                 share = max(share, held)
-                if outcome is not None:
-                    found[i] = min(found[i], conclude(each, outcome), key=order)
+                if held >= 1.0:
+                    outcome = FormulationResult(x, agreed=True, message=CONTINUED)
+                    there = concluded_at(outer_of(each), outcome, terms)
+                    found[i] = min(found[i], there, key=order)
     violation = [np.inf if each.nearest is None else each.nearest.violation for each in samplers]
     best = min(range(len(found)), key=lambda i: (*order(found[i]), violation[i]))
-    result = found[best].result | {
-        "seconds": perf_counter() - began,
-        **spent_entry(sampler.spent.by_purpose, was_moved(found[best].result)),
-    }
+    result = with_all_spent(found[best].result, sampler.spent.by_purpose)
+    result["seconds"] = perf_counter() - terms.began
     if problem.robust is not None:
         names = [_at(choice) for choice in choices]
         told = [{key: item.result[key] for key in TOLD if key in item.result} for item in found]
         tried = dict(zip(names, told, strict=True))
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     sampler.nearest = samplers[best].nearest
-    result["reason"] = explain(sampler, found[best], share)
+    result["reason"] = outer_of(sampler).explained(found[best], share)
     return replace(found[best], result=result, problem=choices[best])
 
 
@@ -126,12 +117,13 @@ def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     if best.result["status"] == "verified":
         return words
     if best.verified is not None:
-        missed = missed_words(problem, cast(VerifiedDesign, best.verified).design.figures)
+        figures = cast(VerifiedDesign, best.verified).design.figures
+        missed = " and ".join(missed_bounds(problem.inner, figures))
         parts = [words, missed, remedies(problem, share) if missed else ""]
         return "; ".join(part for part in parts if part)
     where = ""
     if sampler.nearest is not None and np.isfinite(sampler.nearest.violation):
-        where = f"nearest at {theta_words(plant_of(problem), sampler.nearest.theta)}: "
+        where = f"nearest at {named_values(plant_of(problem).names, sampler.nearest.theta)}: "
     thetas = len({entry.theta for entry in sampler.trace})
     return f"{search_words(problem, thetas)}; {where}{words}; {remedies(problem, share)}"
 
@@ -139,22 +131,14 @@ def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
 def search_words(problem: CoDesignProblem, thetas: int) -> str:
     """Which controllers were looked for, and where."""
     inner, robust = problem.inner, problem.robust
-    box = [
-        f"{name} {low:g} to {high:g}"
-        for name, low, high in (
-            ("omega_S", inner.omega_S[0] / HZ, inner.omega_S[1] / HZ),
-            ("omega_T", inner.omega_T[0] / HZ, inner.omega_T[1] / HZ),
-        )
-    ]
+    ranges = (("omega_S", inner.omega_S), ("omega_T", inner.omega_T))
+    box = [f"{name} {low / HZ:g} to {high / HZ:g}" for name, (low, high) in ranges]
     made = ""
     if robust is not None and robust.shift:
         ends = {"low": "its lower end", "nominal": "its middle", "high": "its upper end"}
         places = [ends[_at(choice)] for choice in design_choices(problem)]
-        made = (
-            f", made on the plant at {' and '.join(places[-2:])}"
-            if len(places) < 3
-            else f", made on the plant at {', '.join(places[:-1])} and {places[-1]}"
-        ) + f" of +-{100 * robust.shift:g} %"
+        named = " and ".join(filter(None, (", ".join(places[:-1]), places[-1])))
+        made = f", made on the plant at {named} of +-{100 * robust.shift:g} %"
     return (
         f"none found among the mixed-sensitivity H-infinity controllers{made} at {thetas} theta "
         f"({', '.join(box)} Hz)"
@@ -178,13 +162,3 @@ def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
         ways.append(narrower)
     ways.append("another kind of controller (`robustness --controller` judges any)")
     return f"that none exists is not proven; try {', '.join(ways[:-1])}, or {ways[-1]}"
-
-
-def missed_words(problem: CoDesignProblem, figures: DesignFigures) -> str:
-    """Which bounds a design misses, and by how much; empty where it keeps them all."""
-    found = [
-        f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is required"
-        for name, (of, bound) in problem.inner.bounds.items()
-        if (value := getattr(figures, of)) > bound
-    ]
-    return " and ".join(found)

@@ -85,15 +85,13 @@ def _past_kinks(
     found = quantities.at(end)
     if not acceptable(problem, end, found):
         return x, design
-    if not acceptable(problem, x, design):
-        return end, found
-    before, after = (true_objective(problem, *item) for item in ((x, design), (end, found)))
-    margin = _level(problem, x, design)
-    if after < before - margin:
-        return end, found
-    level = after <= before + margin
-    better = _residual(problem, end, found) < _residual(problem, x, design)
-    return (end, found) if level and better else (x, design)
+    if acceptable(problem, x, design):
+        rise = true_objective(problem, end, found) - true_objective(problem, x, design)
+        level = _level(problem, x, design)
+        nearer = _residual(problem, end, found) < _residual(problem, x, design)
+        if not (rise < -level or (rise <= level and nearer)):
+            return x, design
+    return end, found
 
 
 def true_objective(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:

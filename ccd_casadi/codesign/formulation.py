@@ -1,9 +1,11 @@
 """What a formulation leaves behind: its iterates, its surrogate, and the design it ends with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
 
@@ -40,6 +42,25 @@ class FormulationResult:
     outer: OuterSolution | None = None
     agreed: bool = False
     message: str = ""
+
+
+@dataclass(frozen=True)
+class KnownSamples:
+    """What a formulation may begin with in place of its own plan: θ (n, n_θ), designs there."""
+
+    thetas: Array
+    samples: tuple[QuantitySample, ...]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """By which formulation, to what relative tolerance and from which seed a run goes; `began` on
+    the clock of `perf_counter`."""
+
+    formulation: str
+    tolerance: float
+    seed: int
+    began: float = field(default_factory=perf_counter)
 
 
 @dataclass(frozen=True)

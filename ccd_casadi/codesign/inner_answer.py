@@ -13,23 +13,17 @@ from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.cases.run_folder import sections_kappa
-from ccd_casadi.codesign.design_entries import (
-    budget_entry,
-    compliance_dict,
-    controller_dict,
-    figures_dict,
-    loop_of_design,
-    move_entry,
-)
+from ccd_casadi.codesign.design_entries import budget_entry, controller_dict, mixed_dict, move_entry
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
     proof_dict,
+    robust_dict,
     sections_controller,
 )
+from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import controller_response
-from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -40,7 +34,6 @@ from ccd_casadi.inner_problem.problem import (
     true_design,
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.inner_problem.structured_bandwidth import too_slow
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import (
     judged_widely,
@@ -48,17 +41,16 @@ from ccd_casadi.inner_problem.structured_robustness import (
     proof_of,
     worst_members,
 )
-from ccd_casadi.inner_problem.structured_search import least_value_at, prepared, with_range
+from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.closed_loop import open_alone
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.statics import statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
@@ -144,17 +136,8 @@ def _design(
     made = final_design(problem, theta, point)
     figures = made.figures
     feasible = problem.inner.feasible(figures)
-    compliance: dict[str, Any] = {}
-    if figures.certified:
-        rest = statics(
-            plant.plant_si(), made.controller, bandwidth=figures.bandwidth,
-            omega_low=problem.inner.omega_low,
-        )  # fmt: skip
-        compliance = compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
     answer = {
-        **clean(figures_dict(figures)),
-        **compliance,
-        **clean(loop_of_design(problem, theta, made)),
+        **json_values(mixed_dict(problem, theta, made)),
         "active": list(active_constraints(problem.inner, figures)) if feasible else [],
         "feasible": feasible,
         "local_peaks": [
@@ -187,7 +170,6 @@ def answer_of(case: MeasuredCase, made: MeasuredDesign) -> InnerAnswer:
     if made.controller is None or made.figures is None:
         return InnerAnswer("infeasible", figures | {"reason": made.words})
     f = made.figures
-    parts = sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()}
     figures |= {
         "reason": "" if made.usable else made.words,
         "bandwidth_hz": made.bandwidth / HZ,
@@ -205,12 +187,11 @@ def answer_of(case: MeasuredCase, made: MeasuredDesign) -> InnerAnswer:
             "passed": made.usable,
             "figures_over_bounds": case.bounds.shares(f),
         },
-        "controller": parts,
+        "controller": sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()},
     }
-    loop: dict[str, Any] = {} if case.period is None else {
-        "loop": {"rate_hz": 1.0 / case.period, "delay_us": 0.0, "method": "tustin"}
-    }  # fmt: skip
-    controller = controller_dict(made.controller) | {"sections": parts | loop}
+    controller = sections_controller(
+        made, None if case.period is None else Sampling(1 / case.period)
+    )
     return InnerAnswer("verified" if made.usable else "not_verified", figures, controller)
 
 
@@ -242,16 +223,12 @@ def structured_answer(
         anchors = (sections_kappa(begin_at, structure_of(asked)),)
         asked = replace(asked, controller=replace(structured_of(asked), anchors=anchors))
     asked, made = prepared(asked, progress, workers, begin_at is not None)
+    fastest = made.bandwidth
+    asked, made, least = least_from(asked, theta, made, progress)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
-    if problem.figure is not BANDWIDTH:
-        slow = too_slow(asked, made)
-        if not slow.certified:
-            return InnerAnswer("infeasible", head | {"reason": slow.words, "syntheses": 1})
-        fastest = made.bandwidth
-        asked, least = least_value_at(asked, theta, made, progress)
-        made = least.design
+    if least is not None:
         value = least.value if problem.w2 > 0.0 else made.bandwidth
         entry = problem.figure.entry
         head["least_error" if entry == "error_rms" else f"least_{entry}"] = {
@@ -271,17 +248,11 @@ def structured_answer(
         "active": active_of(made),
         "feasible": True,
         "objective": objective(problem, theta, value),
-        "robust": {
-            "plants": checked,
-            "passed": wide.passed,
-            "words": wide.words,
-            "bandwidth_hz": wide.bandwidth / HZ,
-            "worst_excess": float(np.expm1(worst.value)),
-        },
+        "robust": robust_dict(wide, checked, worst),
         "proof": proof_dict(proof),
         "syntheses": 1,
         **budget_entry(asked, theta, made.controller),
         **move_entry(asked, theta, made.controller),
     }
     status = "verified" if passed else "not_verified"
-    return InnerAnswer(status, figures, sections_controller(asked, made))
+    return InnerAnswer(status, figures, sections_controller(made, asked.sampling))

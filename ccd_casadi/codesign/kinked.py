@@ -13,17 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.kkt import INSIDE, lagrangian_parts
+from ccd_casadi.codesign.kkt import INSIDE, first_order
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, SAME_PEAK, other_peaks
-from ccd_casadi.inner_problem.constraints import constraint_sizes
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.codesign.peak_constraints import SAME_PEAK, other_peaks
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.quadratic import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, minimise
-from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.derivatives import Sensitivities
 
 BAND = 0.25  # ln: peaks this close to their bound are constraints of a step
 FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
@@ -38,7 +36,6 @@ class _Design:
     """A design with its rows g (m,), their slopes (m, n) per share of the box, and whose they are:
     a name, or "peak" and "shelf" with ln of a frequency and a plant of the set."""
 
-    made: Sensitivities
     g: Array
     jacobian: Array
     tags: tuple[tuple[str, float, int], ...]
@@ -105,23 +102,14 @@ class _Peaks(Model[_Design]):
         problem = self.problem
         if not made.figures.certified or made.made is None:
             return None
-        gradient, g, jacobian, names = lagrangian_parts(problem, where, made)
-        first, sizes = len(problem.inner.bounds), constraint_sizes(problem)
-        g = np.append(g[:first] + INSIDE, g[first:] / sizes)
-        jacobian = np.vstack([jacobian[:first], jacobian[first:] / sizes[:, None]])
-        tags = [(name, 0.0, 0) for name in names]
-        place = float(np.log(made.figures.sensitivity_peak_frequency))
-        tags[0] = ("peak", place, made.made.worst)
         peaks = other_peaks(problem, where, made, BAND)
-        g = np.append(g, [peak.value + INSIDE for peak in peaks])
-        jacobian = np.vstack([jacobian, *(peak.row for peak in peaks)])
-        for peak in peaks:
-            kind = "peak" if peak.name.startswith(OTHER_PEAK) else "shelf"
-            tags.append((kind, float(np.log(peak.omega)), peak.member))
-        cost = hardware_cost(plant_of(problem), where[: len(problem.names)])
-        J = problem.w1 * cost + problem.w2 * made.figures.bandwidth
-        violation = max(0.0, float(g.max()))
-        return Iterate(z, J, gradient, violation, _Design(made, g, jacobian, tuple(tags)))
+        rows = first_order(problem, where, made, peaks, INSIDE)
+        place = float(np.log(made.figures.sensitivity_peak_frequency))
+        others = [(name, 0.0, 0) for name in rows.names[1 : len(rows.names) - len(peaks)]]
+        tags = (("peak", place, made.made.worst), *others, *(peak.tag for peak in peaks))
+        J = objective(problem, where[: len(problem.names)], made.figures.bandwidth)
+        violation = max(0.0, float(rows.g.max()))
+        return Iterate(z, J, rows.gradient, violation, _Design(rows.g, rows.jacobian, tags))
 
     def rows(self, here: Iterate[_Design], radius: float) -> Rows:
         """Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong."""

@@ -26,17 +26,18 @@ from scipy.linalg import null_space
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import PeakConstraint, other_peaks
 from ccd_casadi.inner_problem.constraints import constraint_sizes
+from ccd_casadi.inner_problem.objective import hardware_at
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import (
     ACTIVE,
     ActiveSet,
+    FirstOrder,
     KktCertificate,
     active_set,
     hessian_products,
     reduced_curvature,
 )
-from ccd_casadi.plants.plant import constraint_values, hardware_slopes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
@@ -69,17 +70,8 @@ def active_at(
 ) -> ActiveSet:
     """The active constraints and bounds at x, with `others` besides the problem's own."""
     lower, upper = lifted_bounds(problem)
-    gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
-    sizes = np.ones(len(g) + len(others))
-    first, own = len(problem.inner.bounds), constraint_sizes(problem)
-    sizes[first : first + len(own)] = own
-    if others:
-        g = np.append(g, [peak.value for peak in others])
-        jacobian = np.vstack([jacobian, *(peak.row for peak in others)])
-        names = (*names, *(peak.name for peak in others))
-    z = (x - lower) / (upper - lower)
-    variables = (*problem.names, "omega_S", "omega_T")
-    return active_set(z, gradient, g, jacobian, sizes, names, variables)
+    here = first_order(problem, x, design, others)
+    return active_set((x - lower) / (upper - lower), here, (*problem.names, "omega_S", "omega_T"))
 
 
 def _certificate(
@@ -97,24 +89,29 @@ def _certificate(
     return at.certificate(mu, found.stationarity, reduced_curvature(Z, columns, at.size))
 
 
-def lagrangian_parts(
-    problem: CoDesignProblem, x: Array, design: Sensitivities
-) -> tuple[Array, Array, Array, tuple[str, ...]]:
-    """∇J, g and its Jacobian in unit-box variables, and the constraints' names."""
-    plant = plant_of(problem)
-    count = len(problem.names)
-    lower, upper = lifted_bounds(problem)
-    width = upper - lower
-    theta = x[:count]
-    df, dlam = hardware_slopes(plant, theta)
-    total = np.hstack([design.to_theta, design.to_break_frequencies])
+def first_order(
+    problem: CoDesignProblem,
+    x: Array,
+    design: Sensitivities,
+    others: tuple[PeakConstraint, ...] = (),
+    inside: float = 0.0,
+) -> FirstOrder:
+    """J, the bounds on the loop (ln, `inside` tighter), λ, and `others` like the bounds, at x."""
+    count, (lower, upper) = len(problem.names), lifted_bounds(problem)
+    own, sizes = hardware_at(problem, x[:count]), constraint_sizes(problem)
+    total = np.hstack([design.to_theta, design.to_break_frequencies]) * (upper - lower)
     gradient = problem.w2 * total[0]
-    gradient[:count] += problem.w1 * df
-    lam = constraint_values(plant, theta)
-    g = np.concatenate([design.values[1:-1] - problem.inner.levels, lam])
-    jacobian = np.vstack([total[1:-1], np.hstack([dlam, np.zeros((len(lam), 2))])])
-    names = (*problem.inner.bounds, *plant.constraint_names)
-    return gradient * width, g, jacobian * width, names
+    gradient[:count] += own.cost_gradient
+    bounds, peaks = design.values[1:-1] - problem.inner.levels, [peak.value for peak in others]
+    names = (*problem.inner.bounds, *plant_of(problem).constraint_names)
+    lam = np.pad(own.slopes, ((0, 0), (0, 2)))
+    return FirstOrder(
+        gradient,
+        np.concatenate([bounds + inside, own.constraints, np.add(peaks, inside)]),
+        np.vstack([total[1:-1], lam, *(peak.row for peak in others)]),
+        np.concatenate([np.ones_like(bounds), sizes, np.ones_like(peaks)]),
+        (*names, *(peak.name for peak in others)),
+    )
 
 
 def lagrangian_hessian(
@@ -136,8 +133,9 @@ def lagrangian_hessian(
         design = true_at(at)
         if not design.figures.certified:
             return None
-        gradient, _, jacobian, names = lagrangian_parts(problem, at, design)
-        return gradient + np.array([multipliers.get(name, 0.0) for name in names]) @ jacobian
+        here = first_order(problem, at, design)
+        mu = np.array([multipliers.get(name, 0.0) for name in here.names]) * here.sizes
+        return here.gradient + mu @ here.jacobian
 
     return hessian_products(slope, (x - lower) / width, directions)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -18,7 +18,6 @@ from ccd_casadi.codesign.outer_problem import (
     lifted_program,
     solve_program,
 )
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.constraints import constraint_shares
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -61,11 +60,11 @@ class Lifted:
 
 
 def solve_lifted(
-    sampler: Sampler, options: Lifted, *, seed: int, given: Surrogates | None = None
+    sampler: Sampler, options: Lifted, *, seed: int, given: KnownSamples | None = None
 ) -> FormulationResult:
     """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
 
-    With `given` surrogates the rounds start from those and what they were fitted to.
+    With `given` samples the rounds start from these.
     """
     problem = sampler.problem
     lower, upper = lifted_bounds(problem)
@@ -80,9 +79,9 @@ def solve_lifted(
         return FormulationResult(message=message)
     iterates: list[Iterate] = []
     incumbent: QuantitySample | None = None
-    processes: tuple[GaussianProcess, ...] = () if given is None else given.processes
+    processes: tuple[GaussianProcess, ...] = ()
     solution: OuterSolution | None = None
-    agreed, fitted = False, len(samples) if processes else 0
+    agreed, fitted = False, 0
     for round_number in range(options.max_refinements + 1):
         if len(samples) >= REFIT * fitted:
             processes = fit_quantities(problem, samples, seed, kind=options.kernel)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -17,7 +17,6 @@ from ccd_casadi.codesign.outer_problem import (
     nested_program,
     solve_program,
 )
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
@@ -63,13 +62,13 @@ def solve_nested(
     options: Nested,
     *,
     seed: int,
-    given: Surrogates | None = None,
+    given: KnownSamples | None = None,
     gradients: bool = False,
 ) -> FormulationResult:
     """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.
 
-    With a `given` surrogate the design is what that was fitted to; `gradients`: the surrogate is
-    fitted to the envelope's gradients too.
+    With `given` samples the design is their θ; `gradients`: the surrogate is fitted to the
+    envelope's gradients too.
     """
     problem = sampler.problem
     lower, upper = box(problem)

@@ -13,14 +13,13 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import KktCertificate
@@ -71,7 +70,6 @@ class Outer(ABC):
     """The outer problem of one kind of inner problem, on a sampler's store and workers."""
 
     kkt_level: float  # residual up to which an end counts as stationary
-    learns_from_others: bool  # whether surrogates of other problems can begin a formulation
     beside_theta: tuple[str, ...] = ()  # what else x holds, logarithms
 
     def __init__(self, sampler: Sampler) -> None:
@@ -110,9 +108,9 @@ class Outer(ABC):
         return self
 
     def formulated(
-        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+        self, formulation: Formulation, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
-        """One formulation, from the surrogates that are given where there are any."""
+        """One formulation, from the samples that are given where there are any."""
         if isinstance(formulation, Direct):
             with self.sampler.spent.on("search"):
                 return self.climbed(formulation.starts, seed)
@@ -120,9 +118,9 @@ class Outer(ABC):
 
     @abstractmethod
     def fitted(
-        self, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None
+        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
-        """A formulation on surrogates, from those that are given where there are any."""
+        """A formulation on surrogates, from the samples that are given where there are any."""
 
     def climbed(self, starts: int, seed: int) -> FormulationResult:
         """The direct formulation: local solves from the case's start and a Sobol set beside it.

@@ -14,7 +14,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.direct import acceptable, polish, true_objective
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.kinked import SETTLED, descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -23,7 +23,6 @@ from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -56,7 +55,6 @@ class MixedOuter(Outer):
     """See the module."""
 
     kkt_level = VerifiedDesign.kkt_level
-    learns_from_others = True
     beside_theta = ("omega_S", "omega_T")
 
     @property
@@ -64,7 +62,7 @@ class MixedOuter(Outer):
         return lifted_bounds(self.problem)
 
     def fitted(
-        self, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None
+        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         if isinstance(formulation, Nested):
             return solve_nested(self.sampler, formulation, seed=seed, given=given)

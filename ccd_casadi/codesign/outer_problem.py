@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
@@ -77,40 +77,26 @@ class OuterFailure(RuntimeError):
 
 def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> NonlinearProgram:
     """The outer problem over θ with a surrogate bandwidth(θ) in rad/s."""
-    plant = plant_of(problem)
-    theta = ca.MX.sym("theta", len(problem.names))
-    f, lam = _hardware(problem, theta)
-    return NonlinearProgram(
-        x=theta,
-        f=problem.w1 * f + problem.w2 * bandwidth(theta),
-        g=lam,
-        lower=np.array(problem.lower),
-        upper=np.array(problem.upper),
-        exact_hessian=plant.exact_hessian,
-    )
+    return _program(problem, bandwidth, *box(problem), np.empty(0))
 
 
 def lifted_program(
     problem: CoDesignProblem, quantities: ca.Function, *, margin: float = MARGIN
 ) -> NonlinearProgram:
     """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln of what is bounded."""
-    plant = plant_of(problem)
-    count = len(problem.names)
-    x = ca.MX.sym("x", count + 2)
-    theta = x[:count]
-    q = quantities(x)
-    f, lam = _hardware(problem, theta)
-    inner = problem.inner
-    levels = inner.levels - margin
-    lower, upper = lifted_bounds(problem)
-    return NonlinearProgram(
-        x=x,
-        f=problem.w1 * f + problem.w2 * q[0],
-        g=ca.vertcat(q[1 : 1 + len(levels)] - levels, lam),
-        lower=lower,
-        upper=upper,
-        exact_hessian=plant.exact_hessian,
-    )
+    return _program(problem, quantities, *lifted_bounds(problem), problem.inner.levels - margin)
+
+
+def _program(
+    problem: CoDesignProblem, model: ca.Function, lower: Array, upper: Array, levels: Array
+) -> NonlinearProgram:
+    """Over x, which begins with θ, with model(x) -> ω_b and what must not exceed `levels` (m,)."""
+    x = ca.MX.sym("x", len(lower))
+    q = model(x)
+    f, lam = _hardware(problem, x[: len(problem.names)])
+    J = problem.w1 * f + problem.w2 * q[0]
+    g = ca.vertcat(*(q[1 + i] - level for i, level in enumerate(levels)), lam)
+    return NonlinearProgram(x, J, g, lower, upper, plant_of(problem).exact_hessian)
 
 
 def lifted_bounds(problem: CoDesignProblem) -> tuple[Array, Array]:

@@ -97,7 +97,7 @@ def seeded_and_prepared(
     def found() -> Seeds:
         tell = teller("search at the start", quiet)
         anchored, made = prepared(problem, tell, workers)
-        anchored, made = least_from(anchored, problem.start, made, tell)
+        anchored, made, _ = least_from(anchored, problem.start, made, tell)
         own, start = structured_of(anchored), problem.start
         words = "" if made.certified else made.words
         alone = len(own.members) == len(uncertain_plant(problem, start).corners())

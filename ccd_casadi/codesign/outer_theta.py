@@ -10,12 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.theta_direct import FAR, SETTLED, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.inner_problem.objective import objective_of
@@ -28,7 +27,6 @@ from ccd_casadi.support.errors import UserError
 class ThetaOuter(Outer, ABC):
     """See the module; `words` say why its kind has nothing to begin with, where it has not."""
 
-    learns_from_others = False
     words = ""
 
     @property
@@ -36,7 +34,7 @@ class ThetaOuter(Outer, ABC):
         return False
 
     def fitted(
-        self, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None
+        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """Nested; what is lifted are the exact gradients, as x is θ."""
         if isinstance(formulation, Nested):

@@ -18,6 +18,7 @@ import numpy as np
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.structured_entries import bound_words
 from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
@@ -32,28 +33,17 @@ EXTREME = 1e-3  # share of the range of one that counts as much as all of the ot
 GAIN = 1e-3  # of the triangle between two neighbours: a lesser one is none
 
 
-@dataclass(frozen=True)
-class FrontPoint:
-    """A design that is the best for some weights; `bandwidth` is that of its controller in rad/s,
-    `worth` the true v(θ) in SI, and -v where less is better.
+@dataclass(frozen=True, kw_only=True)
+class FrontPoint(BandwidthSample):
+    """A design that is the best for some weights; `worth`: v(θ), and -v where less is better.
 
     `verified`: the inner problem at θ has a certified design, and the solve ended at a stationary
     point of its J.
     """
 
-    theta: tuple[float, ...]
     hardware_cost: float
-    bandwidth: float
     worth: float
-    omega_S: float
-    omega_T: float
-    active: tuple[str, ...]
     verified: bool
-
-    @property
-    def value(self) -> float:
-        """v(θ): ω_b* in rad/s, the RMS error in m or the time of a move in s."""
-        return abs(self.worth)
 
 
 @dataclass(frozen=True)
@@ -92,8 +82,12 @@ def pareto_front(
     size, sign = begun[0].value, 1.0 if problem.figure.larger_is_better else -1.0
 
     def solved(a: float, b: float, begin: Sequence[BandwidthSample]) -> FrontPoint | None:
-        """The best design for these weights, of local solves from some designs."""
-        outer = outer_of(sampler.of(replace(problem, w1=a, w2=-sign * b), traced=False, quiet=True))
+        """The best design for these weights, of local solves from some designs; where each value
+        is a search over the controller, from the best of them alone."""
+        weighted = replace(problem, w1=a, w2=-sign * b)
+        outer = outer_of(sampler.of(weighted, traced=False, quiet=True))
+        if not outer.look_is_cheap:
+            begin = [min(begin, key=lambda sample: objective_of(weighted, sample))]
         places = [outer.solved_from(sample, ()) for sample in begin]
         found = [place for place in places if place is not None]
         if not found:
@@ -131,14 +125,11 @@ def _gain(light: FrontPoint, new: FrontPoint, a: float, b: float) -> float:
 def _point(sampler: Sampler, theta: Sequence[float] | np.ndarray, stationary: bool) -> FrontPoint:
     up = sampler.problem.figure.larger_is_better
     sample = sampler.bandwidths(np.asarray(theta, float), "verifying")[0]
+    active = tuple(bound_words(sample.active)) if sample.kappa else sample.active
     return FrontPoint(
-        theta=sample.theta,
+        **vars(sample) | {"active": active},
         hardware_cost=hardware_cost(plant_of(sampler.problem), sample.theta),
-        bandwidth=sample.bandwidth,
         worth=sample.value if up else -sample.value,
-        omega_S=sample.omega_S,
-        omega_T=sample.omega_T,
-        active=tuple(bound_words(sample.active)) if sample.kappa else sample.active,
         verified=sample.feasible and stationary,
     )
 

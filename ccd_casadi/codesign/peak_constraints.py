@@ -33,6 +33,12 @@ class PeakConstraint:
     omega: float
     member: int
 
+    @property
+    def tag(self) -> tuple[str, float, int]:
+        """What it is, ln ω and its plant: by these it is found again at another x."""
+        kind = "peak" if self.name.startswith(OTHER_PEAK) else "shelf"
+        return kind, float(np.log(self.omega)), self.member
+
 
 def other_peaks(
     problem: CoDesignProblem, x: Array, design: Sensitivities, band: float

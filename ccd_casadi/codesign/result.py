@@ -8,11 +8,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.codesign.design_entries import budget_entry, move_entry
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult, Terms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.verdict import (
@@ -30,7 +31,7 @@ from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.json_files import clean, write_json
+from ccd_casadi.support.json_files import json_values, write_json
 from ccd_casadi.support.versions import versions
 from surrogates import Quality
 
@@ -38,19 +39,15 @@ FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or ch
 
 
 def result_dict(
-    formulation: str,
+    terms: Terms,
     outcome: FormulationResult,
     verified: Verified,
-    *,
-    tolerance: float,
     spent: Mapping[str, int],
-    seconds: float,
-    seed: int,
     quality: tuple[Quality, ...] = (),
     look: BoxLook | None = None,
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
-    problem = verified.problem
+    problem, tolerance = verified.problem, terms.tolerance
     plant = plant_of(problem)
     promised = predicted_value(outcome, verified.point, verified.value)
     error = abs(promised / verified.value - 1.0)
@@ -74,7 +71,7 @@ def result_dict(
         "status": "not_verified" if failed else "verified",
         "reason": words,
         "verdict": verdict_dict(verdict),
-        "formulation": formulation,
+        "formulation": terms.formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": problem.parameter_units,
         "cost_unit": problem.cost_unit,
@@ -91,13 +88,13 @@ def result_dict(
         "box_look": {} if look is None else look.entry,
         "notes": list(plant.notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        **run_entry(spent, seconds, seed, look is not None and look.moved),
+        **run_entry(terms, spent, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
         **evidence,
         **budget_entry(problem, verified.theta, verified.controller),
         **move_entry(problem, verified.theta, verified.controller),
     }
-    return clean(result)
+    return json_values(result)
 
 
 def verdict_of(
@@ -163,27 +160,19 @@ def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float
     return value
 
 
-def infeasible_dict(
-    formulation: str, reason: str, *, spent: Mapping[str, int], seconds: float, seed: int
-) -> dict[str, Any]:
+def infeasible_dict(terms: Terms, reason: str, spent: Mapping[str, int]) -> dict[str, Any]:
     """result.json where no certified design meets the constraints."""
-    return {
-        "status": "infeasible",
-        "reason": reason,
-        "formulation": formulation,
-        **run_entry(spent, seconds, seed),
-    }
+    head = {"status": "infeasible", "reason": reason, "formulation": terms.formulation}
+    return head | run_entry(terms, spent)
 
 
-def run_entry(
-    spent: Mapping[str, int], seconds: float, seed: int, moved: bool = False
-) -> dict[str, Any]:
+def run_entry(terms: Terms, spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
     """What every result.json says of its run."""
     return {
         "format": FORMAT,
         **spent_entry(spent, moved),
-        "seconds": seconds,
-        "seed": seed,
+        "seconds": perf_counter() - terms.began,
+        "seed": terms.seed,
         "versions": versions(),
     }
 
@@ -220,7 +209,7 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return before if isinstance(before, Mapping) else line
 
 
-def told(run: FinishedRun, out: Path, name: str, line: Line) -> FinishedRun:
+def with_verdict_line(run: FinishedRun, out: Path, name: str, line: Line) -> FinishedRun:
     """The run with a line of its verdict, written into its folder if `out` lies in that.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -19,13 +18,13 @@ from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Terms
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.search import concluded_at
-from ccd_casadi.codesign.stored import Surrogates, keep_version, stored_designs, stored_thetas
+from ccd_casadi.codesign.stored import keep_version, stored_designs, stored_thetas
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.sampling.rows import problem_hash
@@ -98,16 +97,15 @@ class Job:
         known = self._ended_before(mark)
         if known is not None:
             return known
-        began, outer, sampler = perf_counter(), self.outer, self.outer.sampler
+        outer, sampler = self.outer, self.outer.sampler
+        terms = Terms(self.formulation, mark["tolerance"], self.seed)
         words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
         outcome = FormulationResult(message=words)
         if not words:
-            outcome = self._trained(mark["tolerance"])
+            outcome = self._trained(terms.tolerance)
             if outcome.x is None:
                 outcome = outer.rescued(outcome, self.seed)
-        solution = concluded_at(
-            outer, outcome, self.formulation, mark["tolerance"], self.seed, began
-        )
+        solution = concluded_at(outer, outcome, terms)
         version = self._kept(outcome)
         reason = "converged" if outcome.agreed else "budget" if self.left <= 0 else "rounds"
         retraining = mark | {"version": version, "samples": self.spent, "reason": reason}
@@ -149,7 +147,7 @@ class Job:
         """Syntheses a sample, as far as is known of whole inner problems."""
         return max(self.spent, 1) / max(samples, 1) if self.over_theta else 1.0
 
-    def _known(self) -> Surrogates | None:
+    def _known(self) -> KnownSamples | None:
         """What the store holds within the bounds, a first design added where that is too little.
 
         None where the truth has no value at most of its points. Raises UserError where the budget
@@ -175,7 +173,7 @@ class Job:
             raise UserError(f"--budget {self.budget} {words}")
         thetas = np.array([sample.x for sample in kept])[:, : len(self.outer.problem.names)]
         quantities = [sample for sample in kept if isinstance(sample, QuantitySample)]
-        return Surrogates((), thetas, tuple(quantities))
+        return KnownSamples(thetas, tuple(quantities))
 
     def _stored(self) -> "list[Seen]":
         """Samples of the store within the bounds, oldest first, failures among them."""

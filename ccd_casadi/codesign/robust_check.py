@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel
-from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival_of
+from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival
 from ccd_casadi.fixed_structure import Certificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -73,17 +73,18 @@ class OtherDamping:
     @property
     def words(self) -> str:
         """What passes a bound by more than a hundredth with the other damping only, or nothing."""
-        how = f"with the damping {'matrix' if self.kept == 'ratio' else 'ratio'} kept instead"
+        other = "matrix" if self.kept == "ratio" else "ratio"
+        where = f"on the set if the damping {other} is kept and not the {self.kept}"
         if not self.own:
             return ""
         if not self.other:
-            return f"{how} the set holds a plant on which the loop is unstable"
+            return f"a loop is unstable {where}"
         found = [
-            f"{name} is {100.0 * (share - 1.0):.2g} % above its bound"
+            f"{name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
             for name, share in self.other.items()
             if share - max(1.0, self.own[name]) > MATTERS
         ]
-        return f"{how} {', '.join(found)} on the set" if found else ""
+        return f"{', '.join(found)} {where}" if found else ""
 
     @property
     def entry(self) -> dict[str, Any]:
@@ -107,7 +108,11 @@ def survived(
     marks = [abs(end) for end in kind_of(problem).common_shifts()]
     if check is not None and check.at.damping == 1.0:
         marks.append(abs(check.at.shift))
-    found = survival_of(problem, loops, bandwidth, marks)
+    inner, slack = problem.inner, kind_of(problem).slack
+    found = survival(
+        loops, S_max=inner.S_max, bandwidth=bandwidth, omega_low=inner.omega_low, slack=slack,
+        marks=marks,
+    )  # fmt: skip
     return found, check_robust(problem, loops)
 
 

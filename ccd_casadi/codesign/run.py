@@ -3,22 +3,20 @@
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
 
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, Terms
 from ccd_casadi.codesign.formulations import MANY, Formulation
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.search import concluded, concluded_at, nothing_found, searched
-from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.search import concluded, concluded_at, searched
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
@@ -89,11 +87,7 @@ def solve(
 
 
 def co_design(
-    sampler: Sampler,
-    formulation: Formulation,
-    seed: int,
-    given: Surrogates | None = None,
-    known: Array | None = None,
+    sampler: Sampler, formulation: Formulation, seed: int, known: Array | None = None
 ) -> Solution:
     """Run one formulation on a sampler, verify and polish its design on the truth.
 
@@ -102,30 +96,17 @@ def co_design(
     that is known already, in place of the formulation.
     """
     if sampler.problem.listed:
-        if given is not None:
-            raise UserError("--surrogate: cannot start a solve with lists of values; leave it out")
         return _of_lists(sampler, formulation, seed)
-    began = perf_counter()
-    name, tolerance = type(formulation).__name__.lower(), formulation.tolerance
-    outer = outer_of(sampler)
+    terms = Terms(type(formulation).__name__.lower(), formulation.tolerance, seed)
     require_solvable(sampler.problem)
-    if given is not None and not outer.learns_from_others:
-        raise UserError("--surrogate: cannot start a solve of this kind; solve the case without it")
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
-        return concluded(nothing_found(outer, forbidden), name, tolerance, seed, began)
+        return concluded_at(outer_of(sampler), FormulationResult(message=forbidden), terms)
 
-    def solved(each: Sampler) -> Solution:
-        found = searched(outer_of(each), formulation, seed, given, known)
-        return concluded(found, name, tolerance, seed, began)
+    def solved(outer: Outer) -> Solution:
+        return concluded(searched(outer, formulation, seed, known), terms)
 
-    def continued(each: Sampler, outcome: FormulationResult) -> Solution:
-        return concluded_at(outer_of(each), outcome, name, tolerance, seed, began)
-
-    def explained(each: Sampler, found: Solution, share: float | None) -> str:
-        return outer_of(each).explained(found, share)
-
-    return best_over_design_plants(sampler, solved, continued, explained)
+    return best_over_design_plants(sampler, outer_of, solved, terms)
 
 
 def outer_of(sampler: Sampler) -> Outer:

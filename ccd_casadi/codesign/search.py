@@ -6,18 +6,16 @@ better the search begins anew with it. Then a global check over the box, and on 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from time import perf_counter
 
 import numpy as np
 
 from ccd_casadi.codesign.box_look import look_over_box, perturbed
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult, Terms
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
 from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.arrays import Array
 
@@ -31,16 +29,12 @@ class Searched:
     outer: Outer
     outcome: FormulationResult
     end: End | None
-    rounds: int
+    rounds: int = 1
     look: BoxLook | None = None
 
 
 def searched(
-    outer: Outer,
-    formulation: Formulation,
-    seed: int,
-    given: Surrogates | None = None,
-    known: Array | None = None,
+    outer: Outer, formulation: Formulation, seed: int, known: Array | None = None
 ) -> Searched:
     """Formulation and polish, again with what the inner problem at the end has found better.
 
@@ -51,7 +45,7 @@ def searched(
     while True:
         rounds += 1
         if known is None:
-            outcome = outer.formulated(formulation, seed, given)
+            outcome = outer.formulated(formulation, seed)
         else:
             outcome = FormulationResult(known, agreed=True)
         if outcome.x is None:
@@ -104,36 +98,20 @@ def best_end(found: Sequence[End], level: float, tolerance: float) -> End:
     return min(stationary or near, key=lambda item: item.objective)
 
 
-def concluded(
-    found: Searched, formulation: str, tolerance: float, seed: int, began: float
-) -> Solution:
+def concluded(found: Searched, terms: Terms) -> Solution:
     """The design judged, and result.json."""
-    outer, outcome, sampler = found.outer, found.outcome, found.outer.sampler
+    outcome, sampler = found.outcome, found.outer.sampler
+    spent = sampler.spent
     if found.end is None:
-        result = infeasible_dict(
-            formulation, outcome.message, spent=sampler.spent.by_purpose,
-            seconds=perf_counter() - began, seed=seed,
-        )  # fmt: skip
-        return Solution(result, outcome, None)
-    with sampler.spent.on("checks"):
-        verified = outer.verified(found.end, found.rounds)
+        return Solution(infeasible_dict(terms, outcome.message, spent.by_purpose), outcome, None)
+    with spent.on("checks"):
+        verified = found.outer.verified(found.end, found.rounds)
     quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
-    result = result_dict(
-        formulation, outcome, verified, tolerance=tolerance, spent=sampler.spent.by_purpose,
-        seconds=perf_counter() - began, seed=seed, quality=quality, look=found.look,
-    )  # fmt: skip
+    result = result_dict(terms, outcome, verified, spent.by_purpose, quality, found.look)
     return Solution(result, outcome, verified, quality)
 
 
-def concluded_at(
-    outer: Outer, outcome: FormulationResult, formulation: str, tolerance: float, seed: int,
-    began: float,
-) -> Solution:  # fmt: skip
+def concluded_at(outer: Outer, outcome: FormulationResult, terms: Terms) -> Solution:
     """An outcome polished and judged as it is, without a global check over the box."""
     end = None if outcome.x is None else outer.ended(outcome.x)
-    return concluded(Searched(outer, outcome, end, 1), formulation, tolerance, seed, began)
-
-
-def nothing_found(outer: Outer, words: str) -> Searched:
-    """No design, and why."""
-    return Searched(outer, FormulationResult(message=words), None, 0)
+    return concluded(Searched(outer, outcome, end), terms)

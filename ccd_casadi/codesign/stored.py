@@ -10,7 +10,6 @@ the leave-one-out errors of each output {rms, max, q2} in its unit, the predicte
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,52 +18,14 @@ import numpy as np
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.rows import Sample, hashes_of
-from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from surrogates import GaussianProcess, SurrogateFileError
+from surrogates import GaussianProcess
 from surrogates.files import write_whole
-from surrogates.serialise import load, save
+from surrogates.serialise import save
 
 SAME = 1e-9  # of the box: the rounding of a point that went through a surrogate
-
-
-@dataclass(frozen=True)
-class Surrogates:
-    """A version to start from: its processes, and the θ and designs that it was fitted to."""
-
-    processes: tuple[GaussianProcess, ...]
-    thetas: Array
-    samples: tuple[QuantitySample, ...]
-
-
-def named_surrogate(
-    folder: Path, name: str, formulation: str, problem: CoDesignProblem
-) -> Surrogates:
-    """A version of the run folder's surrogates, for a formulation of a problem.
-
-    Raises UserError where there is none of that name, or it is of something else.
-    """
-    try:
-        processes = load_version(folder, name)
-    except (SurrogateFileError, OSError) as error:
-        raise UserError(f"--surrogate {name}: {error}") from error
-    lower, upper = box(problem) if formulation == "nested" else lifted_bounds(problem)
-    outputs = {"nested": 1, "lifted": 1 + len(problem.inner.bounds)}
-    if len(processes) != outputs.get(formulation) or processes[0].lower.shape != lower.shape:
-        raise UserError(
-            f"--surrogate {name}: has {len(processes)} outputs of {processes[0].lower.size} "
-            f"inputs, no surrogate of the {formulation} formulation; choose another --formulation"
-        )
-    if not (np.allclose(processes[0].lower, lower) and np.allclose(processes[0].upper, upper)):
-        raise UserError(f"--surrogate {name}: was made for other bounds; retrain the run folder")
-    X = lower + processes[0].X * (upper - lower)
-    if formulation == "nested":
-        with SampleStore(folder / "samples.sqlite") as store:
-            known = stored_thetas(store, problem)
-        return Surrogates(processes, _exact(X, known, upper - lower), ())
-    return Surrogates(processes, X[:, :-2], _quantities(processes, X))
 
 
 def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Array, Sample]]:
@@ -100,31 +61,6 @@ def stored_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
         raise store.damaged()
     X = np.array(thetas, dtype=float).reshape(-1, len(lower))
     return X[((lower <= X) & (upper >= X)).all(axis=1)]
-
-
-def _exact(X: Array, known: Array, width: Array) -> Array:
-    """The known θ that rows of X are but for rounding; the rows themselves elsewhere."""
-    if not len(known):
-        return X
-    found = []
-    for x in X:
-        away = np.abs((known - x) / width).max(axis=1)
-        found.append(known[np.argmin(away)] if away.min() <= SAME else x)
-    return np.array(found)
-
-
-def _quantities(processes: tuple[GaussianProcess, ...], X: Array) -> tuple[QuantitySample, ...]:
-    """The samples that the processes with gradients hold; γ_opt, the last, is not among them."""
-    n, d = X.shape
-    k = len(processes) + 1
-    values, gradients = np.full((n, k), np.nan), np.full((n, k, d), np.nan)
-    for i, process in enumerate(processes):
-        targets = process.targets.reshape(1 + d, n)
-        values[:, i] = process.output_mean + process.output_scale * targets[0]
-        width = process.upper - process.lower
-        gradients[:, i] = process.output_scale * targets[1:].T / width
-    rows = zip(X, values, gradients, strict=True)
-    return tuple(QuantitySample(tuple(map(float, x)), v, g, True) for x, v, g in rows)
 
 
 FOLDER, NEWEST = "surrogates", "surrogate.json"
@@ -175,21 +111,6 @@ def keep_version(
     save(surrogates, run / FOLDER / f"{name}.json", extra | {"version": record})
     publish(run)
     return name
-
-
-def load_version(run: Path, name: str) -> tuple[GaussianProcess, ...]:
-    """The surrogates of a version.
-
-    Raises SurrogateFileError where there is no such version, or its file is damaged.
-    """
-    path, known = run / FOLDER / f"{name}.json", version_names(run)
-    if name not in known:
-        words = f"known are {known[0]} to {known[-1]}" if known else "there are none yet"
-        raise SurrogateFileError(f"{path}: there is no such version; {words}")
-    processes = load(path)[0]
-    if not processes:
-        raise SurrogateFileError(f"{path}: holds no surrogate")
-    return processes
 
 
 def publish(run: Path) -> None:

@@ -7,9 +7,11 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
-from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
+from ccd_casadi.fixed_structure import Bounds, Certificate, Sampling, SectionsDesign
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
+from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
@@ -58,7 +60,7 @@ def design_dict(
             problem.inner.omega_low / HZ,
         ),
         "KS_max": max(plant.KS for plant in judged.plants),
-        **_loop_entry(problem, theta, made),
+        **_loop_entry(problem, theta, made, highest.S_peak),
         **_channel_entry(bounds_of(problem), judged),
         "certificate": {
             "stable": all(plant.stable for plant in judged.plants),
@@ -84,16 +86,14 @@ def design_dict(
 
 
 def _loop_entry(
-    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign, peak: float
 ) -> dict[str, Any]:
     """Margins and steps on the plants of the set; nothing of an unstable loop."""
-    judged = made.certificate
-    assert judged is not None
+    assert made.certificate is not None
     assert made.controller is not None
-    if not all(plant.stable for plant in judged.plants):
+    if not all(plant.stable for plant in made.certificate.plants):
         return {}
     plants = [plant.plant_si() for plant in plants_of(problem, theta)]
-    peak = max(plant.S_peak for plant in judged.plants)
     return loop_entry(plants, made.controller, problem.sampling, made.bandwidth, peak)
 
 
@@ -139,6 +139,17 @@ def _channel_entry(bounds: Bounds, judged: Certificate) -> dict[str, Any]:
     return {"channel_bounds": found} if found else {}
 
 
+def robust_dict(wide: Certificate, plants: int, worst: Excess) -> dict[str, Any]:
+    """`robust`: the judge on so many plants of the box, and the worst that was searched."""
+    return {
+        "plants": plants,
+        "passed": wide.passed,
+        "words": wide.words,
+        "bandwidth_hz": wide.bandwidth / HZ,
+        "worst_excess": float(np.expm1(worst.value)),
+    }
+
+
 def proof_dict(proof: Proof) -> dict[str, Any]:
     """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
     found: dict[str, Any] = {
@@ -158,15 +169,12 @@ def proof_dict(proof: Proof) -> dict[str, Any]:
     return found
 
 
-def sections_controller(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:
+def sections_controller(
+    made: SectionsDesign | MeasuredDesign, sampling: Sampling | None
+) -> dict[str, Any]:
     """controller.json: the state space in SI, the sections, and how they run."""
     assert made.controller is not None
-    sampling = problem.sampling
     words = sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()}
     if sampling is not None:
-        words["loop"] = {
-            "rate_hz": sampling.rate_hz,
-            "delay_us": sampling.delay_us,
-            "method": "tustin",
-        }
+        words["loop"] = vars(sampling) | {"method": "tustin"}
     return controller_dict(made.controller) | {"sections": words}

@@ -39,7 +39,6 @@ from ccd_casadi.inner_problem.structured_problem import Member
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from surrogates import design
@@ -100,8 +99,21 @@ class ListedStructured:
 
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by."""
-    best = sampler.bandwidths(theta, "near by")[0]
-    return _found(sampler.problem, pieces_from(sampler, best, SETTLED, FAR))
+    problem = sampler.problem
+    best = pieces_from(sampler, sampler.bandwidths(theta, "near by")[0], SETTLED, FAR)
+    J = objective_of(problem, best)
+    if not np.isfinite(J):
+        return _nothing(best.shortfall)
+    result = {
+        "status": "searched",
+        "objective": J,
+        "theta": dict(zip(problem.names, best.theta, strict=True)),
+        "hardware_cost": hardware_cost(plant_of(problem), best.theta),
+        "bandwidth_hz": best.bandwidth / HZ,
+        f"{problem.figure.entry}_of_set": best.value,
+    }
+    outcome = FormulationResult(np.array(best.theta), agreed=True)
+    return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))
 
 
 def carried(
@@ -133,22 +145,6 @@ def _at(
 ) -> CoDesignProblem:
     own = replace(structured_of(problem), anchors=(kappa,), error_anchors=())
     return replace(problem, controller=own.with_anchor(kappa, 1), start=theta)
-
-
-def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
-    J = objective_of(problem, best)
-    if not np.isfinite(J):
-        return _nothing(best.shortfall)
-    result = {
-        "status": "searched",
-        "objective": J,
-        "theta": dict(zip(problem.names, best.theta, strict=True)),
-        "hardware_cost": hardware_cost(plant_of(problem), best.theta),
-        "bandwidth_hz": best.bandwidth / HZ,
-        f"{problem.figure.entry}_of_set": best.value,
-    }
-    outcome = FormulationResult(np.array(best.theta), agreed=True)
-    return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))
 
 
 def _nothing(words: str) -> Solution:

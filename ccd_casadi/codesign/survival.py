@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
-from ccd_casadi.inner_problem.kinds import MixedSensitivity, kind_of
+from ccd_casadi.inner_problem.kinds import MixedSensitivity
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -117,20 +117,6 @@ def damping_range(
         return limit if found == size else math.exp(sign * found)
 
     return end(limits[0]), end(limits[1])
-
-
-def survival_of(
-    problem: CoDesignProblem, loops: LoopsOffModel, bandwidth: float, marks: Sequence[float] = ()
-) -> Survival:
-    """The figures of a problem's finished loop."""
-    return survival(
-        loops,
-        S_max=problem.inner.S_max,
-        bandwidth=bandwidth,
-        omega_low=problem.inner.omega_low,
-        slack=kind_of(problem).slack,
-        marks=marks,
-    )
 
 
 def survival(

@@ -14,6 +14,7 @@ true plants too, as values and slopes are exact in the middle.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +55,7 @@ PENALTY = (
 STEPS, ADAPTING = 60, 15  # of a search, and of the controller alone at its end
 FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-7  # of w2 ω_b
+LAST, FADED = 12, 0.15  # trials that gain less of all that was gained: made anew, plants tell more
 SETTLED = 3e-4  # of J: less is not worth another set of plants
 ENDINGS, CLOSE, MET = 3, 0.02, 1e-4  # searches on the plants to first order; of the box
 LAST_GAIN = 1e-10  # of w2 ω_b
@@ -104,7 +106,7 @@ def together(
         make = partial(proposed, problem, models, best, reach)
         found = asked.kept("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
-            tell(f"J {J:.6g} and {found.gain:.2g} less to be had near by")
+            tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
         promised = found.gain > SETTLED * abs(J) and reach > LEAST
         if not (members or promised):
             best = finished(asked, best)
@@ -192,6 +194,8 @@ def proposed(
     start = model.at(model.start)
     if start is None:
         return Proposal(at, 0.0)
+    if least_gain == LEAST_GAIN:
+        model.enough = 2.0 * SETTLED * abs(start.value)
     n, radius = len(start.x), Radius(min(FIRST, reach), NARROWEST, WIDEST)
     end = minimise(
         model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=least_gain
@@ -205,6 +209,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     x = (z, κ, τ), with the loops at x."""
 
     corrected = bending = True
+    enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
 
     def __init__(
         self, problem: CoDesignProblem, models: Sequence[Evaluate], place: Place, reach: float
@@ -220,6 +225,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self.unit = -problem.w2 * place.bandwidth
         middle = (self.middle - lower) / self.width
         loops = self.first_loops = self.loops(middle)
+        self.merits: list[float] = []  # before every trial
         self.loops_beside = lru_cache(1)(self._loops_beside)  # a step that fails is followed by one
         self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
         kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
@@ -300,6 +306,15 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         slope = np.concatenate([own.cost_gradient / self.unit, np.zeros(len(kappa)), [-worth]])
         violation = max(found.violation, float((own.constraints + INSIDE).max(initial=0.0)))
         return Iterate(x, cost / self.unit - worth, slope, violation, (problem, found))
+
+    def ended(
+        self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]
+    ) -> bool:  # fmt: skip
+        """Where the last trials gain little of what all have."""
+        self.merits.append(here.value + PENALTY * here.violation)
+        gained = self.merits[0] - self.merits[-1]
+        late = self.merits[-LAST:][0] - self.merits[-1]
+        return len(self.merits) > LAST and gained > self.enough and late < FADED * gained
 
     def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""

@@ -32,6 +32,8 @@ from ccd_casadi.inner_problem.objective import hardware_at, objective, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import (
     STEP,
+    ActiveSet,
+    FirstOrder,
     Kink,
     KktCertificate,
     active_set,
@@ -63,14 +65,8 @@ def theta_kkt(
     with slopes to its sides, or the second-order check where it has none. `beside`: where true
     values are dear, by how much J is larger at θ (n, n_θ) next to it on plants to first order.
     """
-    lower, upper = box(problem)
-    width = upper - lower
-    theta, sizes = np.array(sample.theta), constraint_sizes(problem)
-    own = hardware_at(problem, theta)
-    at = active_set(
-        (theta - lower) / width, objective_gradient(problem, sample), own.constraints * sizes,
-        own.slopes * sizes[:, None], sizes, plant_of(problem).constraint_names, problem.names,
-    )  # fmt: skip
+    width, own = np.subtract(*box(problem)[::-1]), hardware_at(problem, np.array(sample.theta))
+    at = active_theta(problem, sample)
     if not np.isfinite(at.gradient).all():
         return at.certificate(np.zeros(len(at.labels)), np.inf, None)
     nu = at.multipliers()
@@ -95,6 +91,17 @@ def theta_kkt(
     elif Z.shape[1] and truth is not None and beside is None:
         second = reduced_curvature(Z, _hessian(problem, truth, sample, Z), at.size)
     return at.certificate(nu, residual, second, kink)
+
+
+def active_theta(problem: CoDesignProblem, sample: BandwidthSample) -> ActiveSet:
+    """∇J at a sample, and what binds of λ and the bounds of θ."""
+    (lower, upper), theta = box(problem), np.array(sample.theta)
+    own = hardware_at(problem, theta)
+    here = FirstOrder(
+        objective_gradient(problem, sample), own.constraints, own.slopes,
+        constraint_sizes(problem), plant_of(problem).constraint_names,
+    )  # fmt: skip
+    return active_set((theta - lower) / (upper - lower), here, problem.names)
 
 
 def joint_residual(

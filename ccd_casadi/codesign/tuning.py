@@ -166,9 +166,10 @@ def _plant(
         spread = item.spread if item.spread is None else item.spread[kept]
         return replace(item, hz=item.hz[kept], G=G[kept], spread=spread), None
     if isinstance(item, interchange.NamedSystem):
-        system, own = item.system, item.period
+        system = item.system
     else:
-        system, own = interchange.from_control(item)
+        system = interchange.from_control(item)
+    own = system.period
     if own and rate_hz is None:
         rate_hz = 1.0 / own
     if rate_hz is None:
@@ -184,7 +185,6 @@ def _plant(
     else:
         whole = parts(T, delay)[0]
         model = delayed(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)
-    system = replace(system, period=own)
     top, rates = np.pi / T, system.rates
     rest = np.abs(rates) <= AT_REST * np.abs(rates).max(initial=0.0)
     zeros = system.rates_of(system.zeros(1.0 if own else top))

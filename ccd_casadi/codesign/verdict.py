@@ -19,7 +19,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import counted, metres, shown
+from ccd_casadi.support.units import counted, metres, with_unit
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -105,7 +105,7 @@ def optimal(
         return Line(State.FAILED, f"{words}; {known}", figures)
     words = (
         f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
-        f"controller together, {kink.one_gradient:.2g} with one side's gradient alone; "
+        f"controller together ({kink.one_gradient:.2g} with the gradient of one side); "
         f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
@@ -122,8 +122,8 @@ def _sides(kink: Kink) -> str:
     if not known:
         return "is not known beside it"
     if len(found) == 2 and known == 2:
-        words = f"grows by {found[0]:.2g} and {found[1]:.2g} of its gradient on the two sides"
-        return f"{words} of the one direction that is left"
+        words = f"{found[0]:.2g} and {found[1]:.2g} times its gradient"
+        return f"rises on both sides of the direction that no bound holds ({words})"
     return (
         f"grows by at least {kink.least_slope:.2g} of its gradient on {known} of {len(found)} "
         f"sides of {len(kink.slopes)} directions"
@@ -181,10 +181,12 @@ def predicted(
         size = f"left_out_{unit.lower()}"
         figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}
     if not error <= tolerance:
-        words = f"prediction and truth differ by {100 * error:.2g} %, more than {tolerance:.0e}"
+        words = (
+            f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
+        )
         return Line(State.FAILED, words, figures)
     if left_out is None:
-        words = f"{what} predicted to {error:.1e}"
+        words = f"{what} predicted to {100 * error:.2g} %"
         if extrapolates:
             words += f"; the surrogate extrapolates there: {extrapolates[0]}"
             return Line(State.WARNED, words, figures)
@@ -286,7 +288,7 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
         return Line(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
-        f"run deploy; the loops' least delay margin is {shown(found.delay, 's')}, and below "
+        f"run deploy; the loops' least delay margin is {with_unit(found.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     ).replace("µ", "u")
     return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})

@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from surrogates import Quality
 
 
@@ -120,7 +120,7 @@ class Verified(ABC):
 
 
 @dataclass(frozen=True)
-class Solution(Shown):
+class Solution(NotebookHtml):
     """Result of a run: the JSON result and the objects behind it.
 
     Parameters

@@ -4,12 +4,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar
 
-from ccd_casadi.codesign.design_entries import (
-    compliance_dict,
-    controller_dict,
-    figures_dict,
-    loop_of_design,
-)
+from ccd_casadi.codesign.design_entries import controller_dict, mixed_dict
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import Line, State, survives
 from ccd_casadi.codesign.verified import Verified
@@ -61,12 +56,7 @@ class VerifiedDesign(Verified):
         return (*filter(ends.__contains__, self.kkt.active), *inner, *touched(problem, self.theta))
 
     def figures(self) -> dict[str, Any]:
-        found = figures_dict(self.design.figures)
-        found |= loop_of_design(self.problem, self.theta, self.design)
-        if self.survival is not None:
-            rest, most = self.survival.statics, self.design.figures.compliance
-            found |= compliance_dict(most, rest.compliance, rest.low, rest.low_hz)
-        return found
+        return mixed_dict(self.problem, self.theta, self.design)
 
     def evidence(self, predicted: float) -> dict[str, Any]:
         free = self.unsuspended

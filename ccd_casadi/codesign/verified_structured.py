@@ -5,14 +5,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-import numpy as np
-
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
     proof_dict,
+    robust_dict,
     sections_controller,
 )
 from ccd_casadi.codesign.verdict import Line, State, survives
@@ -31,7 +30,7 @@ from ccd_casadi.inner_problem.structured_search import joined
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ, counted
 
 
@@ -135,7 +134,7 @@ class VerifiedStructured(Verified):
             "anchors": [list(kappa) for kappa in structured.anchors],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
-            "costs": clean({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
+            "costs": json_values({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
             | {"tolerances_hz": {name: 0.01 * w / HZ for name, w in self.prices.items()}},
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
@@ -163,15 +162,11 @@ class VerifiedStructured(Verified):
         stable = [plant for plant in self.wide.plants if plant.stable]
         members = structured_of(self.problem).members
         return {
+            **robust_dict(self.wide, self.checked, self.worst),
             "stable": len(stable) == len(self.wide.plants),
-            "plants": self.checked,
-            "passed": self.wide.passed,
-            "bandwidth_hz": self.wide.bandwidth / HZ,
             "worst_sensitivity_peak": max((plant.S_peak for plant in stable), default=None),
-            "worst_excess": float(np.expm1(self.worst.value)),
             "worst_plant": {"option": self.worst.option, "point": self.worst.point.tolist()},
             "set": [{"option": option, "point": list(point)} for option, point in members],
-            "words": self.wide.words,
             "yield": None if self.drawn is None else self.drawn.entry,
             **({} if self.damping is None else self.damping.entry),
         }
@@ -182,7 +177,7 @@ class VerifiedStructured(Verified):
         return {"robust": self.kept, **later}
 
     def controller_entry(self) -> dict[str, Any]:
-        return sections_controller(self.problem, self.design)
+        return sections_controller(self.design, self.problem.sampling)
 
     def certified_line(self) -> Line:
         judged = self.design.certificate

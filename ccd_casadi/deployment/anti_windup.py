@@ -32,7 +32,7 @@ from ccd_casadi.support.errors import UserError
 TRUSTS = (0.1, 0.01, 1.0)
 
 
-def limited(realisation: Realisation, bandwidth: float) -> Realisation:
+def with_anti_windup(realisation: Realisation, bandwidth: float) -> Realisation:
     """The same with back-calculation where it has a saturation; ω_b in rad/s."""
     if realisation.saturation is None:
         return realisation

@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.channels import LoopChannel, along, split
+from ccd_casadi.deployment.channels import LoopChannel, along_directions, scalar_channels
 from ccd_casadi.deployment.discretise import Conversion, Target, loop_at
 from ccd_casadi.deployment.outcome import SAMPLED_BANDWIDTH, ChannelOrders
-from ccd_casadi.deployment.rate_choice import ChannelLoops
+from ccd_casadi.deployment.rate_choice import loops_meet
 from ccd_casadi.deployment.reduction import ReducedController, Reduction
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.deployment.timing import Timing
@@ -32,8 +32,8 @@ def at_its_rate(
     target = Target(run.problem.inner.S_max, DESIGNED_EXCESS, own.bandwidth, SAMPLED_BANDWIDTH)
     if timing.delay is None and timing.delay_samples == Timing.delay_samples:
         timing = replace(timing, delay=designed.delay)
-    loops = ChannelLoops(channels, [run.controller], target)
-    met = loops.met(tustin, rate, timing, WorstFirst(family))
+    loops = [(channel, run.controller) for channel in channels]
+    met = loops_meet(loops, target, tustin, rate, timing, WorstFirst(family))
     needed = rate if met else designed.rate_hz
     return target, needed, rate, timing.delay_at(rate)
 
@@ -57,17 +57,18 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
     structure, kappa = structure_of(run.problem), run.kappa
     assert kappa is not None
     if isinstance(structure, Structure):
-        channel = split(run.plant, run.controller)[0]
-        whole = ReducedController(
-            len(run.controller.A), Reduction.NONE, run.controller, run.figures
-        )
-        return (ChannelOrders(channel, (whole,), whole, whole, (structure, kappa)),)
+        channel = scalar_channels(run.plant, run.controller)[0]
+        parts = [(channel, structure, kappa)]
+    else:
+        decoupling, parts = structure.decoupling, []
+        for i, (own, values) in enumerate(structure.split(kappa)):
+            u, v = decoupling.outputs[:, [i]], decoupling.inputs[:, [i]]
+            plant, K = along_directions(run.plant, u, v), state_space(own, values)
+            parts.append((LoopChannel(decoupling.names[i], u, v, plant, K), own, values))
     found = []
-    for i, (own, values) in enumerate(structure.split(kappa)):
-        u, v = structure.decoupling.outputs[:, [i]], structure.decoupling.inputs[:, [i]]
-        plant, K = along(run.plant, u, v), state_space(own, values)
-        channel = LoopChannel(structure.decoupling.names[i], u, v, plant, K)
-        figures = run.measured(plant, K)
+    for channel, own, values in parts:
+        K = channel.controller
+        figures = run.measured(channel.plant, K)
         alone = ReducedController(len(K.A), Reduction.NONE, K, figures)
         found.append(ChannelOrders(channel, (alone,), alone, alone, (own, values)))
     return tuple(found)

@@ -15,7 +15,6 @@ from scipy.linalg import block_diag
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.closed_loop import responses
 
 DIAGONAL = 1e-8  # share of the gain that may lie off the diagonal and count as rounding
 
@@ -31,33 +30,34 @@ class LoopChannel:
     controller: StateSpace
 
 
-def whole(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
+def whole_loop(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
     """The loop as one channel."""
     p, m = plant.C.shape[0], plant.B.shape[1]
     return (LoopChannel("all", np.eye(p), np.eye(m), plant, controller),)
 
 
-def split(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
+def scalar_channels(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
     """The scalar channels of the loop, or the whole loop as one channel."""
     p, m = plant.C.shape[0], plant.B.shape[1]
     U = np.hstack([c.outputs for c in plant.channels] or [np.eye(p)])
     V = np.hstack([c.inputs for c in plant.channels] or [np.eye(m)])
     if not (U.shape == (p, p) and V.shape == (m, m) and p == m > 1):
-        return whole(plant, controller)
-    G, K, _ = responses(plant, controller, plant.grid * plant.omega_0)
+        return whole_loop(plant, controller)
+    omega = plant.grid * plant.omega_0
+    G, K = plant.plant_si().response(omega), controller.response(omega)
     if not (_diagonal(U.T @ G @ V) and _diagonal(V.T @ K @ U)):
-        return whole(plant, controller)
+        return whole_loop(plant, controller)
     found = []
     for i in range(p):
         u, v = U[:, [i]], V[:, [i]]
         part = StateSpace(
             controller.A, controller.B @ u, v.T @ controller.C, v.T @ controller.D @ u
         )
-        found.append(LoopChannel(str(i + 1), u, v, along(plant, u, v), part))
+        found.append(LoopChannel(str(i + 1), u, v, along_directions(plant, u, v), part))
     return tuple(found)
 
 
-def along(plant: ScaledPlant, u: Array, v: Array) -> ScaledPlant:
+def along_directions(plant: ScaledPlant, u: Array, v: Array) -> ScaledPlant:
     """uᵀ G v, of directions u of its outputs and v of its inputs."""
     B, C = np.ascontiguousarray(plant.B @ v), np.ascontiguousarray(u.T @ plant.C)
     return replace(plant, B=B, C=C, channels=())

@@ -7,7 +7,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
-from ccd_casadi.deployment.sections import Root, sections_of
+from ccd_casadi.deployment.sections import sections_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.robust.sampled import SampledFigures
 from ccd_casadi.support.json_files import write_json
@@ -33,8 +33,8 @@ def write_files(
         "plant": named_plant(run.plant.plant_si()),
         "controller": named_controller(run.controller),
         "controller_reduced": named_controller(found.reduced),
-        "controller_discrete": named_controller(K, K.period),
-        "plant_discrete": named_plant(held, held.period),
+        "controller_discrete": named_controller(K),
+        "plant_discrete": named_plant(held),
     }
     theta = dict(zip(run.problem.names, run.theta, strict=True))
     units = dict(zip(run.problem.names, run.problem.units, strict=True))
@@ -151,11 +151,12 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
         "gain": found.gain,
         "gain_at_bandwidth": found.gain_at_bandwidth,
         "sections": [
-            {"kind": s.kind, "zero": _root(s.zero), "pole": _root(s.pole), "depth_db": s.depth_db}
+            {
+                "kind": s.kind,
+                "zero": s.zero and vars(s.zero),
+                "pole": s.pole and vars(s.pole),
+                "depth_db": s.depth_db,
+            }
             for s in found.sections
         ],
     }
-
-
-def _root(root: Root | None) -> dict[str, Any] | None:
-    return None if root is None else dict(vars(root))

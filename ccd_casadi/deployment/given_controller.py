@@ -13,7 +13,7 @@ A table (TOML, or JSON of the same form) is what one enters in a drive:
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,17 +37,6 @@ SECTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class Given:
-    """A controller in SI, e = r - y to u; in discrete time where its period is above 0.
-
-    `delay` in s is that from reading y to the new u, of a discrete one.
-    """
-
-    system: StateSpace
-    delay: float = 0.0
-
-
 def as_it_runs(run: FinishedRun) -> FinishedRun:
     """A run whose case has a sampled loop with its controller as it runs there, by Tustin's rule.
 
@@ -64,8 +53,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
 
     Raises UserError where the file holds none that fits, or the loop is not stable with it.
     """
-    given = read_controller(path)
-    K = given.system
+    K, delay = read_controller(path)
     p, m = len(run.plant.C), run.plant.B.shape[1]
     if (K.C.shape[0], K.B.shape[1]) != (m, p):
         sizes = f"{K.B.shape[1]} inputs and {K.C.shape[0]} outputs"
@@ -76,7 +64,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
         return replace(run, controller=K, figures=figures)
-    sampling = Sampling(1.0 / K.period, 1e6 * given.delay)
+    sampling = Sampling(1.0 / K.period, 1e6 * delay)
     found = _measured(replace(run, controller=K, sampling=sampling))
     if not np.isfinite(found.figures.sensitivity_peak):
         growth = found.loop_on(run.plant.plant_si()).poles.real.max()
@@ -92,8 +80,9 @@ def _measured(run: FinishedRun) -> FinishedRun:
     return replace(run, figures=figures)
 
 
-def read_controller(path: Path) -> Given:
-    """The controller in a .json, .toml or .mat file. Raises UserError where there is none."""
+def read_controller(path: Path) -> tuple[StateSpace, float]:
+    """The controller in a .json, .toml or .mat file, SI, e = r - y to u, and of a discrete one the
+    delay in s from reading y to the new u. Raises UserError where there is none."""
     if path.suffix not in (".json", ".toml", ".mat"):
         raise UserError(f"{path}: name a controller as .json, .toml or .mat")
     if not path.exists():
@@ -103,24 +92,23 @@ def read_controller(path: Path) -> Given:
     table = read_json(path) if path.suffix == ".json" else read_toml(path)
     if "A" in table:
         return _from_matrices(path, table)
-    return Given(_from_sections(path, table))
+    return _from_sections(path, table), 0.0
 
 
-def _from_mat(path: Path) -> Given:
+def _from_mat(path: Path) -> tuple[StateSpace, float]:
     systems = read_mat(path).systems
     for name in ("controller_discrete", "controller", ""):
         if name in systems:
-            found = systems[name]
-            delay = found.period
-            beside = path.with_name("deploy.json")
+            found = systems[name].system
+            delay, beside = found.period, path.with_name("deploy.json")
             if found.period and beside.exists():
                 told = read_json(beside).get("delay")
                 delay = float(told) if isinstance(told, int | float) else delay
-            return Given(replace(found.system, period=found.period), delay)
+            return found, delay
     raise UserError(f"{path}: holds no struct controller_discrete or controller")
 
 
-def _from_matrices(path: Path, table: Mapping[str, Any]) -> Given:
+def _from_matrices(path: Path, table: Mapping[str, Any]) -> tuple[StateSpace, float]:
     try:
         parts = [np.array(table[name], dtype=float) for name in "ABCD"]
         period, delay = float(table.get("period", 0.0)), float(table.get("delay", 0.0))
@@ -134,7 +122,7 @@ def _from_matrices(path: Path, table: Mapping[str, Any]) -> Given:
     )
     if not fits or not (0.0 <= period < np.inf and 0.0 <= delay < np.inf):
         raise UserError(f"{path}: A, B, C, D (and period, delay) are of no state space")
-    return Given(StateSpace(A, B, C, D, period=period), delay)
+    return StateSpace(A, B, C, D, period=period), delay
 
 
 def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.realisation import realise
@@ -14,13 +14,12 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.synthesis.statics import statics
 
 
-def judged(
+def assess(
     run: FinishedRun, members: Sequence[Member], orders: Sequence[ChannelOrders],
     conversion: Conversion, rate_hz: float, delay: float, saturation: float | None,
     way: Mapping[str, Any],
@@ -32,15 +31,16 @@ def judged(
     """
     period, bandwidth = 1.0 / rate_hz, run.figures.bandwidth
     parts = [discretise(o.chosen.controller, conversion, period, delay) for o in orders]
-    realisation = limited(realise([o.channel for o in orders], parts, saturation), bandwidth)
+    realisation = with_anti_windup(
+        realise([o.channel for o in orders], parts, saturation), bandwidth
+    )
     K, nominal = realisation.system, Perturbation()
     plants = {nominal: run.plant.plant_si()} | {m.at: m.plant.plant_si() for m in members}
     held = {at: sampled(plant, period, delay) for at, plant in plants.items()}
     loops = {at: closed_loop(G, K).S for at, G in held.items()}
     figures = {at: sampled_figures(loop) for at, loop in loops.items()}
     at_rest = statics(
-        plants[nominal], StateSpace(K.A, K.B, K.C, K.D), bandwidth=bandwidth,
-        omega_low=run.problem.inner.omega_low, period=period,
+        plants[nominal], K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low
     )  # fmt: skip
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:

@@ -6,7 +6,7 @@ a delay that jitters. `least_limit` is the least force, as a share of the peak t
 for, down to which the limited move ends in its window.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
-from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.move import Electronics, move
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.lti.state_space import StateSpace
@@ -28,16 +28,8 @@ SHARES = (0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of the peak force that a
 
 
 @dataclass(frozen=True)
-class Way:
-    """One way to make the move, in words and as it went."""
-
-    words: str
-    move: Move
-
-
-@dataclass(frozen=True)
 class OnHardware:
-    """The setpoint, the gains of feedforward (5, m, p) or None, the ways; None: no limit was tried.
+    """The setpoint, the gains of feedforward (5, m, p) or None, the move by its ways in words.
 
     `least_limit`: share of the unlimited peak force; NaN where the unlimited move itself does not
     end in its window, and where no limit is given.
@@ -46,7 +38,7 @@ class OnHardware:
     profile: Setpoint
     window: float
     forward: Array | None
-    ways: tuple[Way, ...]
+    ways: Mapping[str, Move]
     least_limit: float
 
 
@@ -77,27 +69,27 @@ def on_hardware(
         )
 
     progress("a move")
-    ways = [Way("feedback alone", made(free, None))]
+    unlimited = made(free, None)
+    ways = {"feedback alone": unlimited}
     if forward is not None:
-        ways.append(Way("with feedforward", made(free, forward)))
-    unlimited = ways[-1].move
+        ways["with feedforward"] = unlimited = made(free, forward)
     if realisation.saturation is not None:
         clipped = replace(realisation, back_calculation=None)
         words = f"limited to {realisation.saturation:.4g} N, only clipped"
-        ways.append(Way(words, made(clipped, forward)))
-        ways.append(Way("limited, with back-calculation", made(realisation, forward)))
+        ways[words] = made(clipped, forward)
+        ways["limited, with back-calculation"] = made(realisation, forward)
     if hardware is not None and not hardware.ideal:
-        ways.append(Way("with the electronics", made(realisation, forward, hardware)))
+        ways["with the electronics"] = made(realisation, forward, hardware)
     peak, least = float(unlimited.peak_force.max()), np.nan
     if realisation.saturation is not None and np.isfinite(unlimited.settled):
         progress("least force")
         least = 1.0
         for share in SHARES:
-            held = limited(replace(free, saturation=share * peak), bandwidth)
+            held = with_anti_windup(replace(free, saturation=share * peak), bandwidth)
             if not np.isfinite(made(held, forward).settled):
                 break
             least = share
-    return OnHardware(profile, window, forward, tuple(ways), least)
+    return OnHardware(profile, window, forward, ways, least)
 
 
 def hardware_dict(found: OnHardware) -> dict[str, Any]:
@@ -109,13 +101,13 @@ def hardware_dict(found: OnHardware) -> dict[str, Any]:
         "least_limit": None if np.isnan(found.least_limit) else found.least_limit,
         "moves": [
             {
-                "words": way.words,
-                "settled": None if np.isinf(way.move.settled) else way.move.settled,
-                "peak_error": way.move.peak_error,
-                "last_error": way.move.last_error(WATCHED),
-                "peak_force": float(way.move.peak_force.max()),
-                "saturated": way.move.saturated,
+                "words": words,
+                "settled": None if np.isinf(move.settled) else move.settled,
+                "peak_error": move.peak_error,
+                "last_error": move.last_error(WATCHED),
+                "peak_force": float(move.peak_force.max()),
+                "saturated": move.saturated,
             }
-            for way in found.ways
+            for words, move in found.ways.items()
         ],
     }

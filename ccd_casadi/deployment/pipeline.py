@@ -8,16 +8,16 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.as_designed import at_its_rate, designed_channels, require_own_bounds
-from ccd_casadi.deployment.channels import LoopChannel, assemble, split, whole
+from ccd_casadi.deployment.channels import LoopChannel, assemble, scalar_channels, whole_loop
 from ccd_casadi.deployment.discretise import Conversion, Target
-from ccd_casadi.deployment.judgement import judged
+from ccd_casadi.deployment.judgement import assess
 from ccd_casadi.deployment.outcome import (
     SAMPLED_BANDWIDTH,
     SAMPLED_EXCESS,
     ChannelOrders,
     Deployment,
 )
-from ccd_casadi.deployment.rate_choice import ChannelLoops, choose
+from ccd_casadi.deployment.rate_choice import choose
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing
@@ -75,16 +75,20 @@ def deploy(
     if kind_of(run.problem).as_designed:
         require_own_bounds(run, designed, timing)
         limits, remedy = LoopLimits(inner.S_max, inner.S_low, np.inf, full.bandwidth), DESIGN_FOR_IT
-        orders, channels, small = designed_channels(run), whole(run.plant, K), [K]
+        orders, channels, small = designed_channels(run), whole_loop(run.plant, K), [K]
         reduced, figures = K, full
     else:
-        _require_fast(timing, full.bandwidth / HZ)
+        if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * full.bandwidth / HZ:
+            words = f"is less than {LEAST_RATE:g} times the bandwidth, {full.bandwidth / HZ:.4g} Hz"
+            raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
         remedy = SHORTEN_IT
         limits = LoopLimits(
             REDUCED_PEAK * inner.S_max, inner.S_low * (1.0 + STRICT), REDUCED_NORM * full.gamma,
             REDUCED_BANDWIDTH * full.bandwidth,
         )  # fmt: skip
-        orders = tuple(_orders(run, c, family, limits, progress) for c in split(run.plant, K))
+        orders = tuple(
+            _orders(run, c, family, limits, progress) for c in scalar_channels(run.plant, K)
+        )
         channels = tuple(item.channel for item in orders)
         small = [item.chosen.controller for item in orders]
         reduced = assemble(channels, small)
@@ -94,12 +98,14 @@ def deploy(
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing)
         way |= {"needed_hz": own_hz, "target": target}
-        return judged(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
-    loops = ChannelLoops(channels, small, target)
+        return assess(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
+    loops = list(zip(channels, small, strict=True))
     for attempt in range(1 + ADDED):
-        conversion, needed, rate = choose(run, timing, loops, family, progress, attempt, remedy)
+        conversion, needed, rate = choose(
+            run, timing, loops, target, family, progress, attempt, remedy
+        )
         way |= {"needed_hz": needed, "target": target}
-        found = judged(run, dense, orders, conversion, rate, timing.delay_at(rate), saturation, way)
+        found = assess(run, dense, orders, conversion, rate, timing.delay_at(rate), saturation, way)
         outside = max((m for m in found.members if not target.held(m.figures)),
                       default=None, key=lambda m: m.badness)  # fmt: skip
         if timing.rate_hz is not None or outside is None:
@@ -107,12 +113,6 @@ def deploy(
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
     return found
-
-
-def _require_fast(timing: Timing, bandwidth_hz: float) -> None:
-    if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:
-        words = f"is less than {LEAST_RATE:g} times the bandwidth, {bandwidth_hz:.4g} Hz"
-        raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
 
 
 def _orders(

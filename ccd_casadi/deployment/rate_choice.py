@@ -16,43 +16,33 @@ from ccd_casadi.deployment.discretise import (
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.robust.sampled import SampledFigures, together
+from ccd_casadi.robust.sampled import SampledFigures, worst_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
 
-class ChannelLoops:
-    """The sampled loops of all channels on the nominal plant and on members of its set."""
+def loops_meet(
+    loops: Sequence[tuple[LoopChannel, StateSpace]], target: Target, conversion: Conversion,
+    rate: float, timing: Timing, order: WorstFirst,
+) -> bool:  # fmt: skip
+    """Whether the nominal loop of all channels, each with its controller, meets the target at a
+    rate, and those of all members hold it."""
+    delay = timing.delay_at(rate)
 
-    def __init__(
-        self, channels: Sequence[LoopChannel], controllers: Sequence[StateSpace], target: Target
-    ) -> None:
-        self.channels, self.controllers, self.target = channels, controllers, target
+    def at(member: Member | None = None) -> SampledFigures:
+        return worst_figures([
+            loop_at((c.plant if member is None else member.seen_by(c)).plant_si(), K, conversion,
+                    1.0 / rate, delay)
+            for c, K in loops
+        ])  # fmt: skip
 
-    def at(
-        self, conversion: Conversion, rate: float, delay: float, member: Member | None = None
-    ) -> SampledFigures:
-        plants = [c.plant if member is None else member.seen_by(c) for c in self.channels]
-        return together(
-            [
-                loop_at(plant.plant_si(), K, conversion, 1.0 / rate, delay)
-                for plant, K in zip(plants, self.controllers, strict=True)
-            ]
-        )
-
-    def met(self, conversion: Conversion, rate: float, timing: Timing, order: WorstFirst) -> bool:
-        """Whether the nominal loop meets the target at a rate, and those of all members hold it."""
-        delay = timing.delay_at(rate)
-
-        def held(member: Member) -> bool:
-            return self.target.held(self.at(conversion, rate, delay, member))
-
-        return self.target.met(self.at(conversion, rate, delay)) and order.all(held)
+    return target.met(at()) and order.all(lambda member: target.held(at(member)))
 
 
 def choose(
-    run: FinishedRun, timing: Timing, loops: ChannelLoops, family: tuple[Member, ...],
-    progress: Callable[[str], None], attempt: int = 0, remedy: str = "shorten it",
+    run: FinishedRun, timing: Timing, loops: Sequence[tuple[LoopChannel, StateSpace]],
+    target: Target, family: tuple[Member, ...], progress: Callable[[str], None], attempt: int,
+    remedy: str,
 ) -> tuple[Conversion, float | None, float]:  # fmt: skip
     """The conversion, the rate in Hz that it needs (None: no rate will do), and the rate to take.
 
@@ -62,7 +52,7 @@ def choose(
     conversion = Conversion.LEAD if timing.lead else Conversion.RAMP
     again = f", once more for a plant in between ({attempt})" if attempt else ""
     progress(f"rate for {conversion.value}{again}")
-    met = partial(loops.met, conversion, timing=timing, order=WorstFirst(family))
+    met = partial(loops_meet, loops, target, conversion, timing=timing, order=WorstFirst(family))
     needed = needed_rate(met, bandwidth_hz, () if timing.rate_hz is None else (timing.rate_hz,))
     if timing.rate_hz is not None:
         return conversion, needed, timing.rate_hz

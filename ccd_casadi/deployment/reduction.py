@@ -127,10 +127,6 @@ def _perturbation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | Non
     )
 
 
-def _closed_loop(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace:
-    return _without_fast(K, closed_loop(plant.system, K).T, r)
-
-
 def _without_fast(K: StateSpace, whole: StateSpace, r: int) -> StateSpace:
     """K with r states, balanced as in `_balanced`, those of the smallest values at rest."""
     balanced, _ = _balanced(K, whole, len(K.A))
@@ -163,7 +159,7 @@ def _residual(K: StateSpace, r: int) -> StateSpace:
 
 _METHODS: dict[Reduction, Callable[[ScaledPlant, StateSpace, int], StateSpace | None]] = {
     Reduction.PERTURBATION: _perturbation,
-    Reduction.CLOSED_LOOP: _closed_loop,
+    Reduction.CLOSED_LOOP: lambda plant, K, r: _without_fast(K, closed_loop(plant.system, K).T, r),
 }
 
 

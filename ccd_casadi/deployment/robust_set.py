@@ -11,7 +11,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.robust_check import DENSE
-from ccd_casadi.deployment.channels import LoopChannel, along
+from ccd_casadi.deployment.channels import LoopChannel, along_directions
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
@@ -41,7 +41,7 @@ class Member:
 
     def seen_by(self, channel: LoopChannel) -> ScaledPlant:
         """Uᵀ G V of a channel of the nominal plant: a perturbation leaves the mode shapes."""
-        return along(self.plant, channel.outputs, channel.inputs)
+        return along_directions(self.plant, channel.outputs, channel.inputs)
 
 
 @dataclass(frozen=True)

@@ -66,17 +66,20 @@ def order_words(run: FinishedRun, found: Deployment) -> str:
 
 def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
     """Bandwidth and peak of S of every loop on the way: name, value and remark."""
-    small = None if kind_of(run.problem).as_designed else found.reduced_figures
-    loops: list[tuple[str, Any]] = [
-        ("Full", run.figures), ("Reduced", small), ("Sampled", found.sampled)
-    ]  # fmt: skip
+    loops: list[tuple[str, Any]] = [("Sampled", found.sampled)]
+    if kind_of(run.problem).as_designed:
+        loops.insert(0, ("Continuous", run.figures))
+    else:
+        loops[:0] = [("Full", run.figures), ("Reduced", found.reduced_figures)]
     rows = []
     for name, figures in loops:
         if figures is not None and isfinite(figures.bandwidth):
             change = 100.0 * (figures.bandwidth / run.figures.bandwidth - 1.0)
             peak = against(figures.sensitivity_peak, run.problem.inner.S_max)
             words = f"peak {figures.sensitivity_peak:.6g} ({peak})"
-            words += "" if name == "Full" else f", bandwidth {round(change, 2) + 0.0:+.2f} %"
+            words += (
+                "" if figures is run.figures else f", bandwidth {round(change, 2) + 0.0:+.2f} %"
+            )
             rows.append((name, f"{figures.bandwidth / HZ:.6g} Hz", words))
     return rows
 

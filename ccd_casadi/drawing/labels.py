@@ -1,9 +1,12 @@
 """Words in a figure that do not meet: each label takes the first free place of several."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from ccd_casadi.drawing.content import Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -15,17 +18,54 @@ POINT = 3.0  # pt; half a marker
 # places beside a point, in pt, after the one that was asked for
 AROUND = ((0, 7), (8, 3), (-8, 3), (0, -7), (8, -5), (-8, -5), (0, 20), (12, 16), (-12, 16),
           (0, -20), (12, -18), (-12, -18))  # fmt: skip
-SHARES = (0.0, 0.2, 0.45, 0.75)  # of a line's length where its words may begin
+FAR = 16.0  # pt from a point to its words, from where on a line leads to it
+SHARES = (0.0, 0.2, 0.45, 0.75, 0.1, 0.3, 0.6, 0.9)  # of a line's length where words may begin
 APART = 2.0  # pt between the points that a curve is looked at by
-BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 
 Box = tuple[float, float, float, float]  # left, bottom, right, top in pt
+
+
+@dataclass(frozen=True)
+class Put:
+    """Words at an offset in pt from a point of the data.
+
+    `held`: whether they belong to its x and to its y; `upright`: turned by 90°.
+    """
+
+    text: str
+    x: float
+    y: float
+    dx: float
+    dy: float
+    colour: str
+    held: tuple[bool, bool] = (True, True)
+    upright: bool = False
+
+    @property
+    def across(self) -> str:
+        """Which side of the words is at the offset."""
+        return "center" if self.dx == 0 else "left" if self.dx > 0 else "right"
+
+    @property
+    def up(self) -> str:
+        """Which end of the words is at the offset."""
+        return "bottom" if self.dy >= 0 else "top"
+
+    @property
+    def far(self) -> bool:
+        """Whether a line leads from the words to their point."""
+        return all(self.held) and abs(self.dy) >= FAR
 
 
 def inside(axes: "Axes") -> Box:
     """The axes themselves in pt, from the lower left corner of the figure."""
     box, scale = axes.get_window_extent(), 72.0 / axes.figure.dpi
     return scale * box.x0, scale * box.y0, scale * box.x1, scale * box.y1
+
+
+def legend_height(names: Sequence[str]) -> float:
+    """Of a legend of these names, in pt."""
+    return LINE * (len(names) + 0.8)
 
 
 def scales_of(axes: "Axes", log_x: bool = False, log_y: bool = False) -> list[list[float]]:
@@ -46,47 +86,62 @@ def in_points(axes: "Axes", x: Any, y: Any) -> np.ndarray:
 
 
 class Labels:
-    """The labels of one pair of axes, whose ranges are final.
+    """Where the words of one panel go, whose axes take a box in pt; `points` gives places of its
+    data (k, 2) in pt, `ranges` are the ends of both axes.
 
     A label takes a place off the curves where there is one. Without a place that hides no other
     label it is left out: the data of every figure stand in the table below it. Widths are those of
     DejaVu Sans by a rule of thumb, as the browser sets a font of its own.
     """
 
-    def __init__(self, axes: "Axes") -> None:
-        self._axes = axes
-        axes.get_xlim(), axes.get_ylim()  # where they follow the data: settle them now
-        self._inside = inside(axes)
+    def __init__(
+        self, panel: Panel, box: Box, points: Callable[[Any, Any], np.ndarray],
+        ranges: Sequence[tuple[float, float]],
+    ) -> None:  # fmt: skip
+        self._panel, self._inside, self._points, self._ranges = panel, box, points, ranges
         self._taken: list[Box] = []
         self._curves = np.empty((0, 2))
+        for curve in panel.curves:
+            self._avoid(curve.x, curve.y, joined=bool(curve.line))
+        for level in panel.levels:
+            one, ends = [level.value] * 2, ranges[level.vertical]
+            x, y = (one, ends) if level.vertical else (ranges[0], one)
+            self._avoid(x, y, apart=4.0 * APART)
+        for mark in panel.marks:
+            a, b = self._at(mark.x, mark.y)
+            self._taken.append((a - POINT, b - POINT, a + POINT, b + POINT))
 
-    def corner(self, names: Sequence[str]) -> str:
-        """The place of a legend of these names that covers least; nothing lies over it then."""
+    def corner(self, names: Sequence[str]) -> tuple[str, float]:
+        """The place of a legend of these names that covers least, and how much it covers; nothing
+        lies over it then."""
         boxes = self._corners(names)
-        costs = {where: self._covered(box) + sum(_meet(box, one) for one in self._taken)
-                 for where, box in boxes.items()}  # fmt: skip
+        covered = self._covered(list(boxes.values()))
+        costs = {where: float(n) + sum(_meet(box, one) for one in self._taken)
+                 for (where, box), n in zip(boxes.items(), covered, strict=True)}  # fmt: skip
         where = min(costs, key=lambda each: costs[each])
         self._taken.append(boxes[where])
-        return where
+        return where, costs[where]
+
+    def words(self) -> list[Put]:
+        """Those of the marks and then of the levels, as far as there is a place for them."""
+        found = [self._beside(mark.x, mark.y, mark.text, mark.offset, mark.colour)
+                 for mark in self._panel.marks if mark.text]  # fmt: skip
+        found += [self._along(level.value, level.text, level.vertical, level.colour)
+                  for level in self._panel.levels if level.text]  # fmt: skip
+        return [put for put in found if put is not None]
 
     def _corners(self, names: Sequence[str]) -> dict[str, Box]:
         left, bottom, right, top = self._inside
-        wide = LETTER * max(map(len, names)) + HANDLE
-        tall = LINE * (len(names) + 0.8)
+        wide, tall = LETTER * max(map(len, names)) + HANDLE, legend_height(names)
         middle = 0.5 * (left + right - wide)
         across = {"right": right - wide, "left": left, "center": middle}
         up = {"upper": top - tall, "lower": bottom, "center": 0.5 * (bottom + top - tall)}
         return {f"{v} {h}": (x, y, x + wide, y + tall) for v, y in up.items()
                 for h, x in across.items() if v != h}  # fmt: skip
 
-    def avoid(self, x: float, y: float) -> None:
-        """Nothing is to lie over this point."""
-        a, b = self._at(x, y)
-        self._taken.append((a - POINT, b - POINT, a + POINT, b + POINT))
-
-    def avoid_curve(self, x: Any, y: Any, joined: bool = True, apart: float = APART) -> None:
+    def _avoid(self, x: Any, y: Any, joined: bool = True, apart: float = APART) -> None:
         """Labels keep off this curve, or its points alone; less off one with points far `apart`."""
-        points = in_points(self._axes, x, y)
+        points = self._points(x, y)
         left, bottom, right, top = self._inside
         shown = np.isfinite(points).all(axis=1)
         points = np.clip(points[shown], (left - 99.0, bottom - 99.0), (right + 99.0, top + 99.0))
@@ -96,98 +151,68 @@ class Labels:
             points = np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
         self._curves = np.vstack([self._curves, points])
 
-    def beside(self, x: float, y: float, text: str, wish: tuple[float, float]) -> None:
-        """A label beside a point, at the offset `wish` in pt if that is free."""
+    def _beside(
+        self, x: float, y: float, text: str, wish: tuple[float, float], colour: str
+    ) -> Put | None:
+        """Beside a point, at the offset `wish` in pt if that is free."""
         a, b = self._at(x, y)
         wide = LETTER * len(text)
         places = []
         for dx, dy in (wish, *AROUND):
             left = a + dx - (0.5 * wide if dx == 0 else wide if dx < 0 else 0.0)
             bottom = b + dy - (LINE if dy < 0 else 0.0)
-            places.append(((left, bottom, left + wide, bottom + LINE), (dx, dy)))
-        found = self._best([box for box, _ in places])
-        if found is not None:
-            dx, dy = places[found][1]
-            side = "center" if dx == 0 else "left" if dx > 0 else "right"
-            held = self._held(x, y)
-            self._write(text, (dx, dy), (x, y), "data", held, ha=side, va=_above(dy), bbox=BEHIND)
+            put = Put(text, x, y, dx, dy, colour)
+            places.append(((left, bottom, left + wide, bottom + LINE), put))
+        return self._best(places)
 
-    def along(self, value: float, text: str, vertical: bool) -> None:
-        """A label at a line across the axes, upright beside a vertical one."""
+    def _along(self, value: float, text: str, vertical: bool, colour: str) -> Put | None:
+        """At a line across the axes; upright beside a vertical one, or level with a place on it
+        where that alone keeps off the curves."""
         left, bottom, right, top = self._inside
-        corner = self._axes.get_xlim()[0], self._axes.get_ylim()[0]
-        line = self._at(value, corner[1])[0] if vertical else self._at(corner[0], value)[1]
+        corner = [low for low, _ in self._ranges]
+        corner[not vertical] = value
+        line = self._at(*corner)[not vertical]
         start, end = (bottom + 4.0, top) if vertical else (left + 3.0, right)
         wide = LETTER * len(text)
         places = []
-        for share in SHARES:
-            for side in (2.0, -2.0):
-                a, b = start + share * (end - start), line + side - (LINE if side < 0 else 0.0)
-                box = (b, a, b + LINE, a + wide) if vertical else (a, b, a + wide, b + LINE)
-                places.append((box, (a - (bottom if vertical else left)), side))
-        found = self._best([box for box, *_ in places])
-        if found is None:
-            return
-        _, at, side = places[found]
-        if vertical:
-            self._write(
-                text, (side, 0.0), (value, at / (top - bottom)), self._axes.get_xaxis_transform(),
-                self._held(value, None), rotation=90, va="bottom",
-                ha="left" if side > 0 else "right",
-            )  # fmt: skip
-        else:
-            self._write(
-                text, (0.0, side), (at / (right - left), value), self._axes.get_yaxis_transform(),
-                self._held(None, value), ha="left", va=_above(side),
-            )  # fmt: skip
+        for long, across in ((wide, LINE), (LINE, wide))[: 1 + vertical]:
+            for share in SHARES:
+                for side in (2.0, -2.0):
+                    a, b = start + share * (end - start), line + side - across * (side < 0)
+                    box = (a, b, a + long, b + across)
+                    off = a - (bottom if vertical else left), side
+                    if vertical:
+                        box, off = (b, a, b + across, a + long), off[::-1]
+                    held, upright = (vertical, not vertical), vertical and long == wide
+                    x, y, (dx, dy) = *corner, off
+                    places.append((box, Put(text, x, y, dx, dy, colour, held, upright)))
+        return self._best(places)
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
-        a, b = in_points(self._axes, x, y)[0]
+        a, b = self._points(x, y)[0]
         return float(a), float(b)
 
-    def _held(self, x: float | None, y: float | None) -> str:
-        """The point, or the line, that words belong to in pt of the picture, for its script."""
-        a, b = self._at(self._axes.get_xlim()[0] if x is None else x,
-                        self._axes.get_ylim()[0] if y is None else y)  # fmt: skip
-        tall = 72.0 * self._axes.figure.bbox.height / self._axes.figure.dpi
-        return f"at:{'' if x is None else f'{a:.1f}'},{'' if y is None else f'{tall - b:.1f}'}"
-
-    def _best(self, boxes: Sequence[Box]) -> int | None:
+    def _best(self, places: Sequence[tuple[Box, Put]]) -> Put | None:
         """Which place to take: inside the axes, free of labels, and the least over curves."""
         left, bottom, right, top = self._inside
-        costs = [
-            self._covered(box)
-            if left <= box[0] and box[2] <= right and bottom <= box[1] and box[3] <= top + LINE
-            and not any(_meet(box, one) for one in self._taken)
-            else np.inf
-            for box in boxes
-        ]  # fmt: skip
-        found = int(np.argmin(costs))
-        if not np.isfinite(costs[found]):
+        free = [(box, put) for box, put in places
+                if left <= box[0] and box[2] <= right and bottom <= box[1] and box[3] <= top + LINE
+                and not any(_meet(box, one) for one in self._taken)]  # fmt: skip
+        if not free:
             return None
-        self._taken.append(boxes[found])
-        return found
+        box, put = free[int(np.argmin(self._covered([box for box, _ in free])))]
+        self._taken.append(box)
+        return put
 
-    def _covered(self, box: Box) -> float:
-        """How many points of curves lie in a box."""
+    def _covered(self, boxes: Sequence[Box]) -> np.ndarray:
+        """How many points of curves lie in each box."""
+        low_x, low_y, high_x, high_y = np.array(boxes).T[:, :, None]
         x, y = self._curves.T
-        return float(((box[0] < x) & (x < box[2]) & (box[1] < y) & (y < box[3])).sum())
-
-    def _write(
-        self, text: str, offset: tuple[float, float], place: tuple[float, float],
-        coordinates: Any, held: str, **look: Any,
-    ) -> None:  # fmt: skip
-        self._axes.annotate(
-            text, place, xycoords=coordinates, xytext=offset, textcoords="offset points",
-            fontsize=SIZE, annotation_clip=False, zorder=6, gid=held, **look,
-        )  # fmt: skip
+        within = (low_x < x) & (x < high_x) & (low_y < y) & (y < high_y)
+        return np.asarray(within.sum(axis=1))
 
 
 def _meet(one: Box, other: Box) -> bool:
     return not (
         one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
     )
-
-
-def _above(dy: float) -> str:
-    return "bottom" if dy >= 0 else "top"

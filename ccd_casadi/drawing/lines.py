@@ -2,20 +2,33 @@
 
 import json
 from collections.abc import Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
-from ccd_casadi.drawing.labels import APART, Labels, in_points, inside, scales_of
+from ccd_casadi.drawing.content import Lines, Modes, Panel, Picture, Place, Table
+from ccd_casadi.drawing.labels import (
+    POINT,
+    SIZE,
+    Labels,
+    Put,
+    in_points,
+    inside,
+    legend_height,
+    scales_of,
+)
 from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
 from ccd_casadi.drawing.turntable import modes_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LEAST_SPAN = 1e-4  # of a value: an axis of less shows digits that nobody reads
+LEADER = {"arrowstyle": "-", "color": "#444444", "linewidth": 0.6, "shrinkA": 0.0, "shrinkB": POINT}
+BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a panel
 
 
@@ -54,11 +67,17 @@ def _placed(what: Place, width: float, height: float, key: str, title: str) -> s
 
 
 def _picture(panel: Panel, width: float, height: float, key: str, title: str) -> str:
+    figure, axes = drawn_axes(panel, width, height)
+    title = f"{title}: {panel.title or panel.y_label}"
+    return to_svg(figure, key, title, _for_cursor(axes, panel, height), 100.0)
+
+
+def drawn_axes(panel: Panel, width: float, height: float) -> tuple["Figure", "Axes"]:
+    """A panel in a figure of its own, size in inches."""
     figure = new_figure(height, width)
     axes = place(figure, LEFT, BOTTOM, width - LEFT - RIGHT, height - BOTTOM - TOP)
-    title = f"{title}: {panel.title or panel.y_label}"
     _draw(axes, panel)
-    return to_svg(figure, key, title, _for_cursor(axes, panel, height), 100.0)
+    return figure, axes
 
 
 def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
@@ -92,12 +111,13 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         )  # fmt: skip
     for i, area in enumerate(panel.forbidden):
         axes.fill(area.x, area.y, color=area.colour, alpha=0.2, linewidth=0.0, gid=f"area{i}")
+    top = np.inf if panel.y_range is None else panel.y_range[1]
     for i, curve in enumerate(panel.curves):
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",
             marker=curve.marker or None, linewidth=curve.width, label=curve.label or None,
             markerfacecolor="white" if curve.line else curve.colour,
-            clip_on=not curve.marker or _leaves(panel, curve),
+            clip_on=not curve.marker or bool(np.nanmax(curve.y, initial=0.0) > top),
             gid=f"curve{i}",
         )  # fmt: skip
     for i, mark in enumerate(panel.marks):
@@ -115,31 +135,43 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         line(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)), gid=f"level{i}")
     labels = _labels(axes, panel)
     if panel.legend is not None and (names := axes.get_legend_handles_labels()[1]):
-        where = labels.corner(names)
+        where, covered = labels.corner(names)
+        if covered and panel.y_range is None:  # a strip above the curves is the legend's
+            _raised(axes, legend_height(names), panel.log_y)
+            labels = _labels(axes, panel)
+            where, _ = labels.corner(names)
         axes.legend(loc=cast(Any, where), borderaxespad=0.2)
-    for mark in panel.marks:
-        labels.beside(mark.x, mark.y, mark.text, mark.offset)
-    for level in panel.levels:
-        labels.along(level.value, level.text, level.vertical)
+    for put in labels.words():
+        _write(axes, put)
+
+
+def _write(axes: "Axes", put: Put) -> None:
+    """Words, with the point or the line that they belong to in pt of the picture for its script."""
+    tall = 72.0 * axes.figure.bbox.height / axes.figure.dpi
+    a, b = in_points(axes, put.x, put.y)[0]
+    ends = (f"{v:.1f}" if held else "" for v, held in zip((a, tall - b), put.held, strict=True))
+    at = f"at:{','.join(ends)}"
+    made = axes.annotate(
+        put.text, (put.x, put.y), xytext=(put.dx, put.dy), textcoords="offset points",
+        fontsize=SIZE, annotation_clip=False, zorder=6, gid=at, ha=put.across, va=put.up,
+        rotation=90 * put.upright, bbox=BEHIND if all(put.held) else None,
+        arrowprops=LEADER if put.far else None,
+    )  # fmt: skip
+    if made.arrow_patch is not None:
+        made.arrow_patch.set_gid(f"leader-{at}")
+
+
+def _raised(axes: "Axes", strip: float, log: bool) -> None:
+    """Moves the top of the axes up by a strip, in pt of their height."""
+    _, bottom, _, top = inside(axes)
+    low, high = np.log(axes.get_ylim()) if log else np.array(axes.get_ylim())
+    high = low + (high - low) / (1.0 - min(strip / (top - bottom), 0.5))
+    axes.set_ylim(*(np.exp([low, high]) if log else (low, high)))
 
 
 def _labels(axes: "Axes", panel: Panel) -> Labels:
-    """None yet, and what they keep off."""
-    labels = Labels(axes)
-    for curve in panel.curves:
-        labels.avoid_curve(curve.x, curve.y, joined=bool(curve.line))
-    for level in panel.levels:
-        one, ends = [level.value] * 2, axes.get_ylim() if level.vertical else axes.get_xlim()
-        x, y = (one, ends) if level.vertical else (ends, one)
-        labels.avoid_curve(x, y, apart=4.0 * APART)
-    for mark in panel.marks:
-        labels.avoid(mark.x, mark.y)
-    return labels
-
-
-def _leaves(panel: Panel, curve: Curve) -> bool:
-    """Whether a curve goes on beyond the top of its panel."""
-    return panel.y_range is not None and bool(np.nanmax(curve.y, initial=0.0) > panel.y_range[1])
+    ranges = axes.get_xlim(), axes.get_ylim()  # where they follow the data: settled now
+    return Labels(panel, inside(axes), partial(in_points, axes), ranges)
 
 
 def _ranges(axes: "Axes", panel: Panel) -> None:

@@ -41,7 +41,8 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
     from matplotlib.patches import Rectangle
 
     with style():
-        figure, axes = _map_axes(width)
+        figure, low = new_figure(5.4, width), 1.1 if width == MAP_WIDTH else 1.5
+        axes = place(figure, 0.75, low, width - 2.05, 5.25 - low)  # room for bar and legend
         axes.grid(False)
         axes.set_facecolor("#eeeeee")
         truths = land.truths.reshape(-1, 3)
@@ -57,8 +58,12 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
                       markeredgewidth=0.6, label="sampled designs", linestyle="none",
                       gid="mark-designs")  # fmt: skip
         if len(truths):
-            known = truths[np.isfinite(truths[:, 2])]
-            dots = _dots(axes, known, norm, land.truth_label)
+            x, y, hz = truths[np.isfinite(truths[:, 2])].T
+            # light and dark rings tell the dots from any colour of the map
+            axes.scatter(x, y, s=62, color=GROUND, zorder=2.9, clip_on=False, gid="mark-grounds")
+            dots = axes.scatter(x, y, c=hz, cmap=COLOUR_MAP, norm=norm, s=34, edgecolors=RING,
+                                linewidths=1.1, label=land.truth_label, zorder=3, clip_on=False,
+                                gid="mark-truths")  # fmt: skip
             filled = filled or dots
             lost = truths[~np.isfinite(truths[:, 2])]
             if len(lost):
@@ -88,22 +93,6 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
         title = "Landscape of the largest bandwidth over the two parameters"
         share = 100.0 if width == NARROW else 100.0 * width / WIDTH
         return to_svg(figure, key, title, json.dumps({"scales": scales_of(axes)}), share)
-
-
-def _dots(axes: "Axes", rows: Array, norm: Any, label: str) -> Any:
-    """Dots (x, y, value) in the map's colours; light and dark rings tell them from any colour."""
-    axes.scatter(rows[:, 0], rows[:, 1], s=62, color=GROUND, zorder=2.9, clip_on=False,
-                 gid="mark-grounds")  # fmt: skip
-    return axes.scatter(rows[:, 0], rows[:, 1], c=rows[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
-                        edgecolors=RING, linewidths=1.1, label=label, zorder=3,
-                        clip_on=False, gid="mark-truths")  # fmt: skip
-
-
-def _map_axes(width: float) -> tuple["Figure", "Axes"]:
-    """A map's axes, with room for the colour bar on the right and the legend below."""
-    figure = new_figure(5.4, width)
-    low = 1.1 if width == MAP_WIDTH else 1.5
-    return figure, place(figure, 0.75, low, width - 2.05, 5.25 - low)
 
 
 def _contours(axes: "Axes", x: Array, y: Array, field: Array, shown: Array) -> tuple[Any, Any]:

@@ -27,7 +27,7 @@ def tables_of(drawing: Drawing) -> tuple[Table, ...]:
         group = groups.setdefault((axis, b"" if joined else x.tobytes()), {})
         group.setdefault(name, (x, y))  # one of each name
     return tuple(
-        Table.of((axis, *found), *(_dots(found) if dots else _thinned(axis, found, panels)))
+        Table.of((axis, *found), *_rows(axis, found, panels, bool(dots)))
         for (axis, dots), found in groups.items()
     )
 
@@ -49,25 +49,21 @@ def _columns(panel: Panel) -> Iterator[Column]:
                 yield panel.x_label, f"{panel.y_label}, {band.label}: {word}", band.x, y, True
 
 
-def _dots(found: dict[str, tuple[Array, Array]]) -> list[Array]:
-    return [next(iter(found.values()))[0], *(y for _, y in found.values())]
-
-
-def _thinned(
-    axis: str, found: dict[str, tuple[Array, Array]], panels: list[Panel]
+def _rows(
+    axis: str, found: dict[str, tuple[Array, Array]], panels: list[Panel], every: bool
 ) -> Iterator[Array]:
     """Points spread along the axis, those next to marked places, and where a curve is largest; of
-    curves over another grid what lies between their points."""
+    curves over another grid what lies between their points. `every`: all."""
     x = max((over for over, _ in found.values()), key=len)
     own = [panel for panel in panels if panel.x_label == axis]
-    marked = [m.x for p in own for m in p.marks]
-    marked += [level.value for p in own for level in p.levels if level.vertical]
-    if any(p.log_x for p in own):
-        marked += np.geomspace(x[0], x[-1], ROWS).tolist()
-    else:
-        marked += x[np.linspace(0, len(x) - 1, ROWS).astype(int)].tolist()
-    marked += [float(over[np.nan_to_num(y, nan=-np.inf).argmax()]) for over, y in found.values()]
-    rows = sorted({int(np.abs(x - value).argmin()) for value in marked})
+    rows = list(range(len(x)))
+    if not every:
+        marked = [m.x for p in own for m in p.marks]
+        marked += [level.value for p in own for level in p.levels if level.vertical]
+        marked += [float(at[np.nan_to_num(y, nan=-np.inf).argmax()]) for at, y in found.values()]
+        even = x[np.linspace(0, len(x) - 1, ROWS).astype(int)]
+        even = np.geomspace(x[0], x[-1], ROWS) if any(p.log_x for p in own) else even
+        rows = sorted({int(np.abs(x - value).argmin()) for value in (*marked, *even)})
     yield x[rows]
     for over, y in found.values():
         same = len(over) == len(x) and np.allclose(over, x, rtol=1e-9)

@@ -17,7 +17,7 @@ BADGES = {"passed": "good", "warned": "warn", "failed": "bad", "unknown": "open"
 STANDINGS = {"good": "✓", "warn": "!", "bad": "✕"}
 
 
-def painted(page: c.Page) -> str:
+def page_html(page: c.Page) -> str:
     """The whole document."""
     body, contents = [], []
     for i, chapter in enumerate(page.chapters, 1):

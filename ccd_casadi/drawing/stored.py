@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.drawing.content import Page
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.plain_values import plain, restored
 from surrogates.files import write_whole
@@ -39,7 +39,7 @@ def draw(path: Path, stored: Any) -> None:
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
         words = f"pages.{path.name}: is not what a page shows; repeat the command that wrote it"
         raise UserError(f"{path.with_name(NAME)}: {words}") from None
-    write_whole(path, painted(page))
+    write_whole(path, page_html(page))
 
 
 def read_pages(folder: Path) -> dict[str, Any]:

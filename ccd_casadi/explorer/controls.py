@@ -9,7 +9,7 @@ from bokeh.models.widgets.sliders import RangeSlider, Slider
 
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.support.units import shown_unit
+from ccd_casadi.support.units import display_unit
 
 STEPS = 1000  # of a slider of θ
 WIDER = 10.0  # the ranges of ω_S and ω_T may be dragged so far beyond those of the case
@@ -26,7 +26,7 @@ class Controls:
     whether it is one that a search answers: S_max and the ranges do nothing to one synthesis."""
 
     def __init__(self, case: Case, start: Knobs, changed: Any, dark: bool) -> None:
-        units = [shown_unit(p.unit, p.upper) for p in case.theta]
+        units = [display_unit(p.unit, p.upper) for p in case.theta]
         self._scale = [factor for _, factor in units]
         self._start, self._theta = start, []
         self.quiet = False  # while they are set from here

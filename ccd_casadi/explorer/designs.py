@@ -18,6 +18,7 @@ from ccd_casadi.inner_problem.problem import (
     scaled_system,
 )
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_by
+from ccd_casadi.kernels.design import failed_row
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant, modal_plant
 from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics
@@ -25,7 +26,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out
-from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome, synthesise
+from ccd_casadi.synthesis.synthesis import DesignFigures, figures_from_row, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 
@@ -190,7 +191,6 @@ def without_controller(
     problem: CoDesignProblem, knobs: Knobs, elements: Elements, how: How, words: str = ""
 ) -> Look:
     """A place without a controller, and why."""
-    nan = float("nan")
     return Look(
         knobs=knobs,
         problem=problem,
@@ -198,10 +198,7 @@ def without_controller(
         modal=modal_plant(elements.system, problem.suspension),
         plant=scaled_system(problem, elements.system),
         weights=problem.weights,
-        figures=DesignFigures(
-            0.0, 0.0, Outcome.NOT_FINITE, nan, nan, nan, False, nan, nan, nan, nan,
-            Certificate(False, nan, nan, nan, False),
-        ),
+        figures=figures_from_row(failed_row(), 0.0, 0.0, 1.0),
         controller=None,
         how=how,
         standing=Standing.REFUSED,

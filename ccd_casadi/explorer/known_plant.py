@@ -11,7 +11,6 @@ from scipy.linalg import eigh
 
 from ccd_casadi.explorer.designs import Elements
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, near
-from ccd_casadi.support.arrays import Array
 
 MOST = 6  # θ that the model is made of: more make it slower than a drag
 FLEXIBLE = 1e-6  # of the largest eigenvalue: what is below is a rigid motion's, rounded
@@ -84,10 +83,6 @@ class KnownPlant:
 
 def frequency_error(one: Mechanics, exact: Mechanics) -> float:
     """Largest relative difference of the flexible frequencies of two plants."""
-    a, b = (_eigenvalues(system) for system in (one, exact))
+    a, b = (eigh(system.K, system.M, eigvals_only=True) for system in (one, exact))
     flexible = b > FLEXIBLE * b.max()
     return float(np.abs(np.sqrt(np.maximum(a, 0.0)[flexible] / b[flexible]) - 1.0).max())
-
-
-def _eigenvalues(system: Mechanics) -> Array:
-    return np.asarray(eigh(system.K, system.M, eigvals_only=True))

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data
-from ccd_casadi.reporting.true_samples import read_truths
+from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths
 from surrogates import GaussianProcess, SurrogateFileError, load
 
 
@@ -30,18 +29,17 @@ def landscape_of(
 
     `made_for`: the problem that the surrogate is of; of another one it says nothing.
     """
-    words = "no surrogate: the dots are the best designs looked at"
-    if process is not None and made_for is not None:
-        same = made_for.identity() == problem.identity()
-        if same and made_for.inner_identity() == problem.inner_identity():
-            words = (
-                f"colours: ω_b*(θ) by the run's surrogate of {len(process.X)} samples; large "
-                "dots: the true ω_b*(θ); small ones: single designs"
-            )
-        else:
-            process = None
-            words = "the run's surrogate is of another S_max, range or plant set: not shown"
+    if process is None or made_for is None:
+        process, words = None, "no surrogate: the dots are the best designs looked at"
+    elif (made_for.identity(), made_for.inner_identity()) == (
+        problem.identity(), problem.inner_identity()
+    ):  # fmt: skip
+        words = (
+            f"colours: ω_b*(θ) by the run's surrogate of {len(process.X)} samples; large "
+            "dots: the true ω_b*(θ); small ones: single designs"
+        )
     else:
         process = None
+        words = "the run's surrogate is of another S_max, range or plant set: not shown"
     truths = read_truths(store, problem)
     return landscape_data(problem, process, truths, theta=theta, axes=axes), words

@@ -23,7 +23,7 @@ from ccd_casadi.drawing.svg import GREY, ORANGE
 from ccd_casadi.explorer.controls import DARK
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.explorer.painter import FEW
-from ccd_casadi.support.units import shown_unit
+from ccd_casadi.support.units import display_unit
 
 HEIGHT = 280
 MARGIN = 0.03  # of the box
@@ -36,7 +36,7 @@ class MapFigure:
         self, parameters: Sequence[Parameter], asked: Callable[[], None], dark: bool
     ) -> None:
         self.names: list[Any] = [parameter.name for parameter in parameters]
-        self._units = [shown_unit(item.unit, item.upper) for item in parameters]
+        self._units = [display_unit(item.unit, item.upper) for item in parameters]
         self._selects = [
             Select(name=f"axis_{i}", title=title, options=self.names, width=120,
                    stylesheets=[DARK] if dark else [],

@@ -9,6 +9,7 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from bokeh.core.property.descriptors import UnsetValueError
 from bokeh.events import Reset
 from bokeh.model import Model
 from bokeh.models import (
@@ -25,6 +26,8 @@ from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
 from ccd_casadi.drawing.content import Curve, Panel
+from ccd_casadi.drawing.labels import LINE as TALL
+from ccd_casadi.drawing.labels import SIZE, Labels
 from ccd_casadi.drawing.lines import positive_range
 from ccd_casadi.drawing.svg import BLUE, GREY, THEME
 from ccd_casadi.explorer.message import Change
@@ -32,6 +35,7 @@ from ccd_casadi.support.package_text import package_text
 
 HEIGHT = 230
 FEW = 4  # ticks of a linear axis across: a figure may be 240 px wide
+USUAL, PX = (240, 150), 11.0 / SIZE  # px of the axes inside; px of a pt of its words
 PADDING = 0.1  # of the data, that a linear axis reaches beyond them
 CENTRE, HALF = -0.8, (2.4, 2.0)  # of a round plot, and what it shows at least to both sides
 DASHES = {"-": "solid", "--": "dashed", ":": "dotted", "-.": "dotdash"}
@@ -147,7 +151,7 @@ class PanelFigure:
             others.append(Curve(*line, "", v.colour, "--", width=0.9))
         found = [
             _rows(self.own, map(self._line, drawn)), _rows(self._lines, map(self._line, others)),
-            _rows(self._areas, areas), self._spotted(spots), self._worded(panel, x, y),
+            _rows(self._areas, areas), self._spotted(spots), self._worded(panel, ends),
         ]  # fmt: skip
         for axis, label in ((self.figure.xaxis, panel.x_label), (self.figure.yaxis, panel.y_label)):
             found.append((axis[0], {"axis_label": label}))
@@ -185,21 +189,41 @@ class PanelFigure:
             "data": {"x": x, "y": y, "colour": [a for a, _ in each], "marker": [b for _, b in each]}
         }
 
-    def _worded(self, panel: Panel, x: tuple[float, float], y: tuple[float, float]) -> Change:
-        """The words of marks beside them, of levels at their lower or left end."""
+    def _worded(self, panel: Panel, ranges: list[tuple[float, float]]) -> Change:
+        """The words of marks and levels where they do not meet, in the size that the browser told
+        last: of a figure that was not laid out yet, a usual one."""
+        if not any([m.text for m in panel.marks] + [v.text for v in panel.levels]):
+            return _rows(self._words, ())
+        try:
+            wide, tall = self.figure.inner_width, self.figure.inner_height
+        except UnsetValueError:
+            wide, tall = USUAL
+        logs = self._log_x, self._log_y
+        if self._round:  # as round.js has them
+            scale = max(2.0 * HALF[0] / wide, 2.0 * HALF[1] / tall)
+            ranges = [(middle - 0.5 * scale * size, middle + 0.5 * scale * size)
+                      for middle, size in ((CENTRE, wide), (0.0, tall))]  # fmt: skip
+
+        def points(x: Any, y: Any) -> np.ndarray:
+            found = []
+            for v, log, ends, size in zip((x, y), logs, ranges, (wide, tall), strict=True):
+                values, low, high = np.asarray(v, float), *ends
+                if log:
+                    with np.errstate(divide="ignore", invalid="ignore"):
+                        values, low, high = np.log(values), np.log(low), np.log(high)
+                found.append((values - low) / (high - low) * size / PX)
+            return np.column_stack(found)
+
         words = []
-        for m in panel.marks:
-            dx, dy = m.offset
-            align = "left" if dx > 0 else "right" if dx < 0 else "center"
-            words.append((m.x, m.y, m.text, self._on(m.colour), dx, -dy, 0.0, align,
-                          "bottom" if dy >= 0 else "top"))  # fmt: skip
-        for v in panel.levels:
-            place = (
-                (v.value, y[0], 14, -3, 0.5 * np.pi) if v.vertical else (x[0], v.value, 4, -2, 0)
-            )
-            a, b, dx, dy, angle = place
-            words.append((a, b, v.text, self._on(v.colour), dx, dy, angle, "left", "bottom"))
-        return _rows(self._words, [word for word in words if word[2]])
+        box = (0.0, 0.0, wide / PX, tall / PX - TALL)  # what is above the axes is cut off
+        for w in Labels(panel, box, points, ranges).words():
+            sides = w.across, w.up
+            if w.upright:  # turned about its place, and so are its sides
+                sides = "left", "top" if w.dx > 0 else "bottom"
+            turn = 0.5 * np.pi * w.upright
+            off = PX * w.dx, -PX * w.dy
+            words.append((w.x, w.y, w.text, self._on(w.colour), *off, turn, *sides))
+        return _rows(self._words, words)
 
     def _range(self, panel: Panel, axis: int) -> tuple[float, float]:
         """Of a panel's own, or over its curves and those beside it."""

@@ -21,7 +21,7 @@ from ccd_casadi.explorer.designs import Look
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure
 from ccd_casadi.explorer.panels import EMPTY, Drawn
-from ccd_casadi.support.units import shown_unit
+from ccd_casadi.support.units import display_unit
 
 HEIGHT = 150
 COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
@@ -58,7 +58,7 @@ class Pins:
         self.names, self.figures, self.kept, self._dark = (
             [p.name for p in parameters], figures, kept, dark,
         )  # fmt: skip
-        units = [shown_unit(p.unit, p.upper) for p in parameters]
+        units = [display_unit(p.unit, p.upper) for p in parameters]
         self._scales = [scale for _, scale in units]
         self.source = ColumnDataSource(self._columns([]))
         self.source.on_change("data", lambda attr, old, new: self._renamed(new["design"]))

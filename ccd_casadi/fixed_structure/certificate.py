@@ -32,7 +32,7 @@ from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.units import counted
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
-AT_ONCE = 64  # plants
+AT_ONCE = 16  # plants: the last ones keep all workers busy
 ROUNDING = 1e3 * float(np.finfo(float).eps)  # of a balanced matrix; 31 eps were seen at a pole
 REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
 
@@ -202,7 +202,7 @@ def judged(
     tops = peaks(table, grid, values)
     loops = [loops[i] for i in good]
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], integrator)
-    norm, confirmed = norms(loops, table, *tops["S"])
+    norm, confirmed = norms(loops, table.period, *tops["S"])
     channels: list[list[ChannelFigures]] = [[] for _ in good]
     for one in bounds.channels:
         of_rows, certain = _rows(one, loops, table, grid, values, tops, integrator)
@@ -250,7 +250,7 @@ def _rows(
         return [ChannelFigures(own.name)] * len(grid), np.ones(len(grid), bool)
     curve, u = f"S of {own.name}", np.array([own.output])
     rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
-    norm, confirmed = norms(rows, table, *tops[curve], row=own.output)
+    norm, confirmed = norms(rows, table.period, *tops[curve])
     _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, own.output)
     missing = np.full(len(grid), np.nan)
     weighted = tops.get(f"weighted KS of {own.name}", (missing, missing))[0]

@@ -2,9 +2,7 @@
 
 With A = QTQᴴ, T upper triangular (Schur), C(s - A)⁻¹B is a back substitution, for all plants and
 all s at once. Of the search's own rows and kernels nothing is used. The peaks of S that are found
-so are confirmed by Hamiltonian matrices: a level γ above σ_max(D) is reached where that of
-`lti.norms` has an imaginary eigenvalue; between two neighbours of these σ_max stays on one side of
-γ. Where it stays below γ at all of them, just above the peak on the grid, that peak is the norm.
+so are confirmed by Hamiltonian matrices (`lti.norms`), which begin at them.
 """
 
 from collections.abc import Sequence
@@ -14,13 +12,12 @@ from scipy.linalg import schur
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.norms import hinf_norm, level_frequencies
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 AT_ONCE = 8192  # numbers of an array that stays in a processor's cache
 CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
-ABOVE = 1e-9  # relative: the level that is tested, over the peak on the grid
 
 
 class Triangular:
@@ -46,16 +43,16 @@ class Triangular:
         return found
 
     def _substituted(self, own: np.ndarray, s: np.ndarray) -> np.ndarray:
-        T, B, C = self.T[own, None], self.B[own, None], self.C[own, None]
-        total = self.D[own, None] + np.zeros((*s.shape, 1, 1), complex)
-        known: dict[int, np.ndarray] = {}
-        for i in reversed(range(T.shape[-1])):
-            right = B[..., i, :] + np.zeros((*s.shape, 1), complex)
-            for j in np.flatnonzero(self.coupled[i]).tolist():
-                right += T[..., i, j, None] * known[j]
-            known[i] = right / (s - T[..., i, i])[..., None]
-            total += C[..., :, i, None] * known[i][..., None, :]
-        return total
+        T, B, C, (N, k) = self.T[own], self.B[own], self.C[own], s.shape
+        n, m = B.shape[1:]
+        X = np.empty((N, n, k * m), complex)  # (s - T)⁻¹B
+        for i in reversed(range(n)):
+            right, j = B[:, i, None, :], np.flatnonzero(self.coupled[i])
+            if len(j):
+                right = right + (T[:, i, j][:, None] @ X[:, j]).reshape(N, k, m)
+            X[:, i] = (right / (s - T[:, i, i, None])[..., None]).reshape(N, k * m)
+        total = (C @ X).reshape(N, C.shape[1], k, m).transpose(0, 2, 1, 3)
+        return np.asarray(self.D[own, None] + total)
 
 
 class Responses:
@@ -135,49 +132,23 @@ def _length(row: Sequence[float], M: np.ndarray) -> Array:
 
 
 def norms(
-    loops: Sequence[StateSpace],
-    table: Responses,
-    peak: Array,
-    at: Array,
-    row: Sequence[float] | None = None,
+    loops: Sequence[StateSpace], period: float | None, peak: Array, at: Array
 ) -> tuple[Array, np.ndarray]:
-    """‖S‖∞ (P,) of every plant's loop, or of a row of it, and whether `peak` (P,) at ω (P,) is it.
+    """‖S‖∞ (P,) of every plant's loop, and whether `peak` (P,) at ω (P,) is it.
 
-    `loops` are S, of sampled loops in z; one whose peak the test does not show to be the largest
-    has its norm searched.
+    `loops` are S, or a row of it, of sampled loops in z.
     """
-    found, confirmed = peak.copy(), np.ones(len(peak), bool)
-    for i, loop in enumerate(loops):
-        continuous = _over_w(loop, table.period)
-        level = peak[i] * (1.0 + ABOVE)
-        if not _highest(continuous, table, i, level, row):
-            found[i] = max(peak[i], hinf_norm(continuous)[0])
-            confirmed[i] = abs(found[i] / peak[i] - 1.0) <= CONFIRMED
-    return found, confirmed
-
-
-def _highest(
-    loop: StateSpace, table: Responses, plant: int, level: float, row: Sequence[float] | None
-) -> bool:
-    """Whether no frequency has more than `level`."""
-    if level <= np.linalg.norm(loop.D, 2) * (1.0 + CONFIRMED):
-        return False
-    edges = level_frequencies(loop, level)
-    edges = edges[edges > 0.0]
-    if not len(edges):
-        return True
-    between = np.sqrt(edges[:-1] * edges[1:])
-    w = np.concatenate([[0.5 * edges[0], 2.0 * edges[-1]], between, edges])
-    omega = w if table.period is None else 2.0 / table.period * np.arctan(w)
-    return bool((table.sensitivity(np.array([plant]), omega[None], row) <= level).all())
+    w = at if period is None else np.tan(0.5 * at * period)
+    each = [hinf_norm(_over_w(loop, period), v)[0] for loop, v in zip(loops, w, strict=True)]
+    found = np.maximum(peak, each)
+    return found, np.abs(found / peak - 1.0) <= CONFIRMED
 
 
 def _over_w(S: StateSpace, period: float | None) -> StateSpace:
-    """S balanced; of a sampled loop over w, z = (1 + w)/(1 - w)."""
+    """S, of a sampled loop over w, z = (1 + w)/(1 - w)."""
     if period is None:
-        return StateSpace(*balanced(S.A, S.B, S.C), S.D)
+        return S
     inverse = np.linalg.inv(S.A + np.eye(len(S.A)))
     root = np.sqrt(2.0)
     A = inverse @ (S.A - np.eye(len(S.A)))
-    parts = balanced(A, root * inverse @ S.B, root * S.C @ inverse)
-    return StateSpace(*parts, S.D - S.C @ inverse @ S.B)
+    return StateSpace(A, root * inverse @ S.B, root * S.C @ inverse, S.D - S.C @ inverse @ S.B)

@@ -26,7 +26,7 @@ from ccd_casadi.fixed_structure.sections_design import (
     failed,
     in_problem_units,
 )
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -93,7 +93,7 @@ def synthesise_sections(
     problem = cast(Problem, problem_for(plants, structure, bounds, sampling, frequencies))
     rng = np.random.default_rng(seed)
     begun_at = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
-    pool = kept(problem, np.reshape(begun_at, (-1, len(structure.names))))
+    pool = stabilising(problem, np.reshape(begun_at, (-1, len(structure.names))))
     known = len(pool)
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
@@ -154,9 +154,9 @@ def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
     """
     low, high = CROSSOVERS
     for _ in range(3):
-        rules = kept(problem, by_rules(problem, np.geomspace(low, high, 12)))
+        rules = stabilising(problem, by_rules(problem, np.geomspace(low, high, 12)))
         draws = np.exp(rng.uniform(np.log(low), np.log(high), POOL * starts))
-        random = kept(problem, at_random(problem, draws, rng))
+        random = stabilising(problem, at_random(problem, draws, rng))
         if len(rules) + len(random):
             half = max(starts // 2, 1)
             fastest = rules[-1:] if half > 2 else rules[:0]
@@ -173,7 +173,7 @@ def _redrawn(
 ) -> Array:
     """Those of the best ends with one section drawn anew that are stable and miss least."""
     fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
-    return _nearest(problem, kept(problem, fresh), count)
+    return _nearest(problem, stabilising(problem, fresh), count)
 
 
 def _nearest(problem: Problem, kappa: Array, count: int) -> Array:

@@ -98,7 +98,7 @@ def synthesise_sections(
 
 def _scale(system: Any, bounds: Bounds) -> float:
     """M_K (N/m) that puts ω₀ a decade above the least bandwidth that the bounds ask for."""
-    space, _ = from_control(system)
+    space = from_control(system)
     inertial = float(np.linalg.norm(space.C @ space.A @ space.B, 2))
     omega_0 = SLOWEST * bounds.omega_low / bounds.S_low
     return omega_0**2 / inertial if inertial > 0.0 else 1.0

@@ -144,28 +144,24 @@ class PlantSet:
         half = np.minimum(0.5 * self.period * omega, 0.5 * np.pi)
         return np.asarray(2.0 / self.period * np.tan(half))
 
-    def responses(
-        self, which: np.ndarray, v: Array, *, free: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """G (..., p, m) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape.
-
-        `free` of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d,
-        whatever the sampling.
-        """
+    def responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G (..., p, m) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
         v = np.asarray(v, float)
-        at, plants, chain = v, self.modes, np.ones_like(v)
-        if free:
-            at, plants, chain = self.frequency(v), plants._replace(period=0.0), self.chain(v)
-        found = modes.responses(plants, np.ravel(which), at.ravel())
+        found = modes.responses(self.modes, np.ravel(which), v.ravel())
         G, slope = (found[:, i].reshape(*v.shape, *found.shape[2:]) for i in (0, 1))
-        return G, slope * chain[..., None, None]
+        return G, slope
 
     def form_to_theta(
         self, which: int, v: Array, left: np.ndarray, right: np.ndarray, *, free: bool = False
     ) -> np.ndarray:
         """∂(x G y)/∂θ (k, n_θ) of one plant at jv with rows x (k, p) and columns y (k, m).
 
+        `free` of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d,
+        whatever the sampling.
+
         x (dC f(A) B + C f(A) dB + C V (f[p_i, p_j] ∘ V⁻¹dA V) V⁻¹B) y   (Daleckii and Krein)
+
+        with f[p_i, p_j] = (f(p_i) - f(p_j))/(p_i - p_j), f'(p_i) where these are one.
         """
         plant = self.plants[which]
         p = plant.poles
@@ -174,16 +170,18 @@ class PlantSet:
         f = transfer(p, omega, period, self.delay)[0]
         gap = p[:, None] - p[None, :]
         near = np.abs(gap) <= CLOSE * np.maximum(np.abs(p)[:, None], np.abs(p)[None, :])
-        between = (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap)
-        i, j = np.nonzero(near)
-        between[:, i, j] = transfer(0.5 * (p[i] + p[j]), omega, period, self.delay)[1]
         c, b = left @ plant.reading, right @ plant.drive.T
+        apart = np.where(near, 0.0, plant.dA) / np.where(near, 1.0, gap)
+        i, j = np.nonzero(near)
+        between = transfer(0.5 * (p[i] + p[j]), omega, period, self.delay)[1]
         pairs = [
-            (c[:, :, None] * between * b[:, None, :], plant.dA),
             (left[:, :, None] * (f * b)[:, None, :], plant.dC),
             ((c * f)[:, :, None] * right[:, None, :], plant.dB),
         ]
-        return np.asarray(sum(np.tensordot(a, d, ((1, 2), (1, 2))) for a, d in pairs))
+        found = sum(np.tensordot(x, d, ((1, 2), (1, 2))) for x, d in pairs)
+        found += (c[:, i] * between * b[:, j]) @ plant.dA[:, i, j].T
+        found += np.einsum("ki,tik->kt", c * f, apart @ b.T)
+        return np.asarray(found - np.einsum("kj,tjk->kt", f * b, apart.transpose(0, 2, 1) @ c.T))
 
 
 def plant_set(

@@ -22,11 +22,11 @@ from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.structure import Structure, roots
 from ccd_casadi.kernels.limits import HALF_POWER, Curve, Limit
 from ccd_casadi.kernels.loop_point import Loop
+from ccd_casadi.lti.grid import around
 from ccd_casadi.support.arrays import Array
 
 FIRST = float(np.log(0.1))  # τ, ω_b over ω₀
 PER_DECADE = 24
-FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
 
 
 @dataclass(frozen=True)
@@ -246,6 +246,4 @@ class Assessment:
 
 def flanked(values: np.ndarray) -> Array:
     """Frequencies around roots (P, n): the imaginary part with flanks, and the size."""
-    centre, half = np.abs(values.imag), np.abs(values.real)
-    found = centre[..., None] + half[..., None] * FLANKS
-    return np.concatenate([found.reshape(len(values), -1), np.abs(values)], axis=1)
+    return np.concatenate([around(values), np.abs(values)], axis=1)

@@ -91,8 +91,10 @@ def run_race(
         field = _going_on(field, turn)
         lead = field[0].point
         going = sum(runner.running for runner in field)
-        tell(f"{np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
-             f"{lead.assessment.violation:.1g}; {going} of {len(running)} continue")  # fmt: skip
+        over = lead.assessment.violation
+        kept = f"bounds exceeded by {100.0 * over:.1g} %" if over > WITHIN else "within every bound"
+        best = f"{np.exp(lead.tau) * scale:.2f} Hz, {kept}"
+        tell(f"{best}; {going} of {len(running)} searches continue")
     return field
 
 

@@ -19,7 +19,7 @@ from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 
@@ -34,7 +34,7 @@ class SectionsOutcome(StrEnum):
 
 
 @dataclass(frozen=True)
-class SectionsDesign(Shown):
+class SectionsDesign(NotebookHtml):
     """A controller of fixed structure, and how it was found; SI, frequencies in rad/s.
 
     Parameters

@@ -124,7 +124,7 @@ def redrawn(problem: Problem, ends: Sequence[Array], count: int, rng: np.random.
     return np.where(chosen, drawn, like)
 
 
-def kept(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
+def stabilising(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
     """Those (N, n) with which every closed loop is stable."""
     parts = [kappa[i : i + chunk] for i in range(0, len(kappa), chunk)]
     good = [stable(closed_loops(problem.plants, problem.structure, part)).all(1) for part in parts]

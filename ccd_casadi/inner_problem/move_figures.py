@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ccd_casadi.analysis.driven_plant import Moved
+from ccd_casadi.analysis.driven_plant import DrivenMechanics
 from ccd_casadi.analysis.motor import MotionAt
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.yield_bound import Yield
@@ -34,7 +34,7 @@ PER_MOVE = 10.0  # a continuous loop is stepped 50 times in this share of the se
 def motion_of(problem: CoDesignProblem, theta: Sequence[float]) -> MotionAt:
     """The move at θ, of a problem that has one."""
     own = plant_of(problem).evaluate
-    assert isinstance(own, Moved)
+    assert isinstance(own, DrivenMechanics)
     return own.at(tuple(map(float, theta)), problem.sampling)
 
 

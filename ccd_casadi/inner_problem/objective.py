@@ -7,8 +7,7 @@ box, in which every variable goes from 0 to 1.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,20 +17,28 @@ from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.support.arrays import Array
 
 
-class TrueValue(Protocol):
-    """v(θ) with its gradient (n,) per unit of θ, and whether a certified design has it."""
+@dataclass(frozen=True)
+class InnerValue:
+    """v(θ) and its gradient (n,) per unit of θ: ω_b* in rad/s, NaN where no design is certified.
+
+    Where the inner problem minimises something else `error` is that in SI (RMS error in m, time of
+    a move in s) and what the gradient is of; `bandwidth` is that of its controller.
+    """
+
+    theta: tuple[float, ...]
+    bandwidth: float
+    gradient: tuple[float, ...]
+    error: float = field(default=np.nan, kw_only=True)
 
     @property
-    def theta(self) -> tuple[float, ...]: ...
+    def value(self) -> float:
+        """What J counts."""
+        return self.bandwidth if np.isnan(self.error) else self.error
 
     @property
-    def value(self) -> float: ...
-
-    @property
-    def gradient(self) -> tuple[float, ...]: ...
-
-    @property
-    def feasible(self) -> bool: ...
+    def feasible(self) -> bool:
+        """Whether a certified design meets the constraints at θ."""
+        return bool(np.isfinite(self.bandwidth))
 
 
 def objective(problem: CoDesignProblem, theta: Sequence[float] | Array, value: float) -> float:
@@ -47,7 +54,7 @@ def objective_terms(
     return problem.w1 * cost, problem.w2 * float(value)
 
 
-def objective_of(problem: CoDesignProblem, sample: TrueValue) -> float:
+def objective_of(problem: CoDesignProblem, sample: InnerValue) -> float:
     """J of a sample; infinite where no design is certified or λ(θ) <= 0 is not met."""
     if not sample.feasible or unmet(problem, sample.theta):
         return np.inf
@@ -73,7 +80,7 @@ def hardware_at(problem: CoDesignProblem, theta: Array) -> Hardware:
     return Hardware(problem.w1 * df * width, shares, dlam * width / sizes[:, None])
 
 
-def objective_gradient(problem: CoDesignProblem, sample: TrueValue) -> Array:
+def objective_gradient(problem: CoDesignProblem, sample: InnerValue) -> Array:
     """∇J (n,) per share of the box; of one side, where v has a kink."""
     lower, upper = box(problem)
     own = hardware_at(problem, np.array(sample.theta)).cost_gradient

@@ -17,7 +17,10 @@ from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
-from ccd_casadi.support.user_code import limited, require_user_code
+from ccd_casadi.support.user_code import require_user_code, with_time_limit
+
+Names = tuple[str, ...]
+Ends = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -81,27 +84,42 @@ def _digest(path: Path) -> str:
     return found.hexdigest()
 
 
-def plant_from(
-    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
-) -> Plant:
+def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
     """The plant with parameters `names`, built once in a process.
 
     The box is where a function of plain numbers is tried, and what its differences do not leave.
     Raises UserError where the plant cannot be built, and UserCodeRefused where a user's function
     must not run.
     """
+    if source.model is None:
+        require_user_code(f"{source.file}:{source.function}")
+    elif source.motion is None and source.places is None:
+        lower = upper = ()  # a shipped model is the same in any box
+    return _built(source.pinned(), names, lower, upper)
+
+
+@lru_cache(maxsize=24)
+def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
+    """By its move, its places or its fixed parameters from the plant below."""
     if source.motion is not None:
-        return _plant_with_motion(source.pinned(), names, lower, upper)
+        motion = source.motion
+        size = () if motion.motor is None else (motion.motor.size,)
+        plant = _below(replace(source, motion=None), size, names, lower, upper)
+        return with_motion(plant, motion, names, source.held)
+    held = source.held
     if source.places is not None:
-        return _placed_plant(source.pinned(), names, lower, upper)
-    if source.model is not None:
-        return _shipped_plant(source, names)
-    require_user_code(f"{source.file}:{source.function}")
-    return _own_plant(source.pinned(), names, lower, upper)
-
-
-Names = tuple[str, ...]
-Ends = tuple[float, ...]
+        places = source.places
+        held = {name: value for name, value in held.items() if name in places.names}
+        plant = _below(replace(source, places=None), places.names, names, lower, upper)
+        plant = placed(plant, places, (*names, *held))
+    elif source.model is not None:
+        model = model_named(source.model)
+        assert model is not None
+        plant = model.build((*names, *held), **dict(source.options))
+    else:
+        function = fixed_model(_own_function(source), held)
+        return own_plant(function, names, dict(source.options), lower, upper)
+    return with_fixed(plant, held) if held else plant
 
 
 def _below(
@@ -114,41 +132,6 @@ def _below(
         replace(source, fixed=fixed), tuple(names[i] for i in at), tuple(lower[i] for i in at),
         tuple(upper[i] for i in at),
     )  # fmt: skip
-
-
-@lru_cache(maxsize=8)
-def _plant_with_motion(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
-    motion = source.motion
-    assert motion is not None
-    size = () if motion.motor is None else (motion.motor.size,)
-    plant = _below(replace(source, motion=None), size, names, lower, upper)
-    return with_motion(plant, motion, names, source.held)
-
-
-@lru_cache(maxsize=8)
-def _placed_plant(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
-    places = source.places
-    assert places is not None
-    held = {name: value for name, value in source.held.items() if name in places.names}
-    plant = _below(replace(source, places=None), places.names, names, lower, upper)
-    whole = placed(plant, places, (*names, *held))
-    return with_fixed(whole, held) if held else whole
-
-
-@lru_cache(maxsize=8)
-def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
-    model, held = model_named(source.model), source.held
-    assert model is not None
-    plant = model.build((*names, *held), **dict(source.options))
-    return with_fixed(plant, held) if held else plant
-
-
-@lru_cache(maxsize=8)
-def _own_plant(
-    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
-) -> Plant:
-    function = fixed_model(_own_function(source), source.held)
-    return own_plant(function, names, dict(source.options), lower, upper)
 
 
 class _PlantFile(SourceFileLoader):
@@ -184,12 +167,12 @@ def _own_function(source: PlantSource) -> ModelFunction:
         "correct it, or give it longer with plant_seconds in a table [limits]"
     )
     try:
-        limited(loader.exec_module, source.seconds, late)(module)
-        function = limited(getattr, source.seconds, late)(module, source.function, None)
+        with_time_limit(loader.exec_module, source.seconds, late)(module)
+        function = with_time_limit(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:
         raise
     except Exception as error:
         raise UserError(f"{path}: cannot be loaded: {described(error)}") from error
     if not callable(function):
         raise UserError(f"{path}: defines no function {source.function}; check plant.function")
-    return limited(function, source.seconds, late)
+    return with_time_limit(function, source.seconds, late)

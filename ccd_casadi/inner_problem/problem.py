@@ -25,7 +25,7 @@ from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
@@ -33,7 +33,7 @@ NUMERICS = 11  # raised whenever a change of ours moves the numbers that a sampl
 
 
 @dataclass(frozen=True)
-class CoDesignProblem(Shown):
+class CoDesignProblem(NotebookHtml):
     """The co-design problem (paper, equation (9)); SI throughout.
 
         min w1 f(θ) + w2 ω_b*(θ)   s.t.  lower <= θ <= upper,   λ(θ) <= 0

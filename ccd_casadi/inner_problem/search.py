@@ -51,18 +51,16 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
 
 
 def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[float, float]]:
-    """The best feasible design, and the best one that is within 2 % of feasible."""
-    near = sorted(
-        (row for row in rows if row.certified and problem.excess(row) < 0.02),
-        key=lambda row: -row.bandwidth,
-    )
-    feasible = [row for row in near if problem.feasible(row)]
-    chosen = feasible[:1] or near[:1]
-    if not chosen:
-        chosen = sorted(
-            (row for row in rows if row.certified), key=lambda row: problem.excess(row)
-        )[:1]
-    return [(row.omega_S, row.omega_T) for row in chosen]
+    """The best feasible design, else the best within 2 % of feasible, else the nearest to it."""
+
+    def rank(row: DesignFigures) -> tuple[int, float]:
+        if problem.feasible(row):
+            return 0, -row.bandwidth
+        excess = problem.excess(row)
+        return (1, -row.bandwidth) if excess < 0.02 else (2, excess)
+
+    chosen = min((row for row in rows if row.certified), key=rank, default=None)
+    return [] if chosen is None else [(chosen.omega_S, chosen.omega_T)]
 
 
 def _design(

@@ -22,6 +22,7 @@ from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.move_figures import FREE, motion_of
+from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
@@ -43,32 +44,15 @@ FEW = 8  # starts of the search at a θ where no anchor ends certified
 
 
 @dataclass(frozen=True)
-class StructuredValue:
-    """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
+class StructuredValue(InnerValue):
+    """With the design, and how many climbs and multi-start searches it took (`syntheses`).
 
-    Of a problem that minimises something else, `error` is that in SI (RMS error in m, time of a
-    move in s) and what the gradient is of, `bandwidth` that of the design. `syntheses`: climbs and
-    multi-start searches that it took. At a kink of the value the gradient is that of one side, and
-    `envelope` has the others.
+    At a kink of the value the gradient is that of one side, and `envelope` has the others.
     """
 
-    theta: tuple[float, ...]
-    bandwidth: float
-    gradient: tuple[float, ...]
     design: SectionsDesign
     syntheses: int
-    error: float = float("nan")
     envelope: Envelope | None = None
-
-    @property
-    def value(self) -> float:
-        """What J counts: what the problem minimises, or ω_b*."""
-        return self.bandwidth if np.isnan(self.error) else self.error
-
-    @property
-    def feasible(self) -> bool:
-        """Whether the judge confirms a design at θ."""
-        return self.design.certified
 
 
 def searched(
@@ -129,7 +113,9 @@ def valued(
     bandwidth = made.bandwidth if made.certified else np.nan
     gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
     slope = tuple(map(float, gradient))
-    return StructuredValue(point, float(bandwidth), slope, made, spent, float(error), envelope)
+    return StructuredValue(
+        point, float(bandwidth), slope, made, spent, envelope, error=float(error)
+    )
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:

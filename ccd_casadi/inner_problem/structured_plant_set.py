@@ -192,7 +192,7 @@ def warm_starts(
         own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array, bounds: Bounds
     ) -> Array:
         found = problem_for(set_of, own, bounds, structured.sampling, structured.frequencies)
-        both = [kappa, moved(own, before, set_of[0], kappa)]
+        both = [kappa, scaled_to_plant(own, before, set_of[0], kappa)]
         merits = [
             at_its_bandwidth(found, np.clip(in_problem_units(found, one), *found.box)).merit()
             for one in both
@@ -211,7 +211,9 @@ def warm_starts(
     return warm
 
 
-def moved(structure: Structure, first: ScaledPlant, here: ScaledPlant, kappa: Array) -> Array:
+def scaled_to_plant(
+    structure: Structure, first: ScaledPlant, here: ScaledPlant, kappa: Array
+) -> Array:
     """κ in SI of a SISO plant for another one like it."""
     frequency = _first_mode(here) / _first_mode(first)
     crossover = 0.1 * first.omega_0

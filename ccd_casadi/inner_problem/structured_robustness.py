@@ -62,7 +62,7 @@ def worst_members(
         seed = structured_of(problem).seed + turn
         time, option, point = latest_plant(problem, theta, made.controller, seed)
         if progress is not None:
-            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms told")
+            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
         if time > value:
             found = (*found, (option, tuple(map(float, point))))
     return worst, found
@@ -84,7 +84,7 @@ def worse_members(
         seed=structured.seed + turn,
     )  # fmt: skip
     if progress is not None:
-        progress(f"{np.exp(heads[0].value):.6g} of a bound at most on {count} plants")
+        progress(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
     known = list(structured.members)
     found: list[Member] = []

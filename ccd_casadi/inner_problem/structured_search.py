@@ -169,13 +169,12 @@ def least_from(
     theta: Sequence[float],
     made: SectionsDesign,
     progress: Progress | None = None,
-) -> tuple[CoDesignProblem, SectionsDesign]:
+) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:
     """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
     one of the least of another figure, not certified where it has to be slower than is allowed."""
+    if problem.figure is not BANDWIDTH and made.certified:
+        made = too_slow(problem, made)
     if problem.figure is BANDWIDTH or not made.certified:
-        return problem, made
-    made = too_slow(problem, made)
-    if not made.certified:
-        return problem, made
+        return problem, made, None
     problem, found = least_value_at(problem, theta, made, progress)
-    return problem, found.design
+    return problem, found.design, found

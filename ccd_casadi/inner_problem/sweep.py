@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 from ccd_casadi.synthesis.weights import Weights
@@ -89,7 +89,7 @@ class InnerStatus(StrEnum):
 
 
 @dataclass(frozen=True)
-class InnerResult(Shown):
+class InnerResult(NotebookHtml):
     """The optimum (None if infeasible), what binds there, and every synthesis on the way.
 
     `violation` is the least one, in ln of the bounds, of any certified design; zero if solved.
@@ -297,23 +297,30 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
         reasons = sorted({row.outcome.value for row in rows})
         return "no synthesis was certified: " + "; ".join(reasons)
     nearest = min(certified, key=lambda row: _violation(problem, row))
-    missed, kept, least, elsewhere = [], [], [], []
+    kept, least, elsewhere = [], [], []
     for name, (attribute, bound) in problem.bounds.items():
-        label = LABELS[name]
         value = float(getattr(nearest, attribute))
-        if value > bound:
-            missed.append(f"{label} {missed_by(value, bound)} where {name} = {bound:g} is required")
-            best = min(float(getattr(row, attribute)) for row in certified)
-            if best > bound:
-                least.append(f"the least {label} of all is {missed_by(best, bound)}")
-            else:
-                elsewhere.append(name)
-        else:
+        best = min(float(getattr(row, attribute)) for row in certified)
+        if value <= bound:
             kept.append(f"{name} = {bound:g} is kept there with {value:.4g}")
+        elif best <= bound:
+            elsewhere.append(name)
+        else:
+            least.append(f"the least {LABELS[name]} of all is {missed_by(best, bound)}")
     if elsewhere:
         least.append(f"others keep {' or '.join(elsewhere)}, but not all bounds at once")
-    words = f"of {len(certified)} certified controllers the nearest has {' and '.join(missed)}"
+    missed = " and ".join(missed_bounds(problem, nearest))
+    words = f"of {len(certified)} certified controllers the nearest has {missed}"
     return "; ".join([words, *kept, *least])
+
+
+def missed_bounds(problem: InnerProblem, figures: DesignFigures) -> list[str]:
+    """Which bounds a design misses, and by how much; none where it keeps them all."""
+    return [
+        f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is required"
+        for name, (of, bound) in problem.bounds.items()
+        if (value := float(getattr(figures, of))) > bound
+    ]
 
 
 def missed_by(value: float, bound: float) -> str:

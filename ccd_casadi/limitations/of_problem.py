@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.limitations.bound import inside, outside, pointwise
 from ccd_casadi.limitations.limits import Limits, limits_of
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ
 
 
@@ -55,7 +55,7 @@ class Gap:
             "objective_bound": np.nan,
             "words": self.words(bandwidth) if np.isfinite(bandwidth) else "",
         }
-        return clean(found)
+        return json_values(found)
 
 
 def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> Gap:

@@ -14,8 +14,9 @@ LIGHT = 0.3  # damping ratio below which a pole or zero is a resonance
 
 
 def around(roots: np.ndarray, flanks: Array = FLANKS) -> Array:
-    """|Im p| + flank |Re p| of roots p (k,) of any plane in 1/s, in rad/s and unsorted."""
-    return np.asarray((np.abs(roots.imag)[:, None] + np.abs(roots.real)[:, None] * flanks).ravel())
+    """|Im p| + flank |Re p| (..., kf) of roots p (..., k) of any plane in 1/s, rad/s, unsorted."""
+    found = np.abs(roots.imag)[..., None] + np.abs(roots.real)[..., None] * flanks
+    return np.asarray(found.reshape(*roots.shape[:-1], -1))
 
 
 def light(roots: np.ndarray) -> np.ndarray:

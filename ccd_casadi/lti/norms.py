@@ -7,6 +7,7 @@ Balakrishnan & Kabamba 1989; Bruinsma & Steinbuch 1990.)
 import numpy as np
 from scipy.linalg import eigvals, solve
 
+from ccd_casadi.lti.grid import around
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 
@@ -56,12 +57,12 @@ def level_frequencies(system: StateSpace, level: float) -> Array:
     return np.unique(values.imag[near & (values.imag >= 0.0)])
 
 
-def hinf_norm(system: StateSpace) -> tuple[float, float]:
+def hinf_norm(system: StateSpace, start: float | None = None) -> tuple[float, float]:
     """sup over ω of σ_max(C(jω - A)⁻¹B + D), and the ω in rad/s where it is; A is stable.
 
     The value is attained at that ω. It is raised until the Hamiltonian shows no higher level,
     each candidate confirmed on the frequency response; infinite where A has an eigenvalue with
-    Re >= 0.
+    Re >= 0. `start` is an ω near it, in place of a grid.
     """
     if not len(system.A):
         return float(np.linalg.norm(system.D, 2)), 0.0
@@ -70,7 +71,7 @@ def hinf_norm(system: StateSpace) -> tuple[float, float]:
     poles = np.linalg.eigvals(A)
     if not poles.real.max() < 0.0:
         return np.inf, float(abs(poles[np.argmax(poles.real)].imag))
-    omega = _first_grid(poles)
+    omega = _first_grid(poles) if start is None else np.array([start])
     values = gains(scaled, omega)
     i = int(np.argmax(values))
     best, at = float(values[i]), float(omega[i])
@@ -97,7 +98,6 @@ def _first_grid(poles: np.ndarray) -> Array:
     size = np.abs(poles)
     low, high = 0.01 * size.min(), 100.0 * size.max()
     count = int(10 * np.log10(high / low)) + 2
-    lightly = poles[poles.imag > 0.0]
-    flanks = lightly.imag[:, None] + np.abs(lightly.real)[:, None] * np.array([-1.0, 0.0, 1.0])
-    grid = np.concatenate([[0.0, np.inf], np.geomspace(low, high, count), flanks.ravel()])
+    flanks = around(poles[poles.imag > 0.0], np.array([-1.0, 0.0, 1.0]))
+    grid = np.concatenate([[0.0, np.inf], np.geomspace(low, high, count), flanks])
     return np.unique(grid[grid >= 0.0])

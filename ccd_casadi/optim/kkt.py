@@ -67,6 +67,18 @@ class KktCertificate:
 
 
 @dataclass(frozen=True)
+class FirstOrder:
+    """∇J (n,), and values g (m,) and Jacobian (m, n) of constraints by name, at one z of the unit
+    box; g in shares of `sizes` (m,)."""
+
+    gradient: Array
+    g: Array
+    jacobian: Array
+    sizes: Array
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class ActiveSet:
     """∇J (n,) and what is within `ACTIVE` of its bound at one z of the unit box.
 
@@ -125,26 +137,11 @@ def non_negative(rows: Array, goal: Array) -> tuple[Array, float]:
     return mu, float(np.abs(goal - mu @ rows).max()) / max(float(np.abs(goal).max()), 1e-300)
 
 
-def active_set(
-    z: Array,
-    gradient: Array,
-    values: Array,
-    jacobian: Array,
-    sizes: Array,
-    names: Sequence[str],
-    variables: Sequence[str],
-) -> ActiveSet:
-    """What binds at z of the unit box: g (m,) <= 0 with Jacobian (m, n) in its own units and sizes
-    (m,), and the ends of `variables`."""
-    rows, labels, slack, units = [], [], [], []
-    shares = values / sizes
-    for share, size, row, name in zip(shares, sizes, jacobian, names, strict=True):
-        if share >= -ACTIVE:
-            rows.append(row / size)
-            labels.append(name)
-            slack.append(share)
-            units.append(size)
-    count = len(rows)
+def active_set(z: Array, here: FirstOrder, variables: Sequence[str]) -> ActiveSet:
+    """What binds at z of the unit box: g <= 0, and the ends of `variables`."""
+    at = np.flatnonzero(here.g >= -ACTIVE)
+    rows, slack, units = ([*each[at]] for each in (here.jacobian, here.g, here.sizes))
+    labels, count = [here.names[i] for i in at], len(at)
     for i, name in enumerate(variables):
         for end, value, sign in (("lower", -z[i], -1.0), ("upper", z[i] - 1.0, 1.0)):
             if value >= -ACTIVE:
@@ -152,10 +149,10 @@ def active_set(
                 labels.append(f"{name} {end}")
                 slack.append(value)
                 units.append(1.0)
-    violation = max(0.0, float((-z).max()), float((z - 1.0).max()), *shares)
+    violation = max(0.0, float((-z).max()), float((z - 1.0).max()), *here.g)
     matrix = np.array(rows).reshape(-1, z.size)
     return ActiveSet(
-        gradient, matrix, np.array(slack), np.array(units), tuple(labels), count, violation
+        here.gradient, matrix, np.array(slack), np.array(units), tuple(labels), count, violation
     )
 
 

@@ -12,6 +12,7 @@ combination of them, which are those of all of them where they can be diagonalis
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from ccd_casadi.support.arrays import Array
 
@@ -89,14 +90,5 @@ def _singular_vectors(residues: Array) -> tuple[Array, Array, Array]:
 
 def _components(linked: np.ndarray) -> list[np.ndarray]:
     """Connected components of a symmetric relation, each sorted, in order of their first."""
-    left, found = set(range(len(linked))), []
-    while left:
-        reached, todo = set(), [min(left)]
-        while todo:
-            i = todo.pop()
-            if i not in reached:
-                reached.add(i)
-                todo += [int(j) for j in np.flatnonzero(linked[i]) if j not in reached]
-        left -= reached
-        found.append(np.array(sorted(reached)))
-    return found
+    count, label = connected_components(linked, directed=False)
+    return [np.flatnonzero(label == i) for i in range(count)]

@@ -7,6 +7,7 @@ the step, is the cross-check: their difference bounds the error from above.
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -14,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.plants.plant import (
+    MATRICES,
     Mechanics,
     ModelFunction,
     Plant,
@@ -22,6 +24,7 @@ from ccd_casadi.plants.plant import (
     check_shapes,
     check_sizes,
     checked_ratio,
+    named_values,
 )
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
@@ -67,7 +70,7 @@ def own_plant(
     except Exception:
         return plant  # the symbols are all it takes
     found = plant.evaluate(middle)
-    for one, other in zip(_matrices(found), _matrices(expected), strict=True):
+    for one, other in zip(found.matrices, expected.matrices, strict=True):
         size = np.abs(other).max(initial=0.0)
         if np.isfinite(size) and not np.abs(one - other).max(initial=0.0) <= AGREEMENT * size:
             return numeric.plant("its expressions differ from the numbers that it returns")
@@ -167,20 +170,19 @@ class DifferencedModel:
 
     def __call__(self, theta: Sequence[float] | Array) -> Mechanics:
         """M, D, K, B, C and their derivatives at θ."""
-        here = self._at(theta)
-        ratio = here.system.damping_ratio
+        here = self._at(theta).system
 
         def parts(item: _Values) -> tuple[Array, ...]:
-            if item.system.damping_ratio != ratio:
+            if item.system.damping_ratio != here.damping_ratio:
                 words = "damping_ratio changes with theta; return damping, a matrix"
                 raise PlantError(f"{words}, in its place")
-            return _matrices(item.system)
+            return item.system.matrices
 
-        slopes = self._slopes(theta, parts, 4)
-        self._refuse_jumps(theta)
-        return Mechanics(
-            *_matrices(here.system), ratio, tuple(slopes)  # type: ignore[arg-type]
-        )  # fmt: skip
+        M, D, K, B, C = self._slopes(theta, parts, 4)
+        jump = self._disagreement(theta, WRONG, LEAP)
+        if jump:  # a value leaps between neighbouring points, not only bends
+            raise PlantError(jump)
+        return replace(here, derivatives=(M, D, K, B, C))
 
     def values(self, theta: Sequence[float] | Array) -> Mechanics:
         """M, D, K, B, C at θ, with derivatives to no parameter."""
@@ -200,30 +202,22 @@ class DifferencedModel:
         """Which derivative is wrong at θ, and the usual cause; empty where both formulas agree."""
         return self._disagreement(theta, WRONG, 0.0)
 
-    def _refuse_jumps(self, theta: Sequence[float] | Array) -> None:
-        """Raise PlantError where a value leaps between neighbouring points, not only bends."""
-        words = self._disagreement(theta, WRONG, LEAP)
-        if words:
-            raise PlantError(words)
-
     def _disagreement(self, theta: Sequence[float] | Array, share: float, leap: float) -> str:
         """The worst derivative whose two formulas differ by `share` of it, and over a step by
         `leap` of the matrix."""
-        names = ("mass", "damping", "stiffness", "input", "output")
         worst, words = share, ""
         for k, i, gap, slope, size in self._gaps(theta):
             floor = max(slope, NOISE * size)
             if not gap > worst * floor or STEP * gap <= leap * size:
                 continue
             worst = gap / floor
-            label = names[k] if k < len(names) else "hardware_cost or a constraint"
-            place = ", ".join(f"{n}={v:g}" for n, v in zip(self.names, theta, strict=True))
+            label = (*MATRICES, "hardware_cost or a constraint")[k]
             words = (
                 f"the derivative of {label} to {self.names[i]} is {100 * worst:.0f} % wrong at "
-                f"theta = {place}: two difference formulas disagree, so the plant function leaps "
-                "or bends there; usual causes are eigenvectors whose sign or order changes "
-                "between points (fix the sign, sort by shape), `if`, `abs`, `round`, or an "
-                "iteration that stops early"
+                f"theta = {named_values(self.names, theta)}: two difference formulas disagree, so "
+                "the plant function leaps or bends there; usual causes are eigenvectors whose sign "
+                "or order changes between points (fix the sign, sort by shape), `if`, `abs`, "
+                "`round`, or an iteration that stops early"
             )
         return words
 
@@ -237,7 +231,7 @@ class DifferencedModel:
         """
 
         def parts(item: _Values) -> tuple[Array, ...]:
-            return (*_matrices(item.system), item.scalars)
+            return (*item.system.matrices, item.scalars)
 
         width = self.upper - self.lower
         sizes = [float(np.abs(part).max(initial=0.0)) for part in parts(self._at(theta))]
@@ -270,10 +264,8 @@ class DifferencedModel:
                 moved[i] = point[i] if offset == away else centre + offset * h
                 found.append(parts(self._at(moved)))
             # The weights sum to zero: without the value at θ a constant has no slope at all.
-            columns = (np.array(column) for column in zip(*found, strict=True))
-            rows.append(
-                [np.tensordot(weights, c - b, 1) for c, b in zip(columns, base, strict=True)]
-            )
+            pairs = zip(zip(*found, strict=True), base, strict=True)
+            rows.append([np.tensordot(weights, np.array(c) - b, 1) for c, b in pairs])
         return [np.array(column) for column in zip(*rows, strict=True)]
 
     def _at(self, theta: Sequence[float] | Array) -> _Values:
@@ -293,10 +285,6 @@ def _number(key: str, value: Any) -> float:
 
 def _array(value: Any) -> Array:
     return np.array(ca.DM(value), dtype=float)
-
-
-def _matrices(system: Mechanics) -> tuple[Array, Array, Array, Array, Array]:
-    return system.M, system.D, system.K, system.B, system.C
 
 
 def _derivative_weights(offsets: Array, at: float) -> Array:

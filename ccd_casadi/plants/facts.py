@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from ccd_casadi.kernels.frequency import prepare, response
+from ccd_casadi.kernels.frequency import prepare, responses
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 ALIKE = 0.3  # relative: a zero with and without suspension is the same within this
@@ -99,11 +98,9 @@ def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
     """The first frequency at which M_K σ_r(G) falls through 1."""
     order = min(plant.B.shape[1], plant.C.shape[0])
     order = min(order, int(modal.rigid.sum()) or order)
-    G = prepare(plant.A, plant.B, plant.C)
     grid = plant.grid[plant.grid > 1e-4]
-    gain = np.array(
-        [np.linalg.svd(response(G, w), compute_uv=False)[order - 1] for w in grid]
-    ).clip(1e-300)
+    G = responses(prepare(plant.A, plant.B, plant.C), grid)
+    gain = np.linalg.svd(G, compute_uv=False)[:, order - 1].clip(1e-300)
     below = np.flatnonzero((gain[1:] < 1.0) & (gain[:-1] >= 1.0))
     if not below.size:
         return float("nan")
@@ -118,14 +115,13 @@ def _zeros(plant: ScaledPlant, effort_hz: float, free: ScaledPlant | None) -> tu
     if free is not None:
         own = free.system.zeros() * (free.omega_0 / plant.omega_0)
     limit = 3.0 * effort_hz * HZ / plant.omega_0
+    x, y = np.log(plant.grid), np.log(np.maximum(plant.gain, 1e-300))
     found = []
     for zero in plant.system.zeros():
         size = abs(zero)
         if zero.imag < 0.0 or not 1e-3 * limit < size < limit:
             continue
-        gain = np.exp(
-            np.interp(np.log(size * np.array([0.7, 1.0, 1.4])), np.log(plant.grid), _log(plant))
-        )
+        gain = np.exp(np.interp(np.log(size * np.array([0.7, 1.0, 1.4])), x, y))
         dip = gain[1] / np.sqrt(gain[0] * gain[2])
         damping = -zero.real / size
         artefact = bool(
@@ -136,10 +132,6 @@ def _zeros(plant: ScaledPlant, effort_hz: float, free: ScaledPlant | None) -> tu
         hz = float(size * plant.omega_0 / HZ)
         found.append(Zero(hz, float(damping), float(dip), artefact))
     return tuple(sorted(found, key=lambda zero: zero.frequency_hz))
-
-
-def _log(plant: ScaledPlant) -> Array:
-    return np.asarray(np.log(np.maximum(plant.gain, 1e-300)))
 
 
 def bandwidth_limit_hz(zero: Zero, S_max: float) -> float:

@@ -36,14 +36,14 @@ class WithFixed:
     def __init__(self, evaluate: Evaluate, place: Sequence[int], whole: Array) -> None:
         self.evaluate, self.place, self._whole = evaluate, list(place), whole
 
-    def at(self, theta: Sequence[float]) -> tuple[float, ...]:
-        """The whole θ."""
+    def own(self, theta: Sequence[float]) -> tuple[float, ...]:
+        """The whole θ, in the plant's own order."""
         out = self._whole.copy()
         out[self.place] = theta
         return tuple(out.tolist())
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
-        found = self.evaluate(self.at(theta))
+        found = self.evaluate(self.own(theta))
         if not len(found.derivatives[0]):  # values alone
             return found
         M, D, K, B, C = (array[self.place] for array in found.derivatives)
@@ -72,7 +72,7 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
     theta = [fixed[name] if name in fixed else next(entries) for name in plant.names]
     domain = plant.domain
     return through(
-        plant, of, own.at,
+        plant, of, own.own,
         names=tuple(plant.names[i] for i in place),
         hardware=ca.Function("hardware", [free], plant.hardware.call([ca.vertcat(*theta)])),
         domain=None if domain is None else (domain[0][place], domain[1][place]),
@@ -119,11 +119,8 @@ def through(
 REMEMBERED = 64  # θ whose matrices are kept
 
 
-class Ordered:
-    """θ in the order of `names` -> Mechanics, of `mechanics(θ in the order of own, derivatives)`.
-
-    Derivatives, where they are asked for, are in the order of `names` too.
-    """
+class Ordered(WithFixed):
+    """θ in the order of `names` -> Mechanics, of `mechanics(θ in the order `own`, derivatives)`."""
 
     keep: object = None  # what has to live as long
 
@@ -134,21 +131,5 @@ class Ordered:
         names: Sequence[str],
         derivatives: bool = True,
     ) -> None:
-        self.place = [list(names).index(name) for name in own]
-        self._mechanics, self._derivatives = mechanics, derivatives
-        self._back = [list(own).index(name) for name in names]
-        self._read = lru_cache(maxsize=REMEMBERED)(self._evaluated)
-
-    def own(self, theta: Sequence[float]) -> tuple[float, ...]:
-        """θ in the builder's order."""
-        return tuple(float(theta[i]) for i in self.place)
-
-    def __call__(self, theta: Sequence[float]) -> Mechanics:
-        return self._read(self.own(theta))
-
-    def _evaluated(self, theta: tuple[float, ...]) -> Mechanics:
-        found = self._mechanics(theta, self._derivatives)
-        if not self._derivatives or self._back == sorted(self._back):
-            return found
-        M, D, K, B, C = (array[self._back] for array in found.derivatives)
-        return replace(found, derivatives=(M, D, K, B, C))
+        evaluate = lru_cache(maxsize=REMEMBERED)(lambda theta: mechanics(theta, derivatives))
+        super().__init__(evaluate, [list(own).index(name) for name in names], np.zeros(len(own)))

@@ -10,7 +10,6 @@ Source: Duchon (1977) for the spline; Rippa, Adv. Comput. Math. 11 (1999), for n
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
-import casadi as ca
 import numpy as np
 
 from ccd_casadi.support.arrays import Array
@@ -47,13 +46,6 @@ class Points:
     def at(self, theta: Array) -> Array:
         """At θ, (m, d)."""
         return np.asarray(self.constant + self.slope @ theta)
-
-    def symbols(self, theta: ca.MX) -> list[ca.MX]:
-        """The same of symbols, a vector for each row."""
-        return [
-            ca.DM(row) + ca.mtimes(ca.DM(slope), theta)
-            for row, slope in zip(self.constant, self.slope, strict=True)
-        ]
 
 
 class Between:

@@ -213,11 +213,12 @@ def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
     found: dict[frozenset[Point], tuple[str, ca.MX]] = {}  # a force and its sensor are one place
     for word, points, group in (("actuators", of.places.actuators, of.actuators),
                                 ("sensors", of.places.sensors, of.sensors)):  # fmt: skip
-        at = group.symbols(theta) if of.places.apart else []
-        for i, j in combinations(range(len(at)), 2):
-            if (group.slope[i] != group.slope[j]).any():
+        for i, j in combinations(range(len(points)) if of.places.apart else (), 2):
+            slope = group.slope[i] - group.slope[j]
+            if slope.any():
                 name = f"{word} {i + 1} and {j + 1} apart"
-                lam = 1.0 - ca.sumsqr(at[i] - at[j]) / of.places.apart**2
+                away = ca.DM(group.constant[i] - group.constant[j]) + ca.DM(slope) @ theta
+                lam = 1.0 - ca.sumsqr(away) / of.places.apart**2
                 found.setdefault(frozenset((points[i], points[j])), (name, lam))
     return dict(found.values())
 

@@ -26,6 +26,7 @@ _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
 # Matrices are dense and a synthesis takes time in the cube of this: more is a mistake, not a stage.
 LARGEST = {"mass": 1000, "input": 100, "output": 100}
 LARGEST_ENTRY = 1e100  # its square is still a double
+MATRICES = ("mass", "damping", "stiffness", "input", "output")
 _KNOWN = {*_REQUIRED, "damping", "damping_ratio", "constraints"}
 
 
@@ -45,14 +46,16 @@ class Mechanics:
     damping_ratio: float | None
     derivatives: tuple[Array, Array, Array, Array, Array]
 
+    @property
+    def matrices(self) -> tuple[Array, Array, Array, Array, Array]:
+        """M, D, K, B, C."""
+        return self.M, self.D, self.K, self.B, self.C
+
 
 def to_first_order(system: Mechanics, step: Array) -> Mechanics:
     """The matrices at θ + step by their derivatives at θ, which are kept."""
-    own = (system.M, system.D, system.K, system.B, system.C)
-    M, D, K, B, C = (
-        matrix + np.tensordot(step, slopes, 1)
-        for matrix, slopes in zip(own, system.derivatives, strict=True)
-    )
+    pairs = zip(system.matrices, system.derivatives, strict=True)
+    M, D, K, B, C = (matrix + np.tensordot(step, slopes, 1) for matrix, slopes in pairs)
     return Mechanics(M, D, K, B, C, system.damping_ratio, system.derivatives)
 
 
@@ -225,7 +228,7 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
     cheaper = plant.values is not None and not derivatives
     system = plant.values(theta) if cheaper and plant.values else plant.evaluate(theta)
     M, K = system.M, system.K
-    _require_finite(plant, system, f"at theta = {theta_words(plant, theta)}")
+    _require_finite(plant, system, f"at theta = {named_values(plant.names, theta)}")
     for name, matrix in (("mass", M), ("stiffness", K)):
         gap = np.abs(matrix - matrix.T)
         if gap.max() > 1e-9 * np.abs(matrix).max():
@@ -233,13 +236,13 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
             entries = (
                 f"row {i + 1}, column {j + 1} is {matrix[i, j]:g}, its mirror {matrix[j, i]:g}"
             )
-            words = f"{name} is not symmetric at theta = {theta_words(plant, theta)}"
+            words = f"{name} is not symmetric at theta = {named_values(plant.names, theta)}"
             raise PlantError(f"{words}: {entries}; make it symmetric")
     try:
         np.linalg.cholesky(M)
     except np.linalg.LinAlgError:
         least = float(np.linalg.eigvalsh(M)[0])
-        words = f"mass is not positive definite at theta = {theta_words(plant, theta)}"
+        words = f"mass is not positive definite at theta = {named_values(plant.names, theta)}"
         remedy = "give every coordinate a mass, or narrow the bounds of theta"
         raise PlantError(f"{words}: its least eigenvalue is {least:.3g}; {remedy}") from None
     return system
@@ -255,13 +258,11 @@ def near(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[float]) 
 
 def _require_finite(plant: Plant, system: Mechanics, place: str) -> None:
     """Raise PlantError that names the first entry, or its slope, that is no number or too large."""
-    keys = ("mass", "damping", "stiffness", "input", "output")
-    matrices = (system.M, system.D, system.K, system.B, system.C)
-    told = [*zip(keys, matrices, strict=True)]
-    for key, slopes in zip(keys, system.derivatives, strict=True):
-        told += [(f"the derivative of {key} to {name}", slope)
-                 for name, slope in zip(plant.names, slopes, strict=False)]  # fmt: skip
-    for what, matrix in told:
+    entries = [*zip(MATRICES, system.matrices, strict=True)]
+    for key, slopes in zip(MATRICES, system.derivatives, strict=True):
+        entries += [(f"the derivative of {key} to {name}", slope)
+                    for name, slope in zip(plant.names, slopes, strict=False)]  # fmt: skip
+    for what, matrix in entries:
         wrong = ~(np.abs(matrix) <= LARGEST_ENTRY)
         if not wrong.any():
             continue
@@ -271,7 +272,7 @@ def _require_finite(plant: Plant, system: Mechanics, place: str) -> None:
             words = f"the plant has an entry beyond {LARGEST_ENTRY:g} {place}: {entry}"
             raise PlantError(f"{words}; choose other units")
         remedy = "keep divisions, roots and logarithms in their range over all bounds of theta"
-        if what not in keys:
+        if what not in MATRICES:
             remedy = "its value is finite: a root or power of 0, or abs, has no slope; smooth it"
         raise PlantError(f"the plant is not finite {place}: {entry}; {remedy}")
 
@@ -304,6 +305,6 @@ def hardware_slopes(plant: Plant, theta: Sequence[float] | Array) -> tuple[Array
     return df.ravel(), dlam.reshape(-1, len(plant.names))
 
 
-def theta_words(plant: Plant, theta: Sequence[float]) -> str:
-    """θ as `name=value, name=value`."""
-    return ", ".join(f"{name}={value:g}" for name, value in zip(plant.names, theta, strict=True))
+def named_values(names: Sequence[str], values: Sequence[float] | Array) -> str:
+    """`name=value, name=value`."""
+    return ", ".join(f"{name}={value:g}" for name, value in zip(names, values, strict=True))

@@ -134,13 +134,10 @@ def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledP
     count = modal.dM.shape[0]
     dA, dB = np.zeros((count, 2 * n, 2 * n)), np.zeros((count, 2 * n, m))
     dC = np.zeros((count, p, 2 * n))
-    for i in range(count):
-        dK = modal.dK[i] / omega_0**2 - modal.dM[i] @ K
-        dD = modal.dD[i] / omega_0 - modal.dM[i] @ D
-        dA[i, n:, :n] = -lower(dK) / s
-        dA[i, n:, n:] = -lower(dD)
-        dB[i, n:] = left[:, None] * drive * (modal.dB[i] - modal.dM[i] @ modal.B)
-        dC[i, :, :n] = modal.dC[i] * right / s
+    dA[:, n:, :n] = -lower(modal.dK / omega_0**2 - modal.dM @ K) / s
+    dA[:, n:, n:] = -lower(modal.dD / omega_0 - modal.dM @ D)
+    dB[:, n:] = left[:, None] * drive * (modal.dB - modal.dM @ modal.B)
+    dC[:, :, :n] = modal.dC * right / s
     if bare:
         none = np.empty(0)
         return ScaledPlant(A, B, C, omega_0, M_K, none, none, modal.natural, dA, dB, dC)

@@ -13,7 +13,7 @@ from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY
 from ccd_casadi.reporting.loops import bandwidth_level, margin_words, of_plants, over_hz
 from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number, shown
+from ccd_casadi.support.units import HZ, number, with_unit
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
@@ -187,8 +187,8 @@ def _caption(loop: LoopView, channels: Sequence[LoopChannel]) -> str:
     K = np.linalg.norm(loop.controller, 2, axis=(1, 2))
     i = int(K.argmax())
     words += (
-        f" The controller's gain is {shown(gain, 'N/m')} at {number(float(loop.hz[0]), 3)} Hz and "
-        f"at most {shown(float(K[i]), 'N/m')}, at {number(float(loop.hz[i]), 4)} Hz."
+        f" The controller's gain is {with_unit(gain, 'N/m')} at {number(float(loop.hz[0]), 3)} Hz "
+        f"and at most {with_unit(float(K[i]), 'N/m')}, at {number(float(loop.hz[i]), 4)} Hz."
     )
     below = [hz for hz in loop.antiresonances_hz if hz > loop.bandwidth_hz]
     if below:

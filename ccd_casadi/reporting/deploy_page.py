@@ -12,18 +12,18 @@ from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.words import figure_rows, order_words, reason_words, short_status
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.facts import run_name, theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
-from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, shown
+from ccd_casadi.support.units import HZ, number, with_unit
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for
@@ -35,7 +35,7 @@ def deploy_page(
     """report.html of a deployment; `index`: the page that links all of the run."""
     meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
     head = head_of(
-        f"Controller of {run.folder.resolve().name}, deployed", found.passed,
+        f"Controller of {run_name(run.folder)}, deployed", found.passed,
         short_status(run, found), reason_words(run, found), meta, _conclusion(run, found),
         run.result,
     )  # fmt: skip
@@ -66,37 +66,38 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
 
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:
-    """The loops beside each other: name, colour, line."""
+    """The loops beside each other: name, colour, line; nothing is reduced of what was designed."""
     G, K = run.plant.plant_si(), found.realisation.system
-    return (
-        (Loop(G, run.controller), "full", BLUE, "-"),
-        (Loop(G, found.reduced), "reduced", GREEN, "--"),
-        (Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"),
-    )
+    sampled = Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"
+    if kind_of(run.problem).as_designed:
+        return (Loop(G, run.controller), "continuous", BLUE, "-"), sampled
+    full = Loop(G, run.controller), "full", BLUE, "-"
+    return full, (Loop(G, found.reduced), "reduced", GREEN, "--"), sampled
 
 
 def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
-    nyquist = 0.5 * found.rate_hz
+    scalar = run.plant.B.shape[1] == len(run.plant.C) == 1
+    nyquist, named = 0.5 * found.rate_hz, "|{}|" if scalar else "σ_max({})"
     low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
     hz = frequency_grid(low, high, POINTS, run.plant.grid * run.plant.omega_0 / HZ)
     curves, drawn = [], []
     for loop, name, colour, line in _loops(run, found):
         G, K = loop.responses(HZ * hz)
-        how = "continuous" if loop.sampling is None else f"at {number(found.rate_hz)} Hz"
-        label = f"{name}{',' if loop.sampling is None else ''} {how}"
+        label = name if loop.sampling is None else f"{name} at {number(found.rate_hz)} Hz"
         curves.append(c.Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
         drawn.append(c.Curve(hz, largest(K), name, colour, line))
-    S_max = run.problem.inner.S_max
-    bandwidth = run.figures.bandwidth / HZ
-    crossing = bandwidth_level(bandwidth, text=", continuous")
-    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named(run, 'S')} (–)")
-    bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist), legend=None)
-    title = "Sensitivity and controller: full, reduced and sampled, over frequency"
-    ends = [shown(each.y[-1], "N/m") for each in drawn]
+    S_max, own = run.problem.inner.S_max, found.sampled.bandwidth / HZ
+    crossing = bandwidth_level(own, text=", sampled") if np.isfinite(own) else (
+        bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")
+    )  # fmt: skip
+    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
+    bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
+    title = f"Sensitivity and controller over frequency: {', '.join(k.label for k in drawn)}"
+    ends = (f"{with_unit(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
-        f"up to half the sampling rate. There the controller's gain, which sensor noise and "
-        f"unmodelled resonances meet, is {ends[2]} (reduced: {ends[1]}, full: {ends[0]})."
+        "up to half the sampling rate. The gain of the controller there amplifies sensor noise and "
+        f"unmodelled resonances. It is {', '.join(ends)}."
     )
     return c.Figure(c.Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption)
 
@@ -141,25 +142,22 @@ def _rates(found: Deployment) -> c.Words:
 
 
 def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
-    head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
-    rows = []
-    for row in item.rows:
-        f = row.figures
-        chosen = "chosen" if row is item.chosen else ""
-        result = chosen if f.certified else f.outcome.value
-        rows.append((
-            row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
-            f.gamma / run.figures.gamma if f.certified else float("nan"), result,
-        ))  # fmt: skip
     if item.designed is not None:
         words = f"Channel {item.channel.name}: {item.chosen.order} states, as designed."
         return (c.Words(words),)
+    head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
+    rows = tuple(
+        (row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
+         f.gamma / run.figures.gamma if f.certified else float("nan"),
+         f.outcome.value if not f.certified else "chosen" if row is item.chosen else "")
+        for row in item.rows for f in [row.figures]
+    )  # fmt: skip
     words = (
         f"Channel {item.channel.name}: {item.chosen.order} of {item.rows[0].order} states are "
         f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
         f"above twice its bound; {item.strict.order} keep S_max itself."
     )
-    return c.Words(words), c.Table(head, tuple(rows))
+    return c.Words(words), c.Table(head, rows)
 
 
 def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
@@ -170,8 +168,8 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     if item.designed is not None:
         structure, kappa = item.designed
         words = (
-            f"Channel {item.channel.name}: gain {shown(gain_of(kappa), 'N/m', 4)}; the sections as "
-            "they were designed."
+            f"Channel {item.channel.name}: gain {with_unit(gain_of(kappa), 'N/m', 4)}; the "
+            "sections as they were designed."
         )
         return c.Words(words), structured_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
@@ -180,9 +178,9 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
-        f"Channel {item.channel.name}: gain {shown(found.gain, 'N/m', 4)} at s = 0, "
-        f"{shown(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at s = 0."
-        " A negative ζ, or a negative frequency of a single root, is in the right half plane."
+        f"Channel {item.channel.name}: gain {with_unit(found.gain, 'N/m', 4)} at s = 0, "
+        f"{with_unit(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at "
+        "s = 0. A negative ζ, or a negative frequency of a single root, is in the right half plane."
     )
     return c.Words(words), c.Table(head, rows)
 

@@ -1,13 +1,15 @@
 """A design in words and numbers: the conclusion, the table of the design, and what binds."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.drawing.content import Fact, Table
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.support.units import HZ, counted, number, shown_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, number
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
@@ -20,7 +22,9 @@ def conclusion(result: Mapping[str, Any]) -> str:
     cost = f"a hardware cost of {cost_words(result)} (J = {number(result['objective'], 6)})"
     if "race" in result:  # a fixed structure
         order = f"a controller of order {result['controller']['order']}"
-        return f"{begins}: {order} with a bandwidth of {hz} on {_plants(result)}, at {cost}."
+        v = FIGURES[result.get("minimise", BANDWIDTH.key)]
+        own = "" if v is BANDWIDTH else f"{v.words} {v.shown(result[f'{v.entry}_of_set'])} and "
+        return f"{begins}: {order} with {own}a bandwidth of {hz} on {_plants(result)}, at {cost}."
     certificate = result["certificate"]
     proof = (
         f"certified stable with ‖[W_S S; W_KS KS; W_T T]‖∞ ≤ {number(certificate['norm_bound'])}"
@@ -53,6 +57,13 @@ def _prediction(result: Mapping[str, Any]) -> str:
     return f" The prediction errs by {number(result['verification_error'], 2)} of the truth."
 
 
+def run_name(place: Path) -> str:
+    """Of a run by its folder or its case; what `ccd new` makes is named by the folder around it."""
+    place = place.resolve()
+    names = (place.name.removesuffix(".toml"), *(parent.name for parent in place.parents))
+    return next((name for name in names if name != "case"), "case")
+
+
 def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:
     """The hardware cost with its unit, where the case gives one."""
     return f"{number(result['hardware_cost'], digits)} {result.get('cost_unit', '')}".strip()
@@ -66,7 +77,7 @@ def cost_axis(problem: CoDesignProblem) -> str:
 def theta_axes(problem: CoDesignProblem) -> list[tuple[str, str, float]]:
     """Name, unit for the eye and the factor to it of every parameter."""
     ends = zip(problem.names, problem.units, problem.upper, strict=True)
-    return [(name, *shown_unit(unit, upper)) for name, unit, upper in ends]
+    return [(name, *display_unit(unit, upper)) for name, unit, upper in ends]
 
 
 def theta_words(result: Mapping[str, Any]) -> str:
@@ -74,10 +85,10 @@ def theta_words(result: Mapping[str, Any]) -> str:
     units = result.get("units", {})
     words = []
     for name, value in {**result["theta"], **result.get("fixed", {})}.items():
-        unit, factor = shown_unit(units.get(name, ""), value)
+        unit, factor = display_unit(units.get(name, ""), value)
         words.append(f"{name} = {number(factor * value)} {unit}".strip())
     for name, (low, high) in result.get("varies", {}).items():
-        unit, factor = shown_unit(units.get(name, ""), high)
+        unit, factor = display_unit(units.get(name, ""), high)
         words.append(f"every {name} from {factor * low:.5g} to {factor * high:.5g} {unit}".strip())
     return ", ".join(words)
 
@@ -93,11 +104,11 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
         rows.append((name, unit or "–", *numbers, place))
     lists = result.get("listed", {}).get("values", {})
     for name, value in result.get("fixed", {}).items():
-        unit, factor = shown_unit(problem.parameter_units[name], value)
+        unit, factor = display_unit(problem.parameter_units[name], value)
         place = f"one of {len(lists[name])}" if name in lists else "fixed"
         rows.append((name, unit or "–", factor * value, "–", "–", "–", place))
     for name, ends in result.get("varies", {}).items():
-        unit, factor = shown_unit(problem.parameter_units[name], ends[1])
+        unit, factor = display_unit(problem.parameter_units[name], ends[1])
         low, high = (factor * end for end in ends)
         rows.append((name, unit or "–", "–", low, high, "–", "varies"))
     head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")
@@ -140,21 +151,31 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
 
 def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list[Fact]:
     """J and what it counts, true and predicted; `of`: which bandwidth it is, in words."""
-    figure, guess = problem.figure, r["surrogate_bandwidth_hz"]
-    value = ("Predicted bandwidth", f"{number(guess, 6)} Hz")
-    known = r.get("verdict", {}).get("predicted", {}).get("left_out") is not None
-    error = f"relative error {number(r['verification_error'], 2)}"
+    figure, guess = problem.figure, f"{number(r['surrogate_bandwidth_hz'], 6)} Hz"
     v, words, entry = figure.symbol, figure.words, figure.entry
+    bandwidth, value = ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz"), []
     if f"{entry}_of_set" in r and not figure.larger_is_better:
         e, guess = (figure.shown(r[key], 6) for key in (f"{entry}_of_set", f"surrogate_{entry}"))
-        value = (f"{words[0].upper()}{words[1:]} {v}", f"{e} over the set (predicted {guess})")
+        name = f"{words[0].upper()}{words[1:]} {v}"
+        value = [(name, f"{e} over the set", prediction_words(r, guess))]
+    else:
+        of = "; ".join(filter(None, (of, prediction_words(r, guess))))
     J = f"{problem.w1:g} f(θ) + ({problem.w2:g}) {v}, {v} in {figure.si_unit}"
     return [
         ("Objective J", number(r["objective"], 7), J),
         ("Hardware cost f(θ)", cost_words(r, 6), ""),
-        ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", of),
-        (*value, "a sample of the surrogate, which it repeats" if known else error),
+        (*bandwidth, of),
+        *value,
     ]
+
+
+def prediction_words(r: Mapping[str, Any], guess: str) -> str:
+    """What was predicted of the design: nothing without a surrogate, or of one of its samples."""
+    if r["formulation"] == "direct":
+        return ""
+    if r.get("verdict", {}).get("predicted", {}).get("left_out") is not None:
+        return "a sample of the surrogate"  # which repeats it
+    return f"predicted {guess} (error {100.0 * r['verification_error']:.2g} %)"
 
 
 def sensitivity_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
@@ -320,4 +341,4 @@ def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
         step = number(0.01 * factor * (problem.upper[i] - problem.lower[i]), 3)
         words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
         return words, 0.01, f"moving the bound outwards by {step} {unit}".rstrip()
-    return f"The constraint {name} binds", 1.0, "loosening it by one unit"
+    return f"The constraint “{name}” binds", 1.0, "loosening it by one unit"

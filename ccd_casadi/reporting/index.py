@@ -7,10 +7,10 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ccd_casadi.drawing.content import INDEX, Chapter, Links, Page
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.drawing.stored import write_page
-from ccd_casadi.reporting.facts import conclusion
-from ccd_casadi.reporting.verdict import refreshed, run_head
+from ccd_casadi.reporting.facts import conclusion, run_name
+from ccd_casadi.reporting.verdict import run_head, with_verdict_of
 from surrogates.files import write_whole
 
 PAGES = {
@@ -57,7 +57,7 @@ def write_index(folder: Path) -> None:
     pages = _pages(folder)
     for place in pages:
         text = place.read_text(encoding="utf-8")
-        now = refreshed(text, result, whole=place == folder / "report.html")
+        now = with_verdict_of(text, result, whole=place == folder / "report.html")
         if now != text:
             write_whole(place, now)
     links = tuple(
@@ -65,11 +65,10 @@ def write_index(folder: Path) -> None:
         for place, words in pages.items()
     )
     files = tuple((n, n, words) for n, words in FILES.items() if (folder / n).exists())
-    name = folder.resolve().name
-    lead = conclusion(result)
-    head = run_head(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
+    lead, meta = conclusion(result), f"{result.get('formulation', '')} formulation"
+    head = run_head(f"Run: {run_name(folder)}", result, meta, lead)
     chapters = (Chapter("Pages", (Links(links),)), Chapter("Files", (Links(files),)))
-    write_whole(folder / INDEX, painted(Page(head, chapters, index="")))
+    write_whole(folder / INDEX, page_html(Page(head, chapters, index="")))
 
 
 def _pages(folder: Path) -> dict[Path, str]:

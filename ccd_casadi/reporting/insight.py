@@ -13,13 +13,13 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_axes, theta_words
+from ccd_casadi.reporting.facts import cost_axis, cost_words, run_name, theta_axes, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, display_unit, number
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
@@ -34,7 +34,7 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     verified = sum(point.verified for point in front.points)
     whole = verified == len(front.points)
     head = head_of(
-        f"Insight: {run.case.path.parent.name}",
+        f"Insight: {run_name(run.folder)}",
         whole,
         "verified" if whole else "not all verified",
         f"{verified} of {len(front.points)} points of the front",
@@ -196,7 +196,7 @@ def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float
     if variable in ("omega_S", "omega_T"):
         return name.replace("omega", "ω"), value / HZ, 1.0 / HZ, "Hz"
     if variable in problem.names:
-        unit, factor = shown_unit(problem.units[problem.names.index(variable)], value)
+        unit, factor = display_unit(problem.units[problem.names.index(variable)], value)
         return name, factor * value, factor, unit
     return name, value, 1.0, ""
 

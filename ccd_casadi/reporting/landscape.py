@@ -1,19 +1,51 @@
 """The landscape of ω_b*(θ) of a run: its data from surrogate and store, and its words."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.reporting.true_samples import Truths, feasible
+from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, sample_key
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
 
 GRID = 25  # points per parameter of a landscape
 COARSER = 17  # the same where there are many samples
 MANY = 80  # samples with gradients above which it is that
+
+
+@dataclass(frozen=True)
+class Truths:
+    """ω_b*(θ) in Hz where the inner problem was solved (NaN: infeasible), and every design."""
+
+    theta: np.ndarray
+    bandwidth_hz: np.ndarray
+    designs: tuple[Sample, ...]
+
+
+def read_truths(path: Path, problem: CoDesignProblem) -> Truths:
+    """Everything in the store that belongs to this problem (a folder may have seen others)."""
+    designs_hash, inner_hash = hashes_of(problem)
+    count = len(problem.names)
+    thetas, values = [], []
+    with SampleStore(path) as store:
+        rows = [s for s in store.select() if len(s.theta) == count]
+        for theta in dict.fromkeys(sample.theta for sample in rows):
+            known = store.get_result(best_key(inner_hash, theta))
+            known = known or store.get_result(sample_key(inner_hash, theta, 0.0, 0.0))
+            if known is not None:
+                thetas.append(theta)
+                value = known["bandwidth"]
+                values.append(np.nan if value is None else value / HZ)
+    ours = tuple(
+        s for s in rows if s.key == sample_key(designs_hash, s.theta, s.omega_S, s.omega_T)
+    )
+    return Truths(np.array(thetas).reshape(-1, count), np.array(values), ours)
 
 
 def bandwidth_process(processes: Sequence[object]) -> GaussianProcess | None:
@@ -76,7 +108,7 @@ def known_bandwidths(
         return dict(zip(map(tuple, truths.theta.tolist()), truths.bandwidth_hz, strict=True))
     best: dict[tuple[float, ...], float] = {}
     for s in truths.designs:
-        if feasible(problem, s):
+        if s.certified and problem.inner.excess(s) <= 1e-9:  # to the surrogates' margin
             best[s.theta] = max(best.get(s.theta, 0.0), s.bandwidth / HZ)
     return best
 
@@ -109,33 +141,18 @@ def caption_landscape(land: Landscape, best_hz: float) -> str:
     return words
 
 
-def caption_disagreement(
-    problem: CoDesignProblem,
-    process: GaussianProcess | None,
-    truths: Truths,
-    design: tuple[float, ...],
-) -> str:
+def caption_disagreement(process: GaussianProcess | None, truths: Truths) -> str:
     """How far the surrogate's ω_b* is from the true one where it was not fitted to it."""
     if process is None:
         return ""
-    known = np.isfinite(truths.bandwidth_hz)
     unit = (truths.theta - process.lower) / (process.upper - process.lower)
     gaps = np.abs(unit[:, None, :] - process.X[None, :, :]).max(axis=2)
-    known &= gaps.min(axis=1) > 1e-9  # it interpolates its own samples
+    known = np.isfinite(truths.bandwidth_hz) & (gaps.min(axis=1) > 1e-9)  # it has its own samples
     if not known.any():
         return ""
-    theta, truth = truths.theta[known], truths.bandwidth_hz[known]
-    error = 100.0 * np.abs(process.predict(theta) / HZ / truth - 1.0)
-    worst = int(error.argmax())
-    place = ", ".join(
-        f"{name} = {number(float(v), 4)}"
-        for name, v in zip(problem.names, theta[worst], strict=True)
-    )
-    width = np.subtract(problem.upper, problem.lower)
-    away = float((np.abs(theta - np.array(design)) / width).max(axis=1).min())
+    truth = truths.bandwidth_hz[known]
+    error = 100.0 * np.abs(process.predict(truths.theta[known]) / HZ / truth - 1.0)
     return (
-        f" Where the true ω_b* is known besides ({len(error)} θ, the nearest "
-        f"{100.0 * away:.2g} % of the box away from the design) it is off by at most "
-        f"{number(float(error[worst]), 2)} % (at {place}), {number(float(np.median(error)), 2)} % "
-        "in the median."
+        f" At {len(error)} other θ with a known true ω_b* it is off by at most "
+        f"{number(float(error.max()), 2)} %, {number(float(np.median(error)), 2)} % in the median."
     )

@@ -142,21 +142,24 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
     return over_hz(label, curves, ends, levels=tuple(bare), **{**found, **more})
 
 
-def figure_gains(views: Sequence[LoopView], *, bounds: bool = True) -> Lines:
-    """S over the full width, KS and T below it; of one design GS where it is bounded."""
+def figure_gains(
+    views: Sequence[LoopView], *, bounds: bool = True, compliance: bool = False
+) -> Lines:
+    """S over the full width, KS and T below it; of one design GS where it is bounded, or asked."""
     S, *others = gain_panels(views, bounds=bounds)
-    most = views[0].bounded.compliance_max
-    more = [] if len(views) > 1 or most is None else [(compliance_panel(views[0], most),)]
+    bounded = len(views) == 1 and views[0].bounded.compliance_max is not None
+    more = [(compliance_panel(views[0]),)] if bounded or compliance else []
     title = "Largest singular values of S, KS and T over frequency, with their bounds"
     return Lines(((S,), tuple(others), *more), title, (3.3, *[2.7] * (1 + len(more))))
 
 
-def compliance_panel(view: LoopView, most: float) -> Panel:
-    """|GS| of the model in a band of all plants, with its bound in m/N."""
+def compliance_panel(view: LoopView) -> Panel:
+    """|GS| of the model in a band of all plants, with its bound in m/N where there is one."""
     curves, bands = of_plants(view.hz, 1e6 * view.sizes[3])
-    level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
+    most = 1e6 * (view.bounded.compliance_max or 0.0)
+    levels = (Level(most, f"compliance_max {most:g} µm/N", colour=GREY),) if most else ()
     label = f"{view.named('GS')} (µm/N)"
-    return over_hz(label, curves, view.ends, levels=(level,), bands=bands)
+    return over_hz(label, curves, view.ends, levels=levels, bands=bands)
 
 
 def margin_words(view: LoopView) -> str:

@@ -17,8 +17,8 @@ from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.structured_page import controller_blocks
-from ccd_casadi.reporting.verdict import advice
-from ccd_casadi.support.units import HZ, number, shown
+from ccd_casadi.reporting.verdict import head_of
+from ccd_casadi.support.units import HZ, number, with_unit
 
 HEIGHT = 3.0  # inches of a row
 
@@ -36,10 +36,9 @@ def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[st
         f"A controller of order {answer['controller']['order']} with a bandwidth of "
         f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}{basis}."
     )
-    head = c.Head(
-        f"Controller on {case.file}", "good" if good else "bad",
-        "verified" if good else "not verified", answer["reason"], f"{case.path.name} · {lines}",
-        lead, decision=advice(answer),
+    head = head_of(
+        f"Controller on {case.file}", good, "verified" if good else "not verified",
+        answer["reason"], f"{case.path.name} · {lines}", lead, answer,
     )  # fmt: skip
     figures = (
         c.Facts(tuple(_facts(case, answer))),
@@ -115,7 +114,7 @@ def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
          f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
         ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} µm/N", "the largest |GS|"),
         *loop_facts(answer),
-        ("Largest |KS|", shown(answer["KS_max"], "N/m", 4), ""),
+        ("Largest |KS|", with_unit(answer["KS_max"], "N/m", 4), ""),
     ]  # fmt: skip
     names = {"S_max": "S_max", "S_low": "S_low", "KS": "weighted KS", "T": "weighted T",
              "GS": "compliance_max"}  # fmt: skip

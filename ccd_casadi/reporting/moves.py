@@ -23,7 +23,7 @@ from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, number, shown, shown_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
 
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
@@ -48,25 +48,25 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
         profile, window = motion.cycle.profile, motion.motion.window
-        name, other = "with feedforward up to snap", "the move of [move]"
+        name, other = "with feedforward up to snap", ", that of [move]"
         ahead: Array | None = motion.forward
     else:
         profile, window = setpoint(LIMITS), WINDOW
         modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
-        other = "for other moves [move] of the case, or the options of robustness"
+        other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     free = free_loops(problem, theta, view.loop.controller)
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
-    several = " on every plant of the set (band; words and numbers are of the worst)"
+    several = " The band spans every plant of the set, and the numbers are of the worst."
     words = (
-        f"The move: {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
-        f"{number(1e3 * end, 4)} ms"
-        f"{several if len(loops) > 1 else ''}, "
-        f"{'without the suspension' if model.free else 'on the soft suspension'} "
-        f"({'continuous loop' if loops[0].sampling is None else 'hold and delay exact'}; {other})."
+        f"The move is {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
+        f"{number(1e3 * end, 4)} ms{other}, "
+        f"{'with rigid bodies free' if model.free else 'on the soft suspension'} and "
+        f"{'without hold and delay' if loops[0].sampling is None else 'hold and delay exact'}."
+        f"{several if len(loops) > 1 else ''}"
     )
     return ways_figure(dict(zip(ways, found, strict=True)), words)
 
@@ -126,18 +126,16 @@ def force_step(view: LoopView) -> c.Figure:
     y = 1e6 * np.array([step[1] for step in steps])
     curves, bands = of_plants(1e3 * t, y)
     panel = c.Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
-    on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
-        "the stage, until it rests"
-    )  # fmt: skip
-    words = f"A force of 1 N at the actuator moves {on}."
+    on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
+    words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
 
 
 def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    ways = {way.words: [way.move] for way in found.ways}
-    words = "The plant has its soft suspension, hold and delay are exact."
+    ways = {words: [move] for words, move in found.ways.items()}
+    words = "The plant has its soft suspension. Hold and delay are exact."
     return ways_figure(ways, words), c.Words(_limit_words(found))
 
 
@@ -156,7 +154,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     panels, force = [], []
     for large in (True, False):  # those that are flat beside the large ones by themselves
         same = [way for way in kept if (FLAT * way[2] > top) == large]
-        unit, scale = shown_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
+        unit, scale = display_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
         curves, bands = [], []
         for name, each, _, colour in same:
             error = scale * np.array([_over(time, e, _error(e)) for e in each])
@@ -177,7 +175,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
-        f"{shown(first.window, 'm')}. {words}"
+        f"{with_unit(first.window, 'm')}. {words}"
     )
     return c.Figure(lines, caption, (c.Table(("way", *FIGURES), rows), *tables_of(lines)))
 
@@ -201,13 +199,13 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     when = "does not settle" if np.isinf(settled) else (
-        f"settled after {shown(settled, 's')}" if settled > 0.0 else "never out of its window"
+        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "never out of its window"
     )  # fmt: skip
-    words = f"{name}: {when}, error of at most {shown(peak, 'm')}"
+    words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, of {shown(float(after.max()), 'm')} after the figure's end"
+    return f"{words}, after the figure's end {with_unit(float(after.max()), 'm')}"
 
 
 def _limit_words(found: OnHardware) -> str:
@@ -219,7 +217,7 @@ def _limit_words(found: OnHardware) -> str:
             "The unlimited move itself does not end in its window within the time watched: ask for "
             "more stiffness at low frequencies (compliance_max, S_low), or widen the window."
         )
-    peak = max(float(way.move.peak_force.max()) for way in found.ways[:2])
+    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
     if found.least_limit == 1.0:
         return (
             words + "Of the limits tried none below the peak force lets the move end in its window."

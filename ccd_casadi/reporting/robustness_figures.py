@@ -4,36 +4,13 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
-from ccd_casadi.drawing.svg import BLUE, CYCLE, GREY, ORANGE
-from ccd_casadi.reporting.loops import over_hz
+from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.robust.structured import StructuredBound
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
-
-
-def named(run: FinishedRun, name: str) -> str:
-    """`|S|` of a loop with one input and output, `σ_max(S)` of others."""
-    scalar = run.plant.B.shape[1] == run.plant.C.shape[0] == 1
-    return f"|{name}|" if scalar else f"σ_max({name})"
-
-
-def gains(run: FinishedRun, found: Study, caption: str) -> Figure:
-    """S and T in one panel, GS and KS in one each."""
-    hz, shown = found.hz, found.gains * np.array([[1.0], [1.0], [1e6], [1.0]])
-    ends = (float(hz[0]), float(hz[-1]))
-
-    def panel(label: str, *curves: tuple[int, str]) -> Panel:
-        drawn = tuple(Curve(hz, shown[i], name, CYCLE[k]) for k, (i, name) in enumerate(curves))
-        return over_hz(label, drawn, ends)
-
-    rows = (
-        (panel(f"{named(run, 'S')}, {named(run, 'T')} (–)", (0, "S"), (1, "T")),),
-        (panel(f"{named(run, 'GS')} (µm/N)", (2, "")), panel(f"{named(run, 'KS')} (N/m)", (3, ""))),
-    )
-    return Figure(Lines(rows, "S, T, GS and KS over frequency"), caption)
 
 
 def perturbed(run: FinishedRun, found: Study, caption: str) -> Figure:

@@ -3,15 +3,16 @@
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Chapter, Facts, Heading, Page, Table, Words
+from ccd_casadi.drawing.content import Chapter, Facts, Figure, Heading, Page, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
-from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.facts import run_name, theta_words
+from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
-from ccd_casadi.robust.perturbed import Judged, Line
+from ccd_casadi.robust.perturbed import Line, PerturbedLoop
 from ccd_casadi.robust.study import Study
-from ccd_casadi.support.units import HZ, metres, number, shown
+from ccd_casadi.support.units import HZ, metres, number, with_unit
 
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
@@ -24,30 +25,26 @@ def robustness_page(
     `own`: of the run's own controller, so that the run's decision and verdict stand on it.
     """
     lead, *others = conclusion(run, found)
+    given = "This controller is stable on every plant that was tried."
+    if not found.survives:
+        given = "Do not use this controller: it is not stable on every plant that was tried."
     head = head_of(
-        f"Robustness: {run.case.path.parent.name}", found.survives,
+        f"Robustness: {run_name(run.folder)}", found.survives,
         "stable on all plants" if found.survives else "not stable on all plants",
         "that were tried; others were not examined",
         f"{theta_words(run.result)} · seed {seed}", lead, run.result if own else {},
-        "" if own else given_decision(found),
+        "" if own else given,
     )  # fmt: skip
     chapters = (
         Chapter("In short", tuple(map(Words, others))),
         _margins(found),
-        _gains(run, found),
+        _gains(found),
         _perturbed(run, found),
         _tolerances(run, found),
         *_structured(found),
         *([_move(found)] if found.moves else []),
     )
     return Page(head, chapters, index)
-
-
-def given_decision(found: Study) -> str:
-    """Whether to use a controller that is not the run's own."""
-    if found.survives:
-        return "This controller is stable on every plant that was tried."
-    return "Do not use this controller: it is not stable on every plant that was tried."
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
@@ -133,7 +130,7 @@ def _damping(line: Line, ends: tuple[float, float]) -> str:
     return f"{stable}, within S_max from {line.within[0]:.3g} to {line.within[1]:.3g}."
 
 
-def _outcome(item: Judged) -> str:
+def _outcome(item: PerturbedLoop) -> str:
     if not item.stable:
         return "unstable"
     return f"peak of S {item.peak:.4g}, ω_b {item.bandwidth / HZ:.4g} Hz"
@@ -162,11 +159,11 @@ def _margins(found: Study) -> Chapter:
     return Chapter("Margins", (Table(head, tuple(rows)), Words(words)))
 
 
-def _gains(run: FinishedRun, found: Study) -> Chapter:
+def _gains(found: Study) -> Chapter:
     shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
-        (figures.named(run, name),
-         shown(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
+        (found.view.named(name),
+         with_unit(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
         for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
     ]  # fmt: skip
     n, d = found.noise, found.demands
@@ -182,10 +179,11 @@ def _gains(run: FinishedRun, found: Study) -> Chapter:
     )  # fmt: skip
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
-    drawn = figures.gains(
-        run, found, "Sensitivity, complementary sensitivity, position by a force at the actuators "
-        "(GS), and force by sensor noise (KS).",
-    )  # fmt: skip
+    caption = (
+        "Sensitivity, complementary sensitivity, position by a force at the actuators (GS), and "
+        "force by sensor noise (KS)."
+    )
+    drawn = Figure(figure_gains([found.view], compliance=True), caption)
     white = (Heading("White noise (one-sided density)"), Facts(facts))
     body = (drawn, Facts(tuple(tops)), *white)  # at rest: in short
     return Chapter("Disturbance and noise", body)

@@ -9,8 +9,7 @@ from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel
 from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
-from ccd_casadi.reporting.landscape import known_bandwidths
-from ccd_casadi.reporting.true_samples import Truths
+from ccd_casadi.reporting.landscape import Truths, known_bandwidths
 from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
 from surrogates.gaussian_process import TWO_SIDED_95

@@ -17,20 +17,22 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.deployment.channels import split
+from ccd_casadi.deployment.channels import scalar_channels
 from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_chapter import budget_chapter
-from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table
+from ccd_casadi.reporting.facts import binding, conclusion, design_facts, run_name, theta_table
 from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.landscape import (
+    Truths,
     bandwidth_process,
     caption_disagreement,
     caption_landscape,
     landscape_data,
+    read_truths,
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
@@ -45,7 +47,6 @@ from ccd_casadi.reporting.structured_page import (
     limits_blocks,
     structured_facts,
 )
-from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import table_trust, trust_figure
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.progress import Progress
@@ -98,11 +99,9 @@ def page_of_run(run: FinishedRun) -> c.Page:
 
 def solve_head(case: Case, result: Mapping[str, Any]) -> c.Head:
     """Of the report, drawn now."""
-    # what `ccd new` makes is named by its folder
-    named = case.path.absolute().parent.name if case.path.stem == "case" else case.path.stem
     now = datetime.now().strftime("%Y-%m-%d %H:%M")
     meta = f"{case.path.name} · {result['formulation']} formulation · {now}"
-    return run_head(f"Co-design of {named}", result, meta, conclusion(result))
+    return run_head(f"Co-design of {run_name(case.path)}", result, meta, conclusion(result))
 
 
 def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> list[Part]:
@@ -172,7 +171,7 @@ def _theta(
     iterates = solution.outcome.iterates
     process = bandwidth_process(solution.outcome.surrogates)
     best = float(solution.result["bandwidth_hz"])
-    extra = caption_disagreement(problem, process, truths, verified.theta)
+    extra = caption_disagreement(process, truths)
     if len(problem.names) == 2:
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, process, truths, radius, verified.theta)
@@ -203,7 +202,7 @@ def stage_chapters(
 def _loop(
     problem: CoDesignProblem, theta: Sequence[float], loop: LoopView, *more: c.Table
 ) -> list[c.Chapter]:
-    channels = split(scaled_plant(problem, theta), loop.loop.controller)
+    channels = scalar_channels(scaled_plant(problem, theta), loop.loop.controller)
     plots = c.Chapter("Loop, plant and controller", (bode(loop, channels),))
     if loop.bounded.asked:  # of a fixed structure
         return [c.Chapter("Closed loop on every plant", (*more, gains(loop))), plots]

@@ -8,10 +8,10 @@ from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_words import SectionWords
+from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words, gain_words
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.reporting.facts import Fact, binding, loop_facts, sensitivity_facts, value_facts
-from ccd_casadi.support.units import HZ, counted, number, shown
+from ccd_casadi.support.units import HZ, counted, number, with_unit
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
@@ -45,20 +45,21 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
         mu = kink["multipliers"]
     v = problem.figure
-    gain = "raise ω_b" if v is BANDWIDTH else f"lower the {v.words}"
-    names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S", "LEVEL": "-3 dB below ω_b",
+    most = HZ * result["bandwidth_hz"] if v is BANDWIDTH else result[f"{v.entry}_of_set"]
+    names = {"S_MAX": "The peak of S", "SHAPE": "The shape of S", "LEVEL": "-3 dB below ω_b",
              "S_LOW": "|S| at ω_low",
-             "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
+             "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "The compliance"}  # fmt: skip
     over_kappa = []
     for kind, words in names.items():
         for name in (name for name, value in mu.items() if value > 1e-6):
             own, channel = kind_and_channel(name)
             if own == kind:
                 of = f" of channel {channel}" if channel else ""
-                loosened = f"a bound looser by 1 % would {gain} by {number(mu[name], 3)} %"
-                over_kappa.append(f"{words}{of} binds; {loosened}")
+                worth = v.shown(0.01 * mu[name] * most, 3)
+                over_kappa.append(f"{words}{of} binds; 1 % more of it is worth {worth}.")
     ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
-    ends = [f"{name} is at the {end} end of its range" for name, _, end in ranges]
+    ends = [f"{name[:1].upper()}{name[1:]} is at the {end} end of its range."
+            for name, _, end in ranges]  # fmt: skip
     return [*over_theta, *over_kappa, *ends]
 
 
@@ -111,14 +112,12 @@ def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fac
         *value_facts(problem, r, "on every plant of the set"),
         ("Loop", runs, ""),
         *sensitivity_facts(problem, r),
-        *((f"Channel {own['name']}", f"peak of S {number(own['sensitivity_peak'], 6)}, "
-           f"{number(own['bandwidth_hz'], 6)} Hz", _asked_of(own))
-          for own in r.get("channel_bounds", ())),
+        *(("Channel", own["name"], channel_words(own)) for own in r.get("channel_bounds", ())),
         ("Peak of S over the box", number(robust["worst_sensitivity_peak"], 6), worst),
         ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
          r["compliance_words"]),
         *loop_facts(r),
-        ("Largest |KS|", shown(r["KS_max"], "N/m", 4), ""),
+        ("Largest |KS|", with_unit(r["KS_max"], "N/m", 4), ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),
@@ -135,17 +134,6 @@ def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fac
     ]  # fmt: skip
 
 
-def _asked_of(own: Mapping[str, Any]) -> str:
-    """The bounds of an entry of `channel_bounds`."""
-    asked = [] if own["S_max"] is None else [f"S_max = {own['S_max']:g}"]
-    if own["bandwidth_ratio"] > 1.0:
-        asked.append(f"at least {own['bandwidth_ratio']:g} ω_b")
-    if "M_K" in own:
-        unit = shown(own["M_K"], "N/m")
-        asked.append(f"|W_KS KS| {number(own['weighted_KS'], 4)} with M_K = {unit}")
-    return "; ".join(asked)
-
-
 def _over(kkt: Mapping[str, Any]) -> str:
     """Of what the residual is; runs from before kinks were known have no word of them."""
     kink = kkt.get("kink")
@@ -159,13 +147,9 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     """Gain and sections in Hz and damping; of `result` only `controller` is read."""
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
-    channels = controller.get("channels", ())
-    gains = [f"{own['name']}: gain {shown(own['gain'], 'N/m', 4)}" for own in channels]
-    if "gain" in controller:
-        gains = [f"Gain {shown(controller['gain'], 'N/m', 4)}"]
     words = (
-        f"{', '.join(gains)}, order {controller['order']}, stable but for "
-        "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
+        f"Gain {gain_words(controller)}, order {controller['order']}. Apart from the integrator, K "
+        "is stable. Every section has the gain 1 at s = 0 (the integrator's: at high frequency)."
     )
     return Words(words), structured_table(found)
 

@@ -55,8 +55,8 @@ def _caption(qualities: Sequence[Quality]) -> str:
     return (
         f"Each of the {len(qualities[0].true)} samples of the last surrogate, predicted from the "
         "others (above; on the dashed line the prediction is exact) and the difference in units of "
-        "the predicted deviation (below). Points far outside the bands, or a curve in place of a "
-        "cloud, are what a smooth surrogate cannot follow."
+        "the predicted deviation (below). Points far outside the bands, or a curve instead of a "
+        "cloud, show what a smooth surrogate cannot follow."
     )
 
 

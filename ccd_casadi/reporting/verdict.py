@@ -26,6 +26,7 @@ USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.m
 )
 SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
 OVERSHOOT = 0.5  # of a step without feedforward
+BETWEEN = 1.1  # of the largest |S| on the lines of a response: what it may reach between them
 NO_SET = "[robust] names no plant"  # as verified_structured says it
 STATUS = {
     "verified": "verified",
@@ -50,7 +51,7 @@ def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
     return tuple(found)
 
 
-def worst(result: Mapping[str, Any]) -> State:
+def worst_state(result: Mapping[str, Any]) -> State:
     """Failed before warned before passed; what is unknown counts as neither."""
     states = {line.state for line in lines_of(result)}
     return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
@@ -72,7 +73,7 @@ def head_of(
 
     `decision`: what the page answers, where that is not whether to build the design.
     """
-    clean = worst(result) is State.PASSED and not doubts(result)
+    clean = worst_state(result) is State.PASSED and not loop_concerns(result)
     badge = "bad" if not good else "good" if clean else "warn"
     decision = decision or advice(result)
     return Head(title, badge, status, reason, meta, lead, lines_of(result), decision)
@@ -87,7 +88,7 @@ def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Hea
     return head_of(title, good, status, reason, meta, lead, result)
 
 
-def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
+def with_verdict_of(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
     """A page with the decision and the verdict as they are now; of the run's own (`whole`) the
     badge too."""
     source = head_html(run_head("", result, "", ""))
@@ -103,10 +104,10 @@ def advice(result: Mapping[str, Any]) -> str:
     in the loop."""
     states = {line.name: line.state for line in lines_of(result)}
     failed = [name for name, state in states.items() if state == State.FAILED]
-    looked_at = doubts(result)
+    looked_at = loop_concerns(result)
     if not states:
         words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
-        return f"{words} Next: {NEXT['loop']}." if looked_at else ""
+        return f"{words} Next: a smaller S_max." if looked_at else ""
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
@@ -126,7 +127,7 @@ def advice(result: Mapping[str, Any]) -> str:
     )
 
 
-def doubts(result: Mapping[str, Any]) -> list[str]:
+def loop_concerns(result: Mapping[str, Any]) -> list[str]:
     """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
     and what is narrow or rings near the bandwidth, against the usual limits of the field.
 
@@ -144,6 +145,9 @@ def doubts(result: Mapping[str, Any]) -> list[str]:
             found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
         if result["settling_ms"] is None:
             found.append("a step does not settle within 160 periods of the bandwidth")
+    reach = result.get("sensitivity_peak_between_lines")  # of a measured response
+    if reach is not None and reach > BETWEEN * result["sensitivity_peak"]:
+        found.append(f"|S| may reach {reach:.3g} between two lines: measure more of them there")
     return [*found, *result.get("loop_warnings", ())]
 
 
@@ -156,5 +160,5 @@ def head_words(result: Mapping[str, Any]) -> str:
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
-        return "all checks passed" + ("; the loop needs a look" if doubts(result) else "")
+        return "all checks passed" + ("; the loop needs a look" if loop_concerns(result) else "")
     return f"with warnings: {', '.join(warned)}"

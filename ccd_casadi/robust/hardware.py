@@ -9,7 +9,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.robust.perturbed import Judged, judge, search
+from ccd_casadi.robust.perturbed import PerturbedLoop, judge, search
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool, Workers
@@ -24,9 +24,9 @@ class Tolerances:
     """Random hardware and the worst found within the tolerances; places are θ."""
 
     tolerance: float
-    judged: tuple[Judged, ...]
+    judged: tuple[PerturbedLoop, ...]
     failed: int
-    worst: Judged
+    worst: PerturbedLoop
 
     @property
     def unstable(self) -> int:
@@ -62,11 +62,11 @@ def tolerances(
     def place(x: Array) -> tuple[float, ...]:
         return tuple(float(v) for v in theta * (1.0 + tolerance * x))
 
-    def at(x: Array) -> Judged | None:
+    def at(x: Array) -> PerturbedLoop | None:
         return _hardware(run, place(x))
 
     light = replace(run, result={})
-    drawn: list[Judged | None] = [None] * samples
+    drawn: list[PerturbedLoop | None] = [None] * samples
     with Progress(samples, "hardware tolerances") as progress:
         tasks = [(i, light, place(x)) for i, x in enumerate(unit)]
         for i, item in pool.map_unordered(_hardware_unit, tasks):
@@ -82,7 +82,7 @@ def tolerances(
     return Tolerances(tolerance, kept, failed, worst)
 
 
-def _hardware(run: FinishedRun, theta: tuple[float, ...]) -> Judged | None:
+def _hardware(run: FinishedRun, theta: tuple[float, ...]) -> PerturbedLoop | None:
     """The controller on the hardware θ; None where the model makes no plant of it."""
     try:
         system = mechanics(plant_of(run.problem), theta, derivatives=False)
@@ -91,6 +91,8 @@ def _hardware(run: FinishedRun, theta: tuple[float, ...]) -> Judged | None:
         return None
 
 
-def _hardware_unit(task: tuple[int, FinishedRun, tuple[float, ...]]) -> tuple[int, Judged | None]:
+def _hardware_unit(
+    task: tuple[int, FinishedRun, tuple[float, ...]],
+) -> tuple[int, PerturbedLoop | None]:
     index, run, theta = task
     return index, _hardware(run, theta)

@@ -26,7 +26,7 @@ Ends = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Judged:
+class PerturbedLoop:
     """A plant's place among the perturbed ones, and what the loop does on it (rad/s)."""
 
     place: tuple[float, ...]
@@ -48,23 +48,23 @@ class Line:
     `stable` and `within` (S_max) are the ends, as far as the line goes, between which it does.
     """
 
-    judged: tuple[Judged, ...]
+    judged: tuple[PerturbedLoop, ...]
     stable: tuple[float, float]
     within: tuple[float, float]
 
 
-def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Judged:
+def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> PerturbedLoop:
     """The run's controller on a plant."""
     plant = scale_plant(modal, run.problem.weights.M_K)
     if run.sampling is not None:
         loop = run.loop_on(plant.plant_si()).closed.S
         f = sampled_figures(loop)
         height, growth = f.sensitivity_peak if f.stable else np.inf, float(loop.rates.real.max())
-        return Judged(place, f.stable, f.bandwidth, height, growth)
+        return PerturbedLoop(place, f.stable, f.bandwidth, height, growth)
     figures = run.measured(plant, run.controller)
     stable = figures.certificate.stable
     peak = figures.sensitivity_peak if stable else np.inf
-    return Judged(place, stable, figures.bandwidth, peak, figures.certificate.max_real_pole)
+    return PerturbedLoop(place, stable, figures.bandwidth, peak, figures.certificate.max_real_pole)
 
 
 def system_of(run: FinishedRun) -> Mechanics:
@@ -112,7 +112,7 @@ def _line(
     return Line(tuple(judged), stable, within)
 
 
-def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Judged, ...]:
+def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[PerturbedLoop, ...]:
     """Every flexible mode that the loop drives and sees, alone, shifted by ±reach.
 
     Places are (frequency in Hz, shift).
@@ -131,11 +131,11 @@ def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Jud
 
 def worst_in_box(
     run: FinishedRun, system: Mechanics, reach: float, damping: tuple[float, float]
-) -> Judged:
+) -> PerturbedLoop:
     """The worst (shift, damping factor) of the box: a grid, then a local search from its worst."""
     low, high = np.array([-reach, np.log(damping[0])]), np.array([reach, np.log(damping[1])])
 
-    def at(x: Array) -> Judged:
+    def at(x: Array) -> PerturbedLoop:
         s, d = float(x[0]), float(np.exp(x[1]))
         return judge(run, modal_plant(system, run.problem.suspension, Perturbation(s, d)), (s, d))
 
@@ -145,10 +145,14 @@ def worst_in_box(
 
 
 def search(
-    at: Callable[[Array], Judged | None], starts: list[Array], low: Array, high: Array, label: str
-) -> Judged:
+    at: Callable[[Array], PerturbedLoop | None],
+    starts: list[Array],
+    low: Array,
+    high: Array,
+    label: str,
+) -> PerturbedLoop:
     """The worst of the starts, and of a bounded Nelder and Mead search from the worst of them."""
-    found: list[tuple[Array, Judged]] = []
+    found: list[tuple[Array, PerturbedLoop]] = []
 
     progress = Progress(len(starts) + SEARCH, label)
 

@@ -46,7 +46,7 @@ def sampled_figures(S: StateSpace) -> SampledFigures:
     return SampledFigures(True, radius, peak, float(_from_w(S, at)), _bandwidth(S, over_w))
 
 
-def together(parts: Sequence[SampledFigures]) -> SampledFigures:
+def worst_figures(parts: Sequence[SampledFigures]) -> SampledFigures:
     """The figures of a loop that is these, side by side: the worst of each."""
     top = max(parts, key=lambda f: f.sensitivity_peak)
     stable = all(f.stable for f in parts)

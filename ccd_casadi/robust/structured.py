@@ -28,7 +28,6 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.mu_bound import mu_bound
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.closed_loop import responses
 
 KAPPA = (0.0, 10.0, 3.0, 1.0)  # a larger one asks for a finer grid
 SEEN = 1e-9  # share of the strongest residue under which a mode is in no loop
@@ -74,7 +73,7 @@ def structured_bound(
     known = np.empty((0, 2))
     allowed, worst = 1.0, float(new[0])  # |δ| = 1 leaves no stiffness
     for _ in range(1 + ROUNDS):
-        K = responses(plant, controller, 2.0 * np.pi * new)[1]
+        K = controller.response(2.0 * np.pi * new)
         M = np.array(
             [_errors(modal, kept, 2.0 * np.pi * f, k) for f, k in zip(new, K, strict=True)]
         )

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import loop_view
+from ccd_casadi.analysis.loop_view import LoopView, loop_view
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
@@ -19,8 +19,8 @@ from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
 from ccd_casadi.robust.perturbed import (
-    Judged,
     Line,
+    PerturbedLoop,
     damping_line,
     shift_line,
     single_modes,
@@ -31,7 +31,7 @@ from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import progress_shown
+from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics, statics
 
@@ -40,8 +40,8 @@ NYQUIST = 0.999  # of half the sampling rate: where a grid ends
 
 @dataclass(frozen=True)
 class Study:
-    """The results; `gains` are σ_max of S, T, GS, KS over `hz`, `peaks` their largest values with
-    the frequencies in rad/s (0: at rest), which the grid does not decide; `moves` the move without
+    """The results; `peaks` are the largest values of σ_max of S, T, GS and KS with the frequencies
+    in rad/s (0: at rest), which the grid of the `view` does not decide; `moves` the move without
     and with feedforward.
 
     `structured` is None where no flexible mode is in the loop, and of a controller in discrete
@@ -49,16 +49,15 @@ class Study:
     """
 
     demands: Demands
-    hz: Array
-    gains: Array
+    view: LoopView
     peaks: tuple[tuple[float, float], ...]
     margins: Margins
     noise: Noise
     statics: Statics
     shift: Line
     damping: Line
-    modes: tuple[Judged, ...]
-    box: Judged
+    modes: tuple[PerturbedLoop, ...]
+    box: PerturbedLoop
     tolerances: Tolerances
     structured: StructuredBound | None
     setpoint: Setpoint
@@ -94,7 +93,7 @@ def robustness(
     Study
         The content of robustness.json.
     """
-    with progress_shown(not quiet):
+    with kept_quiet(quiet):
         return _study(run, demands or Demands(), seed, workers)
 
 
@@ -102,17 +101,16 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
     sampled = loop.sampling is not None
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
-    hz = loop_view([loop], bounded, bandwidth_hz=run.figures.bandwidth / HZ).hz
-    if loop.sampling is not None:
-        hz = np.append(hz, NYQUIST * 0.5 / loop.sampling.period)
+    view = loop_view([loop], bounded, bandwidth_hz=run.figures.bandwidth / HZ)
+    ends = [] if loop.sampling is None else [NYQUIST * 0.5 / loop.sampling.period]
+    hz = np.append(view.hz, ends)
 
     def sizes(omega: Array) -> Array:
         return gains(*loop.responses(omega))
 
     return Study(
         demands=d,
-        hz=hz,
-        gains=sizes(HZ * hz),
+        view=view,
         peaks=highest(sizes, HZ * hz) if sampled else norms(loop.closed),
         margins=margins(loop.responses, hz),
         noise=noise(loop, d.sensor, d.disturbance),
@@ -121,7 +119,6 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
             run.controller,
             bandwidth=run.figures.bandwidth,
             omega_low=run.problem.inner.omega_low,
-            period=0.0 if run.sampling is None else run.sampling.period,
         ),
         shift=shift_line(run, system, d.shift),
         damping=damping_line(run, system, *d.damping),
@@ -258,7 +255,7 @@ def _disk(margin: DiskMargin) -> dict[str, float]:
     return vars(margin) | {"gain": margin.gain, "phase_deg": margin.phase_deg}
 
 
-def _judged(item: Judged, *places: str) -> dict[str, Any]:
+def _judged(item: PerturbedLoop, *places: str) -> dict[str, Any]:
     """Its figures, after the first of its places by these names."""
     return dict(zip(places, item.place, strict=False)) | {
         "stable": item.stable,

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from ccd_casadi.inner_problem.problem import NUMERICS
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool, Workers
-from ccd_casadi.support.worker_process import R, T, WorkerLost, answered
+from ccd_casadi.support.worker_process import R, T, WorkerLost, answer_message
 
 CONNECT_SECONDS = 10.0  # for the scheduler to answer at first, and for a worker to be there
 CLOSE_SECONDS = 1.0  # for a farewell that nobody needs: Ctrl-C ends within 2 s
@@ -158,4 +158,4 @@ def serve(numerics: int, message: bytes) -> bytes:
     if numerics != NUMERICS:
         raise RuntimeError(f"the worker's numerics are version {NUMERICS}, ours are {numerics}")
     with _one_at_a_time, threadpool_limits(limits=1):
-        return answered(message)
+        return answer_message(message)

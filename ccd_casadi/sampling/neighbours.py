@@ -29,7 +29,7 @@ TRIES = 2  # climbs from neighbours, of a sample, that may be in vain
 Theta = tuple[float, ...]
 
 
-def begun(
+def with_warm_start(
     problem: CoDesignProblem, known: Iterable[BandwidthSample], theta: Theta
 ) -> CoDesignProblem:
     """The problem with the neighbour's controller that promises most at a new θ as an anchor."""

@@ -18,7 +18,7 @@ from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.sampling.neighbours import alone, begun, promised
+from ccd_casadi.sampling.neighbours import alone, promised, with_warm_start
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import (
     BandwidthSample,
@@ -27,7 +27,7 @@ from ccd_casadi.sampling.samples import (
     quantity_sample,
     sample_of,
 )
-from ccd_casadi.sampling.spent import Spent
+from ccd_casadi.sampling.spent import SynthesisCounts
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import design_unit, inner_unit
 from ccd_casadi.support.arrays import Array
@@ -68,7 +68,7 @@ class Sampler:
         self.quiet = quiet
         self.hash, self.inner_hash = hashes_of(problem)
         store.put_problem(self.hash, problem.identity())
-        self.spent = Spent()
+        self.spent = SynthesisCounts()
         self.trace: list[TraceEntry] = []
         self.nearest: BandwidthSample | None = None  # of the infeasible ones
         self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # the best at each θ asked for
@@ -107,7 +107,7 @@ class Sampler:
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]
         known, before = list(self.solved.values()), len(self.trace)
         new = [theta for theta in points if theta not in self.solved]
-        self._solve({theta: begun(self.problem, known, theta) for theta in new}, label)
+        self._solve({theta: with_warm_start(self.problem, known, theta) for theta in new}, label)
         self._raise()
         self.report(before)
         return [self.solved[theta] for theta in points]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.sampling.rows import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
@@ -13,17 +14,12 @@ from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 @dataclass(frozen=True)
-class BandwidthSample:
-    """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible.
+class BandwidthSample(InnerValue):
+    """With where it is reached, and what binds.
 
-    An infeasible one says what falls short, and by how much (ln) at least: `violation`. With
-    `error`, the least RMS error in m or time of a move in s, the gradient is of that, and ω_b that
-    of its controller.
+    An infeasible one says what falls short, and by how much (ln) at least: `violation`.
     """
 
-    theta: tuple[float, ...]
-    bandwidth: float
-    gradient: tuple[float, ...]
     omega_S: float
     omega_T: float
     active: tuple[str, ...]
@@ -31,7 +27,6 @@ class BandwidthSample:
     violation: float
     syntheses: int
     kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
-    error: float | None = None
 
     @property
     def x(self) -> tuple[float, ...]:
@@ -42,16 +37,6 @@ class BandwidthSample:
     def joint(self) -> Array:
         """(θ, ln ω_S, ln ω_T)."""
         return np.array([*self.theta, np.log(self.omega_S), np.log(self.omega_T)])
-
-    @property
-    def value(self) -> float:
-        """What J counts: the error where the inner problem is of that, else ω_b*."""
-        return self.bandwidth if self.error is None else self.error
-
-    @property
-    def feasible(self) -> bool:
-        """Whether a certified design meets the constraints at θ."""
-        return bool(np.isfinite(self.bandwidth))
 
 
 @dataclass(frozen=True)
@@ -96,7 +81,7 @@ def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample
     given = nothing | {key: value for key, value in payload.items() if value is not None}
     given |= {"theta": theta, "gradient": [np.nan if v is None else v for v in gradient]}
     sample: BandwidthSample = restored(BandwidthSample, given)
-    sizes = [1.0 if sample.error is None else sample.error]
+    sizes = [1.0 if payload.get("error") is None else sample.error]
     if payload["bandwidth"] is not None:
         sizes += [sample.bandwidth]
         sizes += [] if "kappa" in payload else [sample.omega_S, sample.omega_T]

@@ -8,7 +8,7 @@ from typing import Any
 SHOWN = {"races": "multi-start searches", "box_look": "global check"}
 
 
-class Spent:
+class SynthesisCounts:
     """Counts of true syntheses; `purpose` is what is being done."""
 
     def __init__(self) -> None:
@@ -58,9 +58,10 @@ def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]
     return {"syntheses": total, "syntheses_to_optimum": total - beside, "spent": dict(spent)}
 
 
-def was_moved(result: Mapping[str, Any]) -> bool:
-    """Whether a run's design is one that the global check over the box led to."""
-    return bool(result.get("box_look", {}).get("moved"))
+def with_all_spent(result: Mapping[str, Any], spent: Mapping[str, int]) -> dict[str, Any]:
+    """A result of a run of several searches with what all of them took."""
+    moved = bool(result.get("box_look", {}).get("moved"))  # the global check led to the design
+    return {**result, **spent_entry(spent, moved)}
 
 
 def cost_words(result: Mapping[str, Any]) -> str:

@@ -23,12 +23,13 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_p
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
+from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.derivatives import Sensitivities
-from ccd_casadi.synthesis.synthesis import DesignFigures, sweep, synthesise
+from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 
 LOCAL_POINTS = (7, 7)
 LOCAL_FACTOR = 1.25  # the small range reaches from ω/1.25 to 1.25 ω
@@ -118,13 +119,8 @@ class MixedBaseline(Baseline):
         return Figures(figures_dict(found), inner.feasible(found), found.bandwidth, active)
 
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
-        problem, figures = self.problem, design.figures
-        plant = scaled_plant(problem, theta)
-        made = synthesise(
-            plant, problem.weights.at(figures.omega_S, figures.omega_T),
-            omega_low=problem.inner.omega_low, gamma_backoff=problem.inner.gamma_backoff,
-        )  # fmt: skip
-        return made.controller
+        at = (design.figures.omega_S, design.figures.omega_T)
+        return final_design(self.problem, theta, at).controller
 
 
 class StructuredBaseline(Baseline):

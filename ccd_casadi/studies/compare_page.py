@@ -13,11 +13,10 @@ from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
-from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data
+from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths
 from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.solve_page import stage_chapters
-from ccd_casadi.reporting.true_samples import read_truths
-from ccd_casadi.reporting.verdict import lines_of, worst
+from ccd_casadi.reporting.verdict import lines_of, worst_state
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.conclusions import LABELS
@@ -62,7 +61,7 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     ]
     ours = [method.figures for method in comparison.methods if method.solution]
     verified = all(figures["status"] == "verified" for figures in ours)
-    warned = any(worst(figures) is not State.PASSED for figures in ours)
+    warned = any(worst_state(figures) is not State.PASSED for figures in ours)
     head = Head(
         f"Comparison: {comparison.case.path.name}",
         "bad" if not verified else "warn" if warned else "good",

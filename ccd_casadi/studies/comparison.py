@@ -25,7 +25,7 @@ from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.studies.published import PUBLISHED
 from ccd_casadi.studies.sequential import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.studies.steepest_descent import Descent, steepest_descent
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
@@ -186,7 +186,7 @@ def _best_descent(
     if best.design is None:
         figures = {"status": "infeasible", "reason": best.stop.value}
         figures |= spent_entry({"descent": best.syntheses})
-        return Method(name, clean(figures | extra), (), (), descent=best)
+        return Method(name, json_values(figures | extra), (), (), descent=best)
     theta = best.iterates[-1].theta
     spent = {"descent": best.syntheses}
     figures = _figures(problem, theta, best.design, spent, best.seconds) | extra
@@ -196,7 +196,7 @@ def _best_descent(
     )
     path = tuple(item.theta for item in best.iterates)
     made = baseline_of(problem).controller(theta, best.design)
-    return Method(name, clean(figures), path, trace, descent=best, controller=made)
+    return Method(name, json_values(figures), path, trace, descent=best, controller=made)
 
 
 def _run_dict(descent: Descent) -> dict[str, Any]:
@@ -229,7 +229,7 @@ def _sequential(given: _Setting, name: str, starts: int) -> Method:
     figures = _figures(problem, hardware.theta, design, spent, perf_counter() - began)
     figures |= {"resonance_met": hardware.met, "active": list(sample.active)}
     made = baseline.controller(hardware.theta, design)
-    return Method(name, clean(figures), (hardware.theta,), trace, controller=made)
+    return Method(name, json_values(figures), (hardware.theta,), trace, controller=made)
 
 
 def _figures(
@@ -266,7 +266,7 @@ def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
     """compare.json."""
     model = comparison.problem.source.model or ""
     entries = {method.name: method.figures for method in comparison.methods}
-    return clean(
+    return json_values(
         {
             "case": str(comparison.case.path),
             "methods": entries,

@@ -15,20 +15,18 @@ from ccd_casadi.cases.case import Case
 from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.run import outer_of
-from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.studies.sequential import design_hardware, first_resonance
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ, number
 from surrogates import design, to_casadi
 
 SLOW = 0.3  # seconds of processor time of a plant at a θ: finite elements
-LOOKS, LOOKS_SLOW = 8, 2  # true inner problems over the box for each parameter
+LOOKS, LOOKS_SLOW = 8, 1  # true inner problems over the box for each parameter
 STARTS, STARTS_SLOW = 8, 0  # of IPOPT on the hardware, besides the case's own
 ROUNDS = 12  # of surrogate, IPOPT and truth, at most
 SETTLED = 1e-3  # of |J|: a round that gains less, as expected, is the last
@@ -55,11 +53,14 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     looks = (LOOKS_SLOW if slow else LOOKS) * len(problem.names)
     known = sampler.bandwidths(np.array([hardware.theta, problem.start]), "first designs")
     known += sampler.bandwidths(design("sobol", *box(problem), looks, seed), "global check")
-    best = min(known, key=lambda sample: _value(problem, sample))
+    best = min(known, key=lambda sample: objective_of(problem, sample))
     missed: list[float] = []
     settled = False
     while not settled and len(missed) < ROUNDS:
-        before, learnt = _value(problem, best), [sample for sample in known if sample.feasible]
+        before, learnt = (
+            objective_of(problem, best),
+            [sample for sample in known if sample.feasible],
+        )
         if len(learnt) <= len(problem.names):
             words = f"only {len(learnt)} of {len(known)} designs in the box were certified"
             raise UserError(f"no trade-off can be learnt: {words}; widen the bounds")
@@ -74,12 +75,12 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         missed.append(
             abs(process.predict(expected.x[None])[0] - new.value) if new.feasible else 0.0
         )
-        best = min(best, new, key=lambda sample: _value(problem, sample))
-        level = SETTLED * abs(_value(problem, best))
-        true = abs(_value(problem, new) - expected.objective) <= level
-        settled = new in known or (true and before - _value(problem, best) <= level)
+        best = min(best, new, key=lambda sample: objective_of(problem, sample))
+        level = SETTLED * abs(objective_of(problem, best))
+        true = abs(objective_of(problem, new) - expected.objective) <= level
+        settled = new in known or (true and before - objective_of(problem, best) <= level)
         known.append(new)
-    if not np.isfinite(_value(problem, best)):
+    if not np.isfinite(objective_of(problem, best)):
         raise UserError(f"no feasible design was found: {known[0].shortfall}")
     entries: list[dict[str, Any]] = [
         {
@@ -106,12 +107,6 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         "syntheses": sampler.syntheses,
         "seconds": perf_counter() - began,
     }
-
-
-def _value(problem: CoDesignProblem, sample: BandwidthSample) -> float:
-    """J; infinite where the design is not feasible."""
-    good = sample.feasible and not unmet(problem, sample.theta)
-    return objective(problem, sample.theta, sample.value) if good else np.inf
 
 
 def worth_words(found: Mapping[str, Any]) -> list[str]:

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.interrupts import pending
+from ccd_casadi.support.interrupts import ctrl_c_pending
 
 
 class _Dense(ca.Callback):
@@ -57,7 +57,7 @@ class VectorCallback(_Dense):
         self._derivative: ca.Callback | None = None
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
-        if pending():  # NaN ends IPOPT quickly; the interrupt is raised when it has returned
+        if ctrl_c_pending():  # NaN ends IPOPT quickly; the interrupt is raised when it has returned
             return [np.full(self._sizes[0], np.nan)]
         return super().eval(arguments)
 

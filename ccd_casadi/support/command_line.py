@@ -12,16 +12,14 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.interrupts import begun, ctrl_c_noticed, was_ctrl_c
+from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
+from ccd_casadi.support.options import DEFAULT_CASE, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
-from ccd_casadi.support.options import Parser, one_line, usable_cores, whole
-from ccd_casadi.support.progress import progress_shown
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import kept_quiet, say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
 
-DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
@@ -68,12 +66,14 @@ def run_parser(
 
     add("--out", "the folder to write into", metavar="DIR", type=_folder)
     add(
-        "--workers", "worker processes (default: all cores)", metavar="N", type=whole(1),
+        "--workers", "worker processes (default: all cores)", metavar="N", type=integer(1),
         default=usable_cores(),
     )  # fmt: skip
-    add("--seed", "seed of all random numbers (default: 0)", metavar="N", type=whole(0), default=0)
+    add(
+        "--seed", "seed of all random numbers (default: 0)", metavar="N", type=integer(0), default=0
+    )
     add("--quiet", "print no progress and no summary", action="store_true")
-    words = "refuse a case whose plant is a Python function, which is code of its author"
+    words = "refuse a case whose plant is a Python function"
     add("--no-user-code", words, action="store_true")
     return result
 
@@ -102,21 +102,21 @@ def run(
     try:
         options = arguments.parse_args(argv)
     except SystemExit as ended:  # after --help or a wrong option
-        begun()
+        raise_on_ctrl_c()
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
     for module in needs:
         import_module(module)
-    begun()
+    raise_on_ctrl_c()
     try:
         # One BLAS thread: the matrices are small, and results must not depend on the cores.
         with (
             threadpool_limits(limits=1),
             threads_permitted(getattr(options, "workers", 1)),
             permit_user_code(not options.no_user_code),
-            progress_shown(not options.quiet),
+            kept_quiet(options.quiet),
             ctrl_c_noticed(),
         ):
             code = main(options)

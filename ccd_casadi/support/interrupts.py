@@ -29,13 +29,13 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(130)
 
 
-def starting() -> None:
+def exit_on_ctrl_c() -> None:
     """Let Ctrl-C end the process at once, unless somebody handles or ignores it."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 
 
-def begun() -> None:
+def raise_on_ctrl_c() -> None:
     """Let Ctrl-C raise KeyboardInterrupt again."""
     if signal.getsignal(signal.SIGINT) is _leave:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -109,7 +109,7 @@ def was_ctrl_c(error: BaseException | None) -> bool:
     return False
 
 
-def pending() -> bool:
+def ctrl_c_pending() -> bool:
     """Whether Ctrl-C was pressed since the current solve began: end what is under way soon."""
     return _kept.is_set()
 

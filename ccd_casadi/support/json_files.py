@@ -12,15 +12,15 @@ from surrogates.files import write_whole
 
 def write_json(path: Path, value: Any) -> None:
     """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
-    write_whole(path, json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(json_values(value), indent=2, allow_nan=False) + "\n")
 
 
-def clean(value: Any) -> Any:
+def json_values(value: Any) -> Any:
     """Plain JSON values: tuples to lists, NumPy scalars to numbers, what is not finite to None."""
     if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
+        return {str(key): json_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
+        return [json_values(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 
-class Shown:
+class NotebookHtml:
     """Base of what a notebook shows as more than its `repr`.
 
     How is far above most of these classes: the package sets `drawn` (an object to HTML).
@@ -14,7 +14,7 @@ class Shown:
     drawn: ClassVar[Callable[[object], str] | None] = None
 
     def _repr_html_(self) -> str | None:
-        return None if Shown.drawn is None else Shown.drawn(self)
+        return None if NotebookHtml.drawn is None else NotebookHtml.drawn(self)
 
 
 def in_notebook(stream: object) -> bool:

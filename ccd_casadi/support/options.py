@@ -10,6 +10,7 @@ from typing import NoReturn
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
+DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 LONGEST = 1000  # characters of a line: somebody else's message in it may have millions
 
 
@@ -66,10 +67,10 @@ class Parser(argparse.ArgumentParser):
         self.exit(ExitCode.BAD_INPUT, f"{one_line(message)}; see {self.prog} --help\n")
 
 
-def whole(least: int, most: int = 999_999_999) -> Callable[[str], int]:
+def integer(least: int, most: int = 999_999_999) -> Callable[[str], int]:
     """Return the type of an option that is a whole number from `least` to `most`.
 
-    >>> whole(1)("12")
+    >>> integer(1)("12")
     12
     """
 
@@ -83,14 +84,14 @@ def whole(least: int, most: int = 999_999_999) -> Callable[[str], int]:
     return convert
 
 
-def number(
+def real(
     least: float = 0.0, most: float = math.inf, *, strict: bool = False
 ) -> Callable[[str], float]:
     """Return the type of an option that is a finite number from `least` to `most`.
 
     `strict` leaves the bounds out.
 
-    >>> number(0.0, strict=True)("2.5")
+    >>> real(0.0, strict=True)("2.5")
     2.5
     """
     words = f"number above {least:g}" if strict else f"number from {least:g}"
@@ -110,7 +111,7 @@ def number(
     return convert
 
 
-positive = number(strict=True)
+positive = real(strict=True)
 
 
 def add_break_frequencies(arguments: argparse.ArgumentParser, words: str) -> None:

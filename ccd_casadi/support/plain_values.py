@@ -72,7 +72,8 @@ def restored(kind: Any, data: Any) -> Any:
         named = {cast(Any, item).__name__: item for item in args if is_dataclass(item)}
         if data is None and NoneType in args:
             return None
-        one = named[data[""]] if named else next(item for item in args if item is not NoneType)
+        alone = len(named) < 2  # then its name is not looked at: it may have had another
+        one = next(item for item in args if item is not NoneType) if alone else named[data[""]]
         return restored(one, data)
     if origin is tuple:
         endless = args[1:] == (...,)

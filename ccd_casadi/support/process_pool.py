@@ -78,13 +78,10 @@ class Workers:
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
     ) -> Generator[R, None, None]:
-        """Results as they complete. A task whose worker dies is tried once more, in a new one.
+        """As `Pool` says. A task whose worker dies is tried once more, in a new one.
 
-        A worker holds one task, and has its next before a result is handed out. Leaving the
-        loop early ends what is in flight.
-
-        Raises WorkerLost where a task's worker dies again, whatever `function` raises (with the
-        worker's traceback as a note), and RuntimeError where another map is not yet finished.
+        A worker holds one task, and has its next before a result is handed out. Raises RuntimeError
+        where another map is not yet finished.
         """
         if self.count == 1 or len(tasks) <= 1:
             for task in tasks:

@@ -7,34 +7,19 @@ notebook it is on stdout, since stderr is painted there as a failure.
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-from types import TracebackType
 from typing import Self, TextIO
 
 from ccd_casadi.support.notebook import in_notebook
-from ccd_casadi.support.terminal import columns
+from ccd_casadi.support.terminal import QUIET, columns
 
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
-_shown: ContextVar[bool] = ContextVar("progress_shown", default=True)
-
-
-@contextmanager
-def progress_shown(yes: bool) -> Iterator[None]:
-    """Within the block bars are shown, or (--quiet) not; outside of any they are."""
-    token = _shown.set(yes)
-    try:
-        yield
-    finally:
-        _shown.reset(token)
 
 
 class Progress:
     """`with Progress(total, label) as bar: bar.advance()`; nothing is printed if quiet or empty.
 
-    `quiet`: by default as `progress_shown` says.
+    `quiet`: by default as `kept_quiet` says.
 
     On a terminal, and in a notebook's cell, one line is rewritten a few times a second; elsewhere
     a plain line is printed every few seconds and at the end. Work that ends before its total ends
@@ -48,7 +33,7 @@ class Progress:
         self.total, self.label, self.note = total, label, ""
         cell = in_notebook(sys.stdout)
         self.stream = stream or (sys.stdout if cell else sys.stderr)
-        self.silent = (not _shown.get() if quiet is None else quiet) or total <= 0
+        self.silent = (QUIET.get() if quiet is None else quiet) or total <= 0
         self.cell = in_notebook(self.stream)
         self.terminal = not self.silent and (self.cell or self.stream.isatty())
         self.interval = (0.25 if self.cell else 0.1) if self.terminal else 5.0
@@ -60,10 +45,7 @@ class Progress:
             self._show(end="")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:  # fmt: skip
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None and self.done:
             single, self.total = self.total == 1, self.done
             if single and not self.cell:

@@ -4,12 +4,16 @@ import os
 import re
 import sys
 import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TextIO
 
 WIDTH = 100  # characters of a line at most, and where no terminal is
 LABEL = re.compile(r"\s*(\S+( \S+)*?\s{2,})?((passed|warned|failed|unknown)\s{2,})?")
 
 COLOURS = {"passed": 32, "verified": 32, "warned": 33, "failed": 31, "not_verified": 31}
+QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 STATE = re.compile(rf"^(\w+\s{{2,}})({'|'.join(COLOURS)})\b")
 
 
@@ -47,10 +51,26 @@ def coloured(line: str) -> str:
 
 
 def say(text: str, stream: TextIO | None = None) -> None:
-    """Print lines; a stream that is no terminal gets them as they are."""
-    stream = stream or sys.stdout
+    """Print lines, "us" and "um" in all of them; a stream that is no terminal gets them whole."""
+    stream, text = stream or sys.stdout, text.replace("µ", "u")
     if stream.isatty():
         text = "\n".join(coloured(wrapped(line, columns(stream))) for line in text.split("\n"))
         if stream is sys.stderr:  # where a bar may stand
             text = f"\r\x1b[2K{text}"
     print(text, file=stream, flush=True)
+
+
+def inform(text: str, stream: TextIO | None = None) -> None:
+    """As `say`, unless `kept_quiet` (--quiet) forbids what is no answer and no mistake."""
+    if not QUIET.get():
+        say(text, stream)
+
+
+@contextmanager
+def kept_quiet(yes: bool) -> Iterator[None]:
+    """Within the block `inform` and progress bars print nothing, or (`yes` False) do."""
+    token = QUIET.set(yes)
+    try:
+        yield
+    finally:
+        QUIET.reset(token)

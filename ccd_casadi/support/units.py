@@ -7,15 +7,15 @@ HZ = 2.0 * math.pi  # rad/s in one hertz
 LARGE = (("G", 1e-9), ("M", 1e-6), ("k", 1e-3))
 
 
-def shown_unit(unit: str, largest: float) -> tuple[str, float]:
+def display_unit(unit: str, largest: float) -> tuple[str, float]:
     """The unit to show values up to this size in, and the factor to it: the one rule for the eye.
 
     Lengths, times, forces and stiffnesses get the SI prefix with which the largest is 1 or more;
     what has another unit keeps it.
 
-    >>> shown_unit("m", 4e-3), shown_unit("s", 2e-5), shown_unit("kg", 4e-3)
+    >>> display_unit("m", 4e-3), display_unit("s", 2e-5), display_unit("kg", 4e-3)
     (('mm', 1000.0), ('µs', 1000000.0), ('kg', 1.0))
-    >>> shown_unit("N/m", 3.6e7)
+    >>> display_unit("N/m", 3.6e7)
     ('MN/m', 1e-06)
     """
     if unit in ("N", "N/m") and abs(largest) >= 1e4:
@@ -29,13 +29,13 @@ def shown_unit(unit: str, largest: float) -> tuple[str, float]:
     return f"n{unit}", 1e9
 
 
-def shown(value: float, unit: str, digits: int = 3) -> str:
+def with_unit(value: float, unit: str, digits: int = 3) -> str:
     """A value in the unit that an engineer would read it in.
 
-    >>> shown(4.1e-5, "m"), shown(0.01, "m"), shown(0.18, "s"), shown(0.0, "m")
+    >>> with_unit(4.1e-5, "m"), with_unit(0.01, "m"), with_unit(0.18, "s"), with_unit(0.0, "m")
     ('41 µm', '10 mm', '180 ms', '0 m')
     """
-    read, factor = shown_unit(unit, value)
+    read, factor = display_unit(unit, value)
     return f"{number(factor * value, digits)} {read}"
 
 
@@ -45,7 +45,7 @@ def metres(value: float, digits: int = 3) -> str:
     >>> metres(4.1e-5), metres(-2.5e-10)
     ('41 um', '-0.25 nm')
     """
-    return shown(value, "m", digits).replace("µ", "u")
+    return with_unit(value, "m", digits).replace("µ", "u")
 
 
 def counted(number: int, noun: str) -> str:
@@ -60,8 +60,8 @@ def counted(number: int, noun: str) -> str:
 def number(value: Any, digits: int = 5) -> str:
     """A number to `digits` significant digits; a dash where there is none.
 
-    >>> number(72.0451741), number(1.5e-9, 3), number(None), number(1800.0)
-    ('72.045', '1.5e-09', '–', '1800')
+    >>> number(72.0451741), number(1.5e-9, 3), number(None), number(1800.0), number(999.6, 3)
+    ('72.045', '1.5e-09', '–', '1800', '999.6')
     """
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "–"
@@ -72,5 +72,5 @@ def number(value: Any, digits: int = 5) -> str:
     size = abs(float(value))
     if 1.0 <= size < 1e7:
         # never fewer digits than the whole part has: 110023 stays 110023
-        digits = max(digits, len(str(int(size))))
+        digits = max(digits, len(str(round(size))))
     return f"{float(value):.{digits}g}"

@@ -75,7 +75,9 @@ def time_limit(seconds: float, error: UserError) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def limited(function: Callable[..., Any], seconds: float, late: UserError) -> Callable[..., Any]:
+def with_time_limit(
+    function: Callable[..., Any], seconds: float, late: UserError
+) -> Callable[..., Any]:
     """The function with a time limit on every call, and with no way out but a value or an error.
 
     Raises `late` after so many seconds, and UserError where the function would end the process

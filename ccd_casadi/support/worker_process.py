@@ -177,10 +177,10 @@ def _serve(pipe: connection.Connection, module: str) -> None:
     import_module(module)
     with suppress(EOFError, OSError):
         while True:
-            pipe.send_bytes(answered(pipe.recv_bytes()))
+            pipe.send_bytes(answer_message(pipe.recv_bytes()))
 
 
-def answered(message: bytes) -> bytes:
+def answer_message(message: bytes) -> bytes:
     """The pickled (True, result) or (False, exception) of a pickled (function, task)."""
     try:
         function, task = pickle.loads(message)  # of the parent, through our pipe

@@ -75,24 +75,21 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
         words = "of the model alone, without an input disturbance"
         raise UserError(f"inputs are chosen by the mixed sensitivity {words}; leave these out")
     squared: dict[tuple[int, ...], float] = {}
-    rows, most, least = [np.append(np.ones(m), 0.0)], [float(count)], np.inf
-    free = Bounds(np.zeros(m + 1), np.append(np.ones(m), np.inf))  # of (z, γ²)
-    z = np.full(m, count / m)  # in equal parts, for a first bound
+    rules = [LinearConstraint(np.append(np.ones(m), 0.0), count, count)]  # on (z, γ²)
+    z, least = np.full(m, count / m), np.inf  # in equal parts, for a first bound
     while True:
         at = np.maximum(z, ABSENT)
         value, slope = _squared(plant, weights, at)
         if np.isfinite(value):
-            rows.append(np.append(slope, -1.0))
-            most.append(float(slope @ at) - value)
+            below = float(slope @ at) - value
+            rules.append(LinearConstraint(np.append(slope, -1.0), -np.inf, below))
         if z.max() == 1.0:
             squared[tuple(np.flatnonzero(z).tolist())] = value
-            rows.append(np.append(z, 0.0))  # and no more of this choice
-            most.append(count - 0.5)
+            rules.append(LinearConstraint(np.append(z, 0.0), -np.inf, count - 0.5))  # not again
             least = np.nanmin([least, value])
-        low = np.where(np.arange(len(rows)) == 0, count, -np.inf)
         found = milp(
-            np.append(np.zeros(m), 1.0), integrality=free.ub < np.inf, bounds=free,
-            constraints=LinearConstraint(np.array(rows), low, most), options={"mip_rel_gap": 0.0},
+            np.eye(m + 1)[m], integrality=np.arange(m + 1) < m, constraints=rules,
+            bounds=Bounds(0.0, np.append(np.ones(m), np.inf)), options={"mip_rel_gap": 0.0},
         )  # fmt: skip
         if found.x is None or found.fun >= least * (1.0 - SAME):
             break

@@ -6,8 +6,6 @@ import numpy as np
 
 from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Figure
-from ccd_casadi.kernels.frequency import prepare, response
-from ccd_casadi.lti.closed_loop import sensitivity
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -59,18 +57,6 @@ def handed_out(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
     if again.certified and abs(again.bandwidth / made.figures.bandwidth - 1.0) <= ROUNDING:
         return made
     return replace(made, figures=replace(made.figures, outcome=Outcome.LOST_IN_ROUNDING))
-
-
-def responses(
-    plant: ScaledPlant, controller: StateSpace, omega: Array
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """G (k, p, m), K (k, m, p) and S (k, p, p) at jω in SI, for frequencies (k,) in rad/s."""
-    *parts, Dk = _scaled(plant, controller)
-    G, K = prepare(plant.A, plant.B, plant.C), prepare(*parts)
-    scaled = np.asarray(omega, float) / plant.omega_0
-    g = np.array([response(G, w) for w in scaled])
-    k = np.array([response(K, w) + Dk for w in scaled])
-    return g / plant.force, k * plant.force, sensitivity(g @ k)
 
 
 def _scaled(plant: ScaledPlant, controller: StateSpace) -> tuple[Array, Array, Array, Array]:

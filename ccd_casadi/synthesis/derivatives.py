@@ -12,7 +12,7 @@ from ccd_casadi.kernels.design import design, failed_row
 from ccd_casadi.kernels.gradients import DesignPlant, Loop, figure_gradients
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, figures_from_row, over_family
 from ccd_casadi.synthesis.weights import Weights
@@ -22,7 +22,7 @@ _WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
 
 
 @dataclass(frozen=True)
-class Made:
+class DesignDerivatives:
     """What was made, in scaled units: for what else is read off the same design.
 
     `row` of its figures, (A_K, B_K, C_K), dγ_opt to θ and weights; `worst` is the place in its
@@ -36,7 +36,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Sensitivities(Shown):
+class Sensitivities(NotebookHtml):
     """Figures of one design with their gradients.
 
     `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), where it was
@@ -53,7 +53,7 @@ class Sensitivities(Shown):
     to_weights: dict[str, Array]
     fixed_controller: Array
     simple: tuple[bool, ...]
-    made: Made | None = field(default=None, repr=False, compare=False)
+    made: DesignDerivatives | None = field(default=None, repr=False, compare=False)
 
     @property
     def to_break_frequencies(self) -> Array:
@@ -108,7 +108,9 @@ def sensitivities(
             )
             if whole:
                 break
-        made = Made(row, K, to_gamma, [at is worst for at in plant.members].index(True))
+        made = DesignDerivatives(
+            row, K, to_gamma, [at is worst for at in plant.members].index(True)
+        )
     except np.linalg.LinAlgError:
         figures = figures_from_row(failed_row(), weights.omega_S, weights.omega_T, w0)
         gradient, fixed = np.empty((0, count + len(names))), np.full(count, np.nan)

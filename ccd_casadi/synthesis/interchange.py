@@ -32,14 +32,13 @@ LONGEST_NAME = 63  # of a variable in MATLAB
 
 @dataclass(frozen=True)
 class NamedSystem:
-    """A state space with named signals; `period` in s, 0 in continuous time."""
+    """A state space with named signals."""
 
     system: StateSpace
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     input_unit: str
     output_unit: str
-    period: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -51,16 +50,16 @@ class DesignFile:
     units: Mapping[str, str] = field(default_factory=dict)
 
 
-def named_plant(plant: StateSpace, period: float = 0.0) -> NamedSystem:
-    """Forces u1, … in N to displacements y1, … in m; `period` in s."""
+def named_plant(plant: StateSpace) -> NamedSystem:
+    """Forces u1, … in N to displacements y1, … in m."""
     inputs, outputs = _names("u", plant.B.shape[1]), _names("y", plant.C.shape[0])
-    return NamedSystem(plant, inputs, outputs, "N", "m", period)
+    return NamedSystem(plant, inputs, outputs, "N", "m")
 
 
-def named_controller(controller: StateSpace, period: float = 0.0) -> NamedSystem:
-    """Errors e1, … = r - y in m to forces u1, … in N; `period` in s."""
+def named_controller(controller: StateSpace) -> NamedSystem:
+    """Errors e1, … = r - y in m to forces u1, … in N."""
     inputs, outputs = _names("e", controller.B.shape[1]), _names("u", controller.C.shape[0])
-    return NamedSystem(controller, inputs, outputs, "m", "N", period)
+    return NamedSystem(controller, inputs, outputs, "m", "N")
 
 
 def to_control(named: NamedSystem, name: str = "") -> "control.StateSpace":
@@ -71,11 +70,11 @@ def to_control(named: NamedSystem, name: str = "") -> "control.StateSpace":
     signals: dict[str, Any] = {"inputs": list(named.inputs), "outputs": list(named.outputs)}
     if name:
         signals["name"] = name
-    return control.ss(*parts, named.period, remove_useless_states=False, **signals)
+    return control.ss(*parts, named.system.period, remove_useless_states=False, **signals)
 
 
-def from_control(system: Any) -> tuple[StateSpace, float]:
-    """Matrices and period in s (0: continuous) of a `control` system, in whatever form it is.
+def from_control(system: Any) -> StateSpace:
+    """A `control` system, in whatever form it is.
 
     Raises UserError where it is no linear system, or is discrete without a sampling period.
     """
@@ -91,7 +90,7 @@ def from_control(system: Any) -> tuple[StateSpace, float]:
     except (ValueError, control.ControlMIMONotImplemented) as error:
         raise UserError(f"the system has no state space: {error}; make it proper") from None
     parts = (np.array(part, dtype=float) for part in (space.A, space.B, space.C, space.D))
-    return StateSpace(*parts), float(system.dt or 0.0)
+    return StateSpace(*parts, period=float(system.dt or 0.0))
 
 
 def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
@@ -123,8 +122,8 @@ def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
     >>> round(float(plant.natural[0]), 6), plant.A.shape  # rad/s
     (200.0, (2, 2))
     """
-    space, period = from_control(system)
-    if period:
+    space = from_control(system)
+    if space.period:
         raise UserError("the plant is in discrete time; give the continuous one")
     return scale_state_space(space, M_K)
 
@@ -137,7 +136,7 @@ def write_mat(path: Path, design: DesignFile) -> None:
             raise UserError(f"{path}: {name!r} is not a name for a variable in MATLAB")
         content[name] = {
             **{part: getattr(named.system, part) for part in PARTS},
-            "Ts": named.period,
+            "Ts": named.system.period,
             "InputName": _cells(named.inputs),
             "OutputName": _cells(named.outputs),
             "InputUnit": named.input_unit,
@@ -167,7 +166,8 @@ def mat_variables(path: Path) -> dict[str, Any]:
         words = "is a MATLAB 7.3 file; write it with save(…, '-v7')"
         raise UserError(f"{path}: {words}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
-        raise UserError(f"{path}: is not a readable .mat file: {_one_line(error)}") from None
+        words = " ".join(str(error).split())[:120]
+        raise UserError(f"{path}: is not a readable .mat file: {words}") from None
 
 
 def read_mat(path: Path) -> DesignFile:
@@ -222,12 +222,11 @@ def _system(path: Path, name: str, struct: Mapping[str, Any]) -> NamedSystem:
         period = float(Ts[0, 0])
     inputs, outputs = text("InputName"), text("OutputName")
     return NamedSystem(
-        StateSpace(A, B, C, D),
+        StateSpace(A, B, C, D, period=period),
         inputs if len(inputs) == m else _names("u", m),
         outputs if len(outputs) == p else _names("y", p),
         " ".join(text("InputUnit")),
         " ".join(text("OutputUnit")),
-        period,
     )
 
 
@@ -258,7 +257,3 @@ def _strings(value: Any) -> tuple[str, ...]:
 
 def _names(letter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{letter}{i + 1}" for i in range(count))
-
-
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:120]

@@ -7,7 +7,7 @@ decades below the last frequency that a grid shows. With an integrator GS(0) is 
 what rounding left of a pole; what such a loop gives way is then told at ω_low.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ccd_casadi.lti.grid import climbed
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ, metres, shown
+from ccd_casadi.support.units import HZ, metres, with_unit
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
@@ -53,7 +53,7 @@ class Statics:
         if self.integrates:
             return f"The controller integrates: a constant force does not move the stage; {low}."
         found = (
-            f"Static stiffness K(0) = {shown(self.stiffness, 'N/m')}: a constant force of 1 N "
+            f"Static stiffness K(0) = {with_unit(self.stiffness, 'N/m')}: a constant force of 1 N "
             f"moves the stage {metres(self.compliance)}, {low}."
         )
         if self.differentiates:
@@ -65,29 +65,24 @@ class Statics:
 
 
 def statics(
-    plant: StateSpace,
-    controller: StateSpace,
-    *,
-    bandwidth: float,
-    omega_low: float,
-    period: float = 0.0,
+    plant: StateSpace, controller: StateSpace, *, bandwidth: float, omega_low: float
 ) -> Statics:
     """Of a continuous plant without a pole at 0 and a controller in SI; ω_b, ω_low in rad/s.
 
-    `period` > 0: the controller is in discrete time, its rest z = 1; hold and delay, which turn
-    nothing at ω_low, are left out there.
+    Of a controller in discrete time the rest is z = 1; hold and delay, which turn nothing at
+    ω_low, are left out there.
     """
 
     def at(omega: float) -> np.ndarray:
-        return replace(controller, period=period).response(np.array([omega]))[0]
+        return controller.response(np.array([omega]))[0]
 
     def compliance(omega: float, K: np.ndarray) -> float:
         G = plant.response(np.array([omega]))[0]
         return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))
 
     low = compliance(omega_low, at(omega_low))
-    poles = np.linalg.eigvals(controller.A)
-    rates = np.abs(poles) if period == 0.0 else np.abs(poles - 1.0) / period
+    poles, T = controller.poles, controller.period
+    rates = np.abs(poles - 1.0) / T if T else np.abs(poles)
     if rates.size and rates.min() <= INTEGRATOR * bandwidth:
         return Statics(np.inf, 0.0, np.inf, low, omega_low / HZ)
     K0 = at(0.0)

@@ -17,7 +17,7 @@ from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
 
@@ -90,7 +90,7 @@ class DesignFigures:
 
 
 @dataclass(frozen=True)
-class Design(Shown):
+class Design(NotebookHtml):
     """A synthesis with its controller, input e = r - y, output u, in SI."""
 
     figures: DesignFigures

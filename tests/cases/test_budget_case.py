@@ -18,7 +18,7 @@ from ccd_casadi.codesign.design_entries import budget_entry, budget_lines
 from ccd_casadi.drawing.paint import blocks_html
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.budget_chapter import budget_chapter
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import synthesise
 
@@ -111,7 +111,7 @@ def test_the_budget_of_a_design_in_result_terminal_and_page(tmp_path: Path) -> N
     weights = problem.weights.at(72.0 * HZ, 150.0 * HZ)
     made = synthesise(scaled_plant(problem, (55.0, 55.0)), weights, omega_low=HZ)
     found = budget_entry(problem, (55.0, 55.0), made.controller)
-    budget = json.loads(json.dumps(clean(found), allow_nan=False))["budget"]
+    budget = json.loads(json.dumps(json_values(found), allow_nan=False))["budget"]
     shares = [item["share"] for item in budget["sources"]]
     assert sum(shares) == pytest.approx(1.0)
     squares = sum(item["error_rms"] ** 2 for item in budget["sources"])

@@ -4,20 +4,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.lifted import Lifted
-from ccd_casadi.codesign.run import co_design
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.compare import main as compare
-from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.process_pool import Workers
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"
 
@@ -86,8 +78,3 @@ def test_what_needs_ranges_says_so(tmp_path: Path, capsys: pytest.CaptureFixture
     path.write_text(case_to_toml(parse_case(document(values=[57, 60]))))
     assert compare([str(path), "--quiet"]) == 2
     assert "theta.m1.values: compare needs a range" in capsys.readouterr().err
-    case = load_case(path)
-    with Workers(1) as pool, SampleStore(tmp_path / "samples.sqlite") as store:
-        sampler = Sampler(problem_of(case), store, pool)
-        with pytest.raises(UserError, match="--surrogate"):
-            co_design(sampler, Lifted(), 0, Surrogates((), np.empty((0, 2)), ()))

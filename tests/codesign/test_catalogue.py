@@ -33,7 +33,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.spent import Spent
+from ccd_casadi.sampling.spent import SynthesisCounts
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.plain_values import plain
 from ccd_casadi.support.process_pool import Workers
@@ -145,7 +145,7 @@ class Found:
 class OneSampler(SimpleNamespace):
     """What the search asks of a Sampler."""
 
-    spent = Spent()
+    spent = SynthesisCounts()
 
     def of(self, other: CoDesignProblem, *, traced: bool = True) -> "OneSampler":
         return OneSampler(problem=other)

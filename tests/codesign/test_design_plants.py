@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.codesign.design_plants import missed_words, remedies, search_words, widen
+from ccd_casadi.codesign.design_plants import remedies, search_words, widen
 from ccd_casadi.codesign.direct import acceptable
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import best_choice, design_choices, true_design, true_inner
-from ccd_casadi.inner_problem.sweep import missed_by, shortfall
+from ccd_casadi.inner_problem.sweep import missed_bounds, missed_by, shortfall
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.solve import design_plant_lines
@@ -81,8 +81,8 @@ def test_a_failed_search_does_not_contradict_itself() -> None:
     assert f"S_low = {case.inner.S_low:g} is kept" in words
     shown = float(words.split("peak of S ")[1].split()[0])
     assert shown > case.inner.S_max
-    assert missed_words(case, near).startswith("peak of S")
-    assert missed_words(case, replace(near, sensitivity_peak=1.2)) == ""
+    assert missed_bounds(case.inner, near)[0].startswith("peak of S")
+    assert missed_bounds(case.inner, replace(near, sensitivity_peak=1.2)) == []
 
 
 def test_the_words_say_what_was_tried_where_and_what_next() -> None:

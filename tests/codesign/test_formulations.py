@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.sampling.samples import BandwidthSample
-from ccd_casadi.sampling.spent import Spent
+from ccd_casadi.sampling.spent import SynthesisCounts
 
 ROOT = Path(__file__).parents[2]
 CASE = load_case(ROOT / "runs" / "two_mass.toml")
@@ -154,7 +154,7 @@ def test_nested_looks_around_the_only_feasible_sample(reach: float) -> None:
         return found
 
     sampler = SimpleNamespace(
-        problem=case, bandwidths=bandwidths, spent=Spent(), latest=list, raised=0
+        problem=case, bandwidths=bandwidths, spent=SynthesisCounts(), latest=list, raised=0
     )
     options = Nested(points=3, starts=4, max_refinements=3)
     found = solve_nested(sampler, options, seed=0)  # type: ignore[arg-type]

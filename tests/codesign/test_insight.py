@@ -160,7 +160,7 @@ def test_the_lightest_may_be_the_fastest(truth_of: Callable[[CoDesignProblem], S
 class ErrorOverMasses:
     """A sampler and an outer problem in one, by hand: the error falls with both masses."""
 
-    quiet, syntheses = True, 0
+    quiet, syntheses, look_is_cheap = True, 0, True
     grid = np.array([[m1, m2] for m1 in range(55, 71) for m2 in range(55, 71)], float)
 
     def __init__(self, problem: CoDesignProblem) -> None:

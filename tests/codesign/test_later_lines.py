@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.result import told
+from ccd_casadi.codesign.result import with_verdict_line
 from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Page
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.reporting.index import write_index
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.robustness import main as robustness
@@ -90,15 +90,15 @@ def test_words_from_anywhere_stay_words_and_a_study_kept_apart_changes_no_run(tm
     place = folder / "result.json"
     place.write_text(json.dumps(result))
     for name in ("report.html", "other/report.html"):
-        (folder / name).write_text(painted(Page(run_head("t", result, "", ""), ())))
+        (folder / name).write_text(page_html(Page(run_head("t", result, "", ""), ())))
     (folder / "other" / "result.json").write_text("{}")  # another run, below this one
     run, kept = run_in(folder, result), place.read_bytes()
     line = Line(State.FAILED, r"</table><script>\1 \g<0>", {"figure": 1.0})
-    assert told(run, tmp_path / "elsewhere", "deployable", line) is run
+    assert with_verdict_line(run, tmp_path / "elsewhere", "deployable", line) is run
     old = replace(run, result={k: v for k, v in result.items() if k != "verdict"})
-    assert told(old, folder, "deployable", line) is old
+    assert with_verdict_line(old, folder, "deployable", line) is old
     assert place.read_bytes() == kept
-    told(run, folder / "deploy", "deployable", line)
+    with_verdict_line(run, folder / "deploy", "deployable", line)
     write_index(folder)
     for name in ("report.html", "index.html"):
         text = (folder / name).read_text()

@@ -12,7 +12,7 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.optim.kkt import KktCertificate
-from ccd_casadi.sampling.spent import Spent
+from ccd_casadi.sampling.spent import SynthesisCounts
 from surrogates import fit
 
 
@@ -52,7 +52,7 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     spent = (SimpleNamespace(),) * (rounds + 1)
     outcome = FormulationResult(end.x, spent, (process,), None, False, "")  # type: ignore[arg-type]
     outer = SimpleNamespace(
-        sampler=SimpleNamespace(spent=Spent()), kkt_level=1e-4, may_try_again=False,
+        sampler=SimpleNamespace(spent=SynthesisCounts()), kkt_level=1e-4, may_try_again=False,
         samples_of=lambda end, inputs: (np.array([end.value]), np.full((1, 1), np.nan)),
         learnt=lambda outcome, end: Outer.learnt(outer, outcome, end),
     )  # fmt: skip

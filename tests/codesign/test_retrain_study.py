@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 from busy import HANGS
 
-from ccd_casadi.solve import main as solve
 from surrogates.retrain import main
 
 pytestmark = pytest.mark.slow  # a study of half a minute; its parts are tested apart
@@ -40,45 +39,6 @@ def retrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def result(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "result.json").read_text())
-
-
-def without_look(folder: Path) -> Path:
-    """The case without the global check at the end, whose syntheses are not a surrogate's."""
-    case = folder / "without_look.toml"
-    case.write_text(TWO_MASS.read_text() + "\n[outer]\nbox_points = 0\n")
-    return case
-
-
-def test_solve_starts_from_a_named_version(retrained: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    shutil.copytree(retrained / "surrogates", folder / "surrogates")
-    words = [str(without_look(tmp_path)), "--out", str(folder), "--workers", "1", "--quiet"]
-    words += ["--no-report"]
-    assert solve([*words, "--formulation", "lifted", "--surrogate", "0001"]) == 0
-    found = result(folder)
-    assert found["objective"] == pytest.approx(-439.4648, abs=1e-3)
-    assert found["syntheses"] < 16 + 48, "without the 24 samples of the usual start"
-
-
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        (["--surrogate", "0099"], "there is no such version; known are 0001 to"),
-        (["--surrogate", "../../x"], "there is no such version"),
-        (["--surrogate", "0001", "--formulation", "nested"], "no surrogate of the nested form"),
-        (["--surrogate", "0001", "--formulation", "direct"], "no surrogate of the direct form"),
-    ],
-)
-def test_solve_refuses_a_version_that_is_none(
-    retrained: Path, capsys: pytest.CaptureFixture[str], more: list[str], words: str
-) -> None:
-    line = [str(TWO_MASS), "--out", str(retrained), "--quiet", "--formulation", "lifted", *more]
-    before = result(retrained)
-    assert solve(line) == 2
-    output, errors = capsys.readouterr()
-    assert (output, len(errors.splitlines())) == ("", 1)
-    assert words in errors
-    assert result(retrained) == before
 
 
 # ---- real processes ------------------------------------------------------------------------------

@@ -258,7 +258,7 @@ def test_other_damping_is_that_of_the_plant_given_the_other_way(
 
 def test_what_the_other_damping_would_pass_is_told() -> None:
     told = OtherDamping("matrix", {"S_max": 1.0, "KS": 0.2}, {"S_max": 1.036, "KS": 0.5})
-    assert "damping ratio kept instead S_max is 3.6 %" in told.words
+    assert "S_max exceeds its bound by 3.6 % on the set if the damping ratio is kept" in told.words
     assert "KS" not in told.words
     assert told.words in told.entry["damping_words"]
     assert not OtherDamping("ratio", {"S_max": 1.0}, {"S_max": 1.009}).words
@@ -297,7 +297,7 @@ def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: boo
         controller=loops.run,
         sampling=sampling,
     )
-    good = perturbed.Judged((0.0,), True, 1.0, 1.0, -1.0)
+    good = perturbed.PerturbedLoop((0.0,), True, 1.0, 1.0, -1.0)
     with mock.patch.object(perturbed, "judge", return_value=good):
         line = perturbed.shift_line(run, case.system(), REACH, 2)
         damped = perturbed.damping_line(run, case.system(), *FACTORS, 2)

@@ -24,8 +24,9 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.survival import REACH, Survival, loops_of, survival_of
+from ccd_casadi.codesign.survival import REACH, Survival, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.paint import verdict_html
 from ccd_casadi.inner_problem.controller_problem import RobustSet
@@ -155,7 +156,7 @@ def corner_design() -> tuple[Survival, float]:
     )
     bandwidth = made.figures.bandwidth
     loops = loops_of(problem(), CORNER, made.controller)
-    return survival_of(problem(), loops, bandwidth), bandwidth
+    return survived(problem(), loops, bandwidth)[0], bandwidth
 
 
 def test_the_range_found_is_where_stability_is_lost() -> None:
@@ -323,7 +324,7 @@ def test_every_place_shows_the_same_lines() -> None:
     for name in shown.LINES:
         assert f"{name} words" in terminal
         assert f"{name} words" in page
-    assert shown.worst(result) is v.State.WARNED
+    assert shown.worst_state(result) is v.State.WARNED
     assert shown.head_words(result) == "with warnings: survives"
     assert "all checks passed" not in shown.head_words(result)
     assert "survives" in shown.head_words(result)

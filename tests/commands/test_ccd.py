@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -88,8 +89,15 @@ def test_a_new_stage_is_a_case_that_can_be_solved(
     assert "would be overwritten" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("word", [*COMMANDS, *OWN])
+def test_every_word_has_help(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with suppress(SystemExit):  # as argparse ends
+        assert main([word, "--help"]) == 0
+    assert word in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
-    "words", [["sovle"], ["new"], ["new", "a", "b"], ["new", "--help"], ["keys", "x"]]
+    "words", [["sovle"], ["new"], ["new", "a", "b"], ["new", "-x"], ["keys", "x"]]
 )
 def test_a_wrong_word_is_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 2

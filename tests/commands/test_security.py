@@ -16,7 +16,7 @@ from test_sources import SOURCES
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner import main as inner
-from ccd_casadi.inner_problem.plant_source import _own_plant
+from ccd_casadi.inner_problem.plant_source import _built
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.retrain import formulation_in
 from ccd_casadi.solve import main as solve
@@ -116,7 +116,7 @@ def test_an_edited_plant_is_not_the_one_kept_in_memory(trap: Path) -> None:
     assert float(plant_of(second).hardware([60.0, 60.0])[0]) == 420.0
     assert plant_of(first).hardware is before
     copied = pickle.loads(pickle.dumps(first))  # as a worker gets it
-    _own_plant.cache_clear()
+    _built.cache_clear()
     with pytest.raises(UserError, match="was changed since the case was read"):
         plant_of(copied)
 
@@ -217,21 +217,6 @@ def test_a_plant_too_large_for_memory_is_refused(trap: Path, matrices: str, word
 
 
 # ---- names that lead out of the folder -----------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "name", ["../x", "/etc/passwd", "..", "", ".", "0001/../../x", "0001.json", "\x00", "x" * 5000]
-)
-def test_a_surrogates_name_is_no_path(
-    two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
-    shutil.copy(folder / "surrogate.json", tmp_path / "x.json")
-    case = str(folder / "case.toml")
-    assert solve([case, "--out", str(folder), "--surrogate", name, "--quiet"]) == 2
-    errors = capsys.readouterr().err
-    assert len(errors.splitlines()) == 1
-    assert errors.startswith("--surrogate ")
 
 
 def test_a_surrogate_file_of_another_kind_is_not_built(tmp_path: Path) -> None:

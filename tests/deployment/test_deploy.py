@@ -11,20 +11,29 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import OMEGA_LOW, PAPER, flexible_case, mechanics, problem, scaled, two_mass_model
+from helpers import (
+    OMEGA_LOW,
+    PAPER,
+    flexible_case,
+    mechanics,
+    problem,
+    responses,
+    scaled,
+    two_mass_model,
+)
 from sampled_simulation import measure_set
 from scipy.linalg import block_diag
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
-from ccd_casadi.deployment.channels import assemble, split
+from ccd_casadi.deployment.channels import assemble, scalar_channels
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.reduction import LoopLimits, Reduction, reductions, smallest
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import measure, responses
+from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, synthesise
 
@@ -62,7 +71,7 @@ def as_run(plant: ScaledPlant, made: Design) -> FinishedRun:
 
 def test_a_plant_of_two_channels_is_deployed_channel_by_channel() -> None:
     plant, made = two_channels()
-    channels = split(plant, made.controller)
+    channels = scalar_channels(plant, made.controller)
     assert [c.plant.C.shape[0] for c in channels] == [1, 1]
     whole = assemble(channels, [c.controller for c in channels])
     omega = HZ * np.geomspace(1.0, 1000.0, 50)
@@ -84,7 +93,7 @@ def test_a_plant_of_two_channels_is_deployed_channel_by_channel() -> None:
 def test_a_coupled_plant_is_one_channel() -> None:
     case = flexible_case(0)
     made = synthesise(case.plant, case.weights, omega_low=OMEGA_LOW)
-    (channel,) = split(case.plant, made.controller)
+    (channel,) = scalar_channels(case.plant, made.controller)
     rows = reductions(channel, case.weights, OMEGA_LOW)
     f, best = made.figures, rows[0].figures
     assert best.bandwidth == pytest.approx(f.bandwidth, rel=1e-5)
@@ -96,7 +105,7 @@ def test_a_coupled_plant_is_one_channel() -> None:
 
 def test_every_order_is_measured_on_the_true_loop(two_mass_run: Path) -> None:
     run = read_run(two_mass_run)
-    (channel,) = split(run.plant, run.controller)
+    (channel,) = scalar_channels(run.plant, run.controller)
     rows = reductions(channel, run.weights, OMEGA_LOW)
     assert {row.method for row in rows} == set(Reduction) - {Reduction.NONE}
     for row in rows:
@@ -151,16 +160,13 @@ def test_the_command_leaves_a_controller_that_can_be_built(
     assert 7000.0 < found["needed_rate_hz"] < 9000.0  # 8000 Hz, found to some per cent
     # the loop of the .mat file alone, at its own bandwidth
     mat = read_mat(out / "design.mat")
-    K, G = mat.systems["controller_discrete"], mat.systems["plant_discrete"]
+    K, G = (mat.systems[name].system for name in ("controller_discrete", "plant_discrete"))
     assert (K.period, G.period) == (1e-4, 1e-4)
     z = np.exp(1j * HZ * found["sampled"]["bandwidth_hz"] * K.period)
-    g, k = (
-        s.C @ np.linalg.solve(z * np.eye(len(s.A)) - s.A, s.B + 0j) + s.D
-        for s in (G.system, K.system)
-    )
+    g, k = (s.C @ np.linalg.solve(z * np.eye(len(s.A)) - s.A, s.B + 0j) + s.D for s in (G, K))
     assert abs(1.0 / (1.0 + (g @ k)[0, 0])) == pytest.approx(2**-0.5, rel=1e-8)
     table = json.loads((out / "controller.json").read_text())
-    np.testing.assert_array_equal(table["A"], K.system.A)
+    np.testing.assert_array_equal(table["A"], K.A)
     page = _Plain()
     page.feed((out / "report.html").read_text(encoding="utf-8"))
     assert (page.figures, page.foreign) == (3, ["../index.html"])  # loop, step, move

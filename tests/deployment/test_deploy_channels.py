@@ -17,7 +17,7 @@ from ccd_casadi.deployment.files import deployment_dict
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.timing import Timing
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, uncertain_plant
@@ -144,7 +144,7 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
             figures = sampled_figures(closed_loop(held, found.realisation.system).S)
             assert figures.stable
             assert figures.sensitivity_peak <= found.worst.figures.sensitivity_peak * (1.0 + 1e-3)
-    page = painted(deploy_page(run, found))
+    page = page_html(deploy_page(run, found))
     assert "Channel sum: gain 3000\xa0N/m" in page
     assert "Channel difference: 3 states, as designed" in page
 

@@ -11,7 +11,7 @@ from helpers import few
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.c_code import COMPILE, c_files, write_c
 from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.deployment.realisation import Realisation, difference_equation, realise
@@ -115,7 +115,7 @@ def test_c_equals_python_bit_by_bit(
     plain = of_one_channel(random_controller(5, pairs, reals, inputs))
     e = 1e-6 * np.random.default_rng(7).normal(size=(400, inputs))
     limit = None if share is None else share * float(np.abs(difference_equation(plain, e)).max())
-    found = limited(Realisation(plain.system, plain.blocks, limit), 500.0)
+    found = with_anti_windup(Realisation(plain.system, plain.blocks, limit), 500.0)
     program = build(tmp_path, found)
     assert subprocess.run([program], capture_output=True, check=False).returncode == 0
     lines = "\n".join(" ".join(f"{v:.17g}" for v in row) for row in e)

@@ -14,7 +14,7 @@ from ccd_casadi.deployment.discretise import Conversion, Target, discretise, nee
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.robust.sampled import SampledFigures, sampled_figures, together
+from ccd_casadi.robust.sampled import SampledFigures, sampled_figures, worst_figures
 
 HZ = 2.0 * np.pi
 
@@ -117,7 +117,7 @@ def test_a_simulation_measures_the_same_sensitivity(channels: int) -> None:
 def test_figures_of_loops_side_by_side_are_the_wholes() -> None:
     period, delay = 1e-3, 5e-4
     one = sampled_figures(loop(period, delay))
-    both = together([one, sampled_figures(loop(period, 2.0 * delay))])
+    both = worst_figures([one, sampled_figures(loop(period, 2.0 * delay))])
     K = discretise(lead(), Conversion.LEAD, period, delay)
     slow = discretise(lead(), Conversion.LEAD, period, 2.0 * delay)
     S1 = closed_loop(sampled(stage(), period, delay), K).S
@@ -131,7 +131,7 @@ def test_figures_of_loops_side_by_side_are_the_wholes() -> None:
     assert both.sensitivity_peak == pytest.approx(whole.sensitivity_peak, rel=1e-8)
     assert both.bandwidth == pytest.approx(whole.bandwidth, rel=1e-9)
     gone = SampledFigures(False, 1.1, np.nan, np.nan, np.nan)
-    assert not together([one, gone]).stable
+    assert not worst_figures([one, gone]).stable
 
 
 @pytest.mark.parametrize("conversion", list(Conversion))

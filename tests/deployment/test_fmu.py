@@ -10,7 +10,7 @@ import pytest
 from test_deploy_code import of_one_channel, random_controller
 
 from ccd_casadi.deploy import main
-from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.c_code import c_files
 from ccd_casadi.deployment.fmu import FLAGS, compiled, write_fmu
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
@@ -31,7 +31,7 @@ def controller(share: float | None = None) -> Realisation:
         return plain
     errors = 1e-6 * np.random.default_rng(7).normal(size=(200, 3))
     limit = share * float(np.abs(difference_equation(plain, errors)).max())
-    return limited(Realisation(plain.system, plain.blocks, limit), 500.0)
+    return with_anti_windup(Realisation(plain.system, plain.blocks, limit), 500.0)
 
 
 def written(folder: Path, found: Realisation) -> Path:

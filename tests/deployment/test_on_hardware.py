@@ -16,7 +16,7 @@ from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.deployment.anti_windup import back_calculation, limited, takeover
+from ccd_casadi.deployment.anti_windup import back_calculation, takeover, with_anti_windup
 from ccd_casadi.deployment.c_code import vectors
 from ccd_casadi.deployment.move import PARTS, Electronics, move
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
@@ -118,9 +118,9 @@ def test_nothing_changes_between_the_limits() -> None:
     K = pid()
     e = 1e-6 * np.random.default_rng(0).normal(size=(300, 1))
     u = difference_equation(K, e)
-    wide = limited(replace(K, saturation=1.01 * float(np.abs(u).max())), CROSSOVER)
+    wide = with_anti_windup(replace(K, saturation=1.01 * float(np.abs(u).max())), CROSSOVER)
     np.testing.assert_array_equal(difference_equation(wide, e), u)
-    narrow = limited(replace(K, saturation=0.5 * float(np.abs(u).max())), CROSSOVER)
+    narrow = with_anti_windup(replace(K, saturation=0.5 * float(np.abs(u).max())), CROSSOVER)
     only_clipped = np.clip(u, -(narrow.saturation or 0.0), narrow.saturation)
     assert np.abs(difference_equation(narrow, e) - only_clipped).max() > 0.0
 
@@ -162,7 +162,7 @@ def test_a_limited_move_ends_as_fast_and_without_a_cycle() -> None:
     free = made(K)
     limit = 0.9 * float(np.abs(free.force).max())
     clipped = replace(K, saturation=limit)
-    held = made(limited(clipped, CROSSOVER))
+    held = made(with_anti_windup(clipped, CROSSOVER))
     assert held.saturated > 0.05
     assert held.settled <= 1.2 * free.settled
     assert held.last_error(0.25) < 1e-7  # of a window of 1e-6
@@ -182,7 +182,8 @@ def test_steps_of_sensor_and_force_bound_what_is_left() -> None:
 def test_structured_text_is_the_c_code_line_by_line(
     pairs: int, reals: int, inputs: int, limit: float | None
 ) -> None:
-    found = limited(of_one_channel(random_controller(5, pairs, reals, inputs), limit), 500.0)
+    K = of_one_channel(random_controller(5, pairs, reals, inputs), limit)
+    found = with_anti_windup(K, 500.0)
     errors, forwards, first, forces = vectors(found)
     text = structured_text(found, title="x *) y", delay=1e-4, verified=True)
     calls = [

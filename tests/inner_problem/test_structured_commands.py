@@ -23,7 +23,7 @@ from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
@@ -291,7 +291,7 @@ def test_no_structure_has_a_stacked_norm_below_gamma_opt() -> None:
         least = synthesise(plant, weights, omega_low=HZ).figures.gamma_opt
         inside = problem_for([plant], structure, bounds)
         draws = np.exp(rng.uniform(-3.0, -0.5, 40))
-        stable = kept(inside, at_random(inside, draws, rng))
+        stable = stabilising(inside, at_random(inside, draws, rng))
         assert len(stable) > 3
         for kappa in stable:
             K = state_space(structure, structure.in_units(kappa, plant.omega_0, plant.force))

@@ -25,8 +25,8 @@ from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.reporting.bode import loop_panels
+from ccd_casadi.reporting.landscape import read_truths
 from ccd_casadi.reporting.machine import lumped, lumped_svg
-from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Outcome

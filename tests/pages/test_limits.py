@@ -7,7 +7,7 @@ from helpers import HZ, problem, two_mass
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.reporting.limits import limit_sentences, shares, table_limits
-from ccd_casadi.support.units import shown_unit
+from ccd_casadi.support.units import display_unit
 from ccd_casadi.synthesis.synthesis import synthesise
 
 
@@ -39,6 +39,6 @@ def test_the_words_name_the_zero_that_limits_case_a(loop: LoopView) -> None:
 
 
 def test_lengths_of_a_stage_are_shown_in_mm() -> None:
-    assert shown_unit("m", 95e-3) == ("mm", 1e3)
-    assert shown_unit("m", 2.0) == ("m", 1.0)
-    assert shown_unit("kg", 1e-3) == ("kg", 1.0)
+    assert display_unit("m", 95e-3) == ("mm", 1e3)
+    assert display_unit("m", 2.0) == ("m", 1.0)
+    assert display_unit("kg", 1e-3) == ("kg", 1.0)

@@ -13,12 +13,12 @@ from helpers import HZ, problem
 
 import ccd_casadi as ccd
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, Terms
 from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.support.errors import MissingPackage
-from ccd_casadi.support.notebook import Shown
+from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,7 +50,7 @@ class _Text(HTMLParser):
             self.text += data
 
 
-def shown(item: Shown) -> str:
+def shown(item: NotebookHtml) -> str:
     return _Text(item._repr_html_()).text.replace("\u00a0", " ")  # a unit stays with its number
 
 
@@ -99,9 +99,8 @@ def test_inner_designs_show_their_figures() -> None:
 
 
 def test_a_solution_without_a_design_says_why() -> None:
-    outcome = FormulationResult()
-    spent = {"spent": {"samples": 1}, "seconds": 1.0, "seed": 0}
-    text = shown(Solution(infeasible_dict("lifted", "too <heavy>", **spent), outcome, None))
+    result = infeasible_dict(Terms("lifted", 1e-3, 0), "too <heavy>", {"samples": 1})
+    text = shown(Solution(result, FormulationResult(), None))
     assert "No feasible design: too <heavy>" in text
 
 

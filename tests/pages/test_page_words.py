@@ -20,7 +20,7 @@ from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
 from ccd_casadi.reporting.nyquist import nyquist_panel
 from ccd_casadi.reporting.robustness_figures import shown_peak
-from ccd_casadi.reporting.verdict import LINES, advice, run_head
+from ccd_casadi.reporting.verdict import LINES, advice, head_of, run_head
 from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.support.units import HZ
 
@@ -118,6 +118,13 @@ def test_a_loop_within_its_bounds_is_looked_at_as_an_engineer_would(
         assert said not in advice(result_of(survives="failed") | figures)
 
 
+def test_what_s_may_reach_between_two_lines_is_said_first() -> None:
+    tuned = {"sensitivity_peak": 1.8, "sensitivity_peak_between_lines": 4.78}
+    assert "4.78 between two lines" in advice(tuned)
+    assert head_of("", True, "verified", "", "", "", tuned).badge == "warn"
+    assert not advice(tuned | {"sensitivity_peak_between_lines": 1.85})
+
+
 def test_a_peak_is_above_or_below_what_it_is_held_against() -> None:
     assert against(1.804, 1.75) == "3.09 % above S_max"
     assert against(1.6189, 1.75) == "7.49 % below S_max"
@@ -133,7 +140,7 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
     rest, error = np.zeros(801), 1e-4 * np.exp(-time)
     move = Move(time, rest, rest, error, rest[:, None], False, 0.18, window=1e-6)
     assert shown_until(move) == pytest.approx(0.54)
-    assert "of 57.7 µm after the figure's end" in ways_figure({"one": [move]}, "").caption
+    assert "after the figure's end 57.7 µm" in ways_figure({"one": [move]}, "").caption
     soon = replace(move, error=1e-6 * np.exp(-time))
     assert "after the figure's end" not in ways_figure({"one": [soon]}, "").caption
 

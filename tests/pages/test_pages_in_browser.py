@@ -10,7 +10,7 @@ from PIL import Image
 
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Chapter, Head, Lines, Page, Steps, Table
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.insight import main as insight
 from ccd_casadi.robustness import main as robustness
 
@@ -195,7 +195,7 @@ def test_a_table_that_goes_on_has_a_shadow_there(browser, tmp_path, width):
     place = tmp_path / "page.html"
     wide = Table(tuple(f"a column {i}" for i in range(9)), (tuple(range(9)),))
     head = Head("a page", "good", "", "", "", "")
-    place.write_text(painted(Page(head, (Chapter("A table", (wide,)),))), encoding="utf-8")
+    place.write_text(page_html(Page(head, (Chapter("A table", (wide,)),))), encoding="utf-8")
     page = browser.new_page(viewport={"width": width, "height": 500}, color_scheme="light")
     page.goto(place.as_uri())
     box = page.locator(".table").bounding_box()
@@ -226,7 +226,7 @@ def test_a_slider_shows_one_step_at_a_time(browser, tmp_path):
     place = tmp_path / "page.html"
     section = Chapter("Steps", (Steps(steps, 1, "first to last"),))
     head = Head("a page", "good", "", "", "", "")
-    place.write_text(painted(Page(head, (section,))), encoding="utf-8")
+    place.write_text(page_html(Page(head, (section,))), encoding="utf-8")
     page = browser.new_page()
     heard = complaints(page)
     page.goto(place.as_uri())

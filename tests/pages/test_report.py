@@ -21,15 +21,15 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.deployment.channels import split
-from ccd_casadi.drawing.paint import block_html, painted
+from ccd_casadi.deployment.channels import scalar_channels
+from ccd_casadi.drawing.paint import block_html, page_html
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.report import main as report_command
 from ccd_casadi.reporting.bode import bode
+from ccd_casadi.reporting.landscape import read_truths
 from ccd_casadi.reporting.solve_page import solve_page, write_report
-from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
@@ -251,7 +251,7 @@ def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
     result = {key: solution.result[key] for key in kept}
     result |= {"status": "infeasible", "reason": "S_max cannot be met by <0.1>"}
     nothing = FormulationResult()
-    text = painted(solve_page(tmp_path, case, problem, Solution(result, nothing, None)))
+    text = page_html(solve_page(tmp_path, case, problem, Solution(result, nothing, None)))
     Document(text)
     assert "S_max cannot be met by &lt;0.1&gt;" in text
 
@@ -331,7 +331,7 @@ def test_mimo_shows_its_channels_or_all_singular_values() -> None:
         plant = scaled_plant(problem, theta)
         weights = problem.weights.at(HZ * 50.0, HZ * 100.0)
         loop = design_view(problem, theta, K, weights=weights, gamma=1.0, bandwidth_hz=50.0)
-        text = block_html(bode(loop, split(plant, K)), "k")
+        text = block_html(bode(loop, scalar_channels(plant, K)), "k")
         assert ("channel 1, outputs +" in text) == apart
         assert ("phase of G" in text) == apart
         assert ("plant σ(G) (m/N)" in text) != apart

@@ -25,7 +25,7 @@ from ccd_casadi.drawing.content import (
 from ccd_casadi.drawing.lines import figure_lines
 from ccd_casadi.drawing.maps import figure_landscape
 from ccd_casadi.drawing.page import table_html
-from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.report import main as report_command
 
 
@@ -65,7 +65,7 @@ def test_tables_round_and_escape() -> None:
     assert '<td class="n">0.33333</td>' in html
     assert '<td class="n">–</td>' in html
     head = Head("t", "good", "", "", "", "")
-    Document(painted(Page(head, (Chapter("<h>", (Words("x"),)),))))
+    Document(page_html(Page(head, (Chapter("<h>", (Words("x"),)),))))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from ccd_casadi.case_studies.rib_stage import COARSE, Geometry, PointMass, RibSt
 from ccd_casadi.case_studies.rib_stage.drawing import drawing
 from ccd_casadi.case_studies.rib_stage.geometry import UPPER, bays, mass
 from ccd_casadi.drawing.content import Block, Chapter, Head, Page, Panel, Words
-from ccd_casadi.drawing.paint import block_html, painted
+from ccd_casadi.drawing.paint import block_html, page_html
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.turntable import (
     HEIGHT,
@@ -43,7 +43,7 @@ def modes_figure() -> str:
 
 
 def page(*blocks: Block) -> str:
-    return painted(Page(Head("t", "good", "", "", "", ""), (Chapter("s", blocks),)))
+    return page_html(Page(Head("t", "good", "", "", "", ""), (Chapter("s", blocks),)))
 
 
 def svgs(html: str) -> list[ElementTree.Element]:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.plants.cad import draw_morph, solid
-from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved, volumes
+from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
 from ccd_casadi.support.errors import PlantError
 
 lengths = st.floats(20.0, 200.0)
@@ -41,7 +41,7 @@ def test_a_linear_change_of_the_solid_is_that_of_its_mesh(
         mesh = meshed(gmsh, 1.0)
         before = gmsh.axes
         load(gmsh, draw(folder / "second.json", second, shear, turn))
-        points = moved(gmsh, mesh)
+        points = moved_points(gmsh, mesh)
         linear = gmsh.axes @ np.linalg.inv(before)
     np.testing.assert_allclose(points, mesh.points @ linear.T, atol=1e-12)
     assert volumes(points, mesh.tets).sum() == pytest.approx(1e-9 * np.prod(second), rel=1e-9)

@@ -7,7 +7,7 @@ import pytest
 
 from ccd_casadi.plants.cad import draw_morph
 from ccd_casadi.plants.cad.boundary import Boundary, Piece, paired
-from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved, volumes
+from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
 from ccd_casadi.support.errors import MissingPackage, PlantError, require
 
 
@@ -42,7 +42,7 @@ def test_nodes_stay_on_their_faces(tmp_path: Path) -> None:
         mesh = meshed(gmsh, 15e-3)
         end = face_at(gmsh, "end", (-50.0, 0.0, 5.0))
         load(gmsh, second)
-        points = moved(gmsh, mesh)
+        points = moved_points(gmsh, mesh)
     radius = np.hypot(mesh.points[:, 0] - 0.01, mesh.points[:, 1])
     on_bore = np.abs(radius - 0.012) < 1e-9
     assert on_bore.sum() > 20
@@ -68,7 +68,7 @@ def test_another_topology_is_refused(tmp_path: Path) -> None:
         mesh = meshed(gmsh, 20e-3)
         load(gmsh, files[1])
         with pytest.raises(PlantError, match="corners where the meshed one has"):
-            moved(gmsh, mesh)
+            moved_points(gmsh, mesh)
         with pytest.raises(PlantError, match="2 solids; fuse"):
             load(gmsh, files[2])
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import responses
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deployment.given_controller import read_controller, with_controller
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.statics import Statics, statics
 
 TABLE = """
@@ -29,7 +29,7 @@ def gain(K: StateSpace, s: complex) -> complex:
 
 def test_a_table_is_the_product_of_its_filters(tmp_path: Path) -> None:
     (tmp_path / "k.toml").write_text(TABLE)
-    K = read_controller(tmp_path / "k.toml").system
+    K = read_controller(tmp_path / "k.toml")[0]
 
     def second(s: complex, hz: float, zeta: float) -> complex:
         w = HZ * hz
@@ -49,7 +49,7 @@ def test_json_of_either_kind_and_the_runs_own(two_mass_run: Path, tmp_path: Path
     same = with_controller(run, two_mass_run / "controller.json")
     assert same.figures.sensitivity_peak == run.figures.sensitivity_peak
     (tmp_path / "k.json").write_text(json.dumps({"gain": 5.0, "low_pass": [{"pole_hz": 3.0}]}))
-    assert gain(read_controller(tmp_path / "k.json").system, 0j) == pytest.approx(5.0)
+    assert gain(read_controller(tmp_path / "k.json")[0], 0j) == pytest.approx(5.0)
     (tmp_path / "p.toml").write_text("gain = 3e5")  # no state of its own
     figures = with_controller(run, tmp_path / "p.toml").figures
     assert figures.certificate.stable
@@ -100,7 +100,7 @@ def test_the_loop_at_rest_is_the_limit_of_low_frequencies(two_mass_run: Path) ->
 def test_an_integrator_is_infinitely_stiff(two_mass_run: Path, tmp_path: Path) -> None:
     run = read_run(two_mass_run)
     (tmp_path / "k.toml").write_text(TABLE)
-    K = read_controller(tmp_path / "k.toml").system
+    K = read_controller(tmp_path / "k.toml")[0]
     found = at_rest(run, K)
     assert found.compliance == 0.0
     low = responses(run.plant, K, np.array([run.problem.inner.omega_low]))

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import control
 import numpy as np
 import pytest
-from helpers import HZ, SUSPENSION, random_plant, scaled
+from helpers import HZ, SUSPENSION, random_plant, responses, scaled
 from scipy.integrate import trapezoid
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
@@ -33,7 +33,6 @@ from ccd_casadi.robust.perturbed import (
 from ccd_casadi.robust.signals import gains, noise
 from ccd_casadi.robust.structured import structured_bound
 from ccd_casadi.robustness import main
-from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights

@@ -57,6 +57,12 @@ def test_every_bit_comes_back() -> None:
     assert found.array.flags.carray  # contiguous and writeable, as the kernels want it
 
 
+def test_a_class_that_had_another_name_comes_back() -> None:
+    """Only where a field may be of several classes does the stored name tell which."""
+    data = {**plain(whole()), "maybe": {"": "OneOfBefore", "x": 2.0}}
+    assert restored(Whole, data).maybe == One(2.0)
+
+
 def test_what_is_damaged_is_told(tmp_path: Path) -> None:
     wrong = [
         {**plain(whole()), name: value}

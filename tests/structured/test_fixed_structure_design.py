@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
-from helpers import HZ, SUSPENSION, random_plant, two_mass_model
+from helpers import HZ, SUSPENSION, random_plant, responses, two_mass_model
 
 from ccd_casadi.fixed_structure import (
     Bounds,
@@ -26,7 +26,7 @@ from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
 from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
@@ -34,7 +34,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
-from ccd_casadi.synthesis.closed_loop import measure, responses
+from ccd_casadi.synthesis.closed_loop import measure
 
 # One notch and a first-order roll-off are quick to find and have every kind of bound.
 SMALL = Structure(biquads=1, roll_off=2)
@@ -140,7 +140,7 @@ def test_a_rigid_body_is_looked_at_far_above_its_suspension() -> None:
     bounds = replace(EASY, weighted_level=None, weights=None)
     problem = problem_for([body], SMALL, bounds)
     rng = np.random.default_rng(0)
-    kappa = kept(problem, at_random(problem, np.exp(rng.uniform(-2.0, -1.0, 20)), rng))[0]
+    kappa = stabilising(problem, at_random(problem, np.exp(rng.uniform(-2.0, -1.0, 20)), rng))[0]
     peaks = assess(problem, kappa, -2.0, depth=-np.inf).peaks
     unit = problem.plants
     controller = state_space(SMALL, SMALL.in_units(kappa, unit.omega_0, unit.force))
@@ -291,7 +291,7 @@ def test_of_many_parameters_the_worst_plant_is_climbed_to(design) -> None:
     box = UncertainPlant((system,), SUSPENSION, 1e6, 0.01, 0.02, (0.5, 2.0), 0.05)
     assert len(box.names) == 7
     members = problem_for([box.plant(box.nominal)], SMALL, EASY)
-    kappa = kept(members, by_rules(members, np.geomspace(0.01, 0.3, 8)))[0]
+    kappa = stabilising(members, by_rules(members, np.geomspace(0.01, 0.3, 8)))[0]
     units = members.plants
     kappa = SMALL.in_units(kappa, units.omega_0, units.force)
     asked = (SMALL, kappa, 0.01 * units.omega_0, EASY, None)

@@ -7,10 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.analysis.loop_figures import (
-    LoopFigures,
-    gain_margin,
-    loop_figures,
-    loop_warnings,
+    light_roots,
+    loop_entry,
     measured_entry,
     ringing,
     step_figures,
@@ -40,24 +38,20 @@ def is_stable(G: StateSpace, K: StateSpace, sampling: Sampling | None) -> bool:
     return bool(Loop(G, K, sampling).poles.real.max() < 0.0)
 
 
-def warnings_of(found: LoopFigures, bandwidth: float) -> list[str]:
-    return loop_warnings(found.growth, found.light_roots, bandwidth, found.ringing)
-
-
 @pytest.mark.parametrize("sampling", [None, FAST, LATE])
 @pytest.mark.parametrize("seed", range(3))
 def test_stability_is_lost_at_the_margins(seed: int, sampling: Sampling | None) -> None:
     """The gain margin by eigenvalues; a delay added to the loop likewise, sampled where it is."""
     G, K = pair(seed, sampling)
-    found = loop_figures([G], K, sampling, 20.0 * HZ)
+    found = loop_entry([G], K, sampling, 20.0 * HZ, 1.5)
     assert is_stable(G, K, sampling)
-    gain = gain_margin(found.margins)
+    gain = found["gain_margin"]
     beyond, inside = (1.001 * gain, 0.999 / gain), (0.999 * gain, 1.001 / gain)
     assert not all(is_stable(G, turned(K, f), sampling) for f in beyond)
     assert all(is_stable(G, turned(K, f), sampling) for f in inside)
     if sampling is not None:
         late = [
-            Sampling(sampling.rate_hz, sampling.delay_us + 1e6 * f * found.margins.delay)
+            Sampling(sampling.rate_hz, sampling.delay_us + f * found["delay_margin_us"])
             for f in (0.999, 1.001)
         ]
         assert [is_stable(G, K, other) for other in late] == [True, False]
@@ -117,16 +111,14 @@ def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
         np.block([[K.A, K.B @ narrow.C], [np.zeros((2, len(K.A))), narrow.A]]),
         np.vstack([K.B @ narrow.D, narrow.B]), np.hstack([K.C, K.D @ narrow.C]), K.D @ narrow.D,
     )  # fmt: skip
-    before = loop_figures([G], K, None, w)
-    after = loop_figures([G], series, None, w)
-    added = [root[1:] for root in after.light_roots][len(before.light_roots) :]
-    new = [root for root in after.light_roots if abs(root[0] / w - 1.0) < 1e-6]
-    assert len(added) == len(new) == 2
+    before, after = light_roots(K, w), light_roots(series, w)
+    new = [root for root in after if abs(root[0] / w - 1.0) < 1e-6]
+    assert len(after) - len(before) == len(new) == 2
     named = {(word, round(damping, 6)) for _, damping, word in new}
     assert named == {("pole", 0.05), ("zero", 0.02)}
     of_controller = [
-        sum(words.startswith("the controller") for words in warnings_of(found, w))
-        for found in (before, after)
+        sum(words.startswith("the controller") for words in entry["loop_warnings"])
+        for entry in (loop_entry([G], each, None, w, 1.5) for each in (K, series))
     ]  # what rings of the closed loop is told besides
     assert of_controller[1] == of_controller[0] + 2
 
@@ -152,10 +144,10 @@ def test_margins_on_dense_lines_are_those_of_the_model() -> None:
     omega = np.geomspace(1.0, 3000.0, 20_000)
     L = made.controller_response(omega) @ made.plant_response(omega)
     lines = measured_entry([(omega, L[:, 0, 0])], K, w, 1.5)
-    exact = loop_figures([G], K, None, w).margins
-    assert lines["phase_margin_deg"] == pytest.approx(exact.phase_deg, abs=0.05)
-    assert lines["gain_margin"] == pytest.approx(gain_margin(exact), rel=1e-3)
-    assert lines["delay_margin_us"] == pytest.approx(1e6 * exact.delay, rel=1e-3)
+    exact = loop_entry([G], K, None, w, 1.5)
+    assert lines["phase_margin_deg"] == pytest.approx(exact["phase_margin_deg"], abs=0.05)
+    assert lines["gain_margin"] == pytest.approx(exact["gain_margin"], rel=1e-3)
+    assert lines["delay_margin_us"] == pytest.approx(exact["delay_margin_us"], rel=1e-3)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])

@@ -9,7 +9,7 @@ from helpers import HZ, scaled, two_mass
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.race import WITHIN, distinct, run_race, started
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
 from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.plants.plant import Mechanics
 
@@ -56,9 +56,9 @@ def test_what_is_redrawn_never_loses_what_was_found() -> None:
     """A search that is given the ends of another ends with the best of both."""
     problem = problem_for([plant()], Structure(biquads=0), EASY)
     rng = np.random.default_rng(1)
-    pool = kept(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]
+    pool = stabilising(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]
     first = run_race(problem, pool, lambda words: None)
-    fresh = kept(problem, redrawn(problem, distinct(first, 2), 24, rng))[:3]
+    fresh = stabilising(problem, redrawn(problem, distinct(first, 2), 24, rng))[:3]
     again = run_race(problem, fresh, lambda words: None, before=first)
     assert again[0].merit >= first[0].merit
     assert not any(runner.running for runner in again)
@@ -70,7 +70,7 @@ def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
     bounds = Bounds(S_max=2.5, S_low=0.9, omega_low=0.2 * HZ, shape=1.5)
     problem = problem_for([two_mass(60.0, 60.0)], Structure(biquads=0), bounds)
     inside = 0
-    for kappa in kept(problem, by_rules(problem, np.geomspace(0.01, 0.3, 8))):
+    for kappa in stabilising(problem, by_rules(problem, np.geomspace(0.01, 0.3, 8))):
         point = started(problem, kappa)
         assert np.log(problem.low) <= point.tau <= problem.begin(kappa)
         lowered = point.tau < problem.begin(kappa)

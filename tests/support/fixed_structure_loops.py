@@ -8,7 +8,7 @@ from helpers import HZ, PAPER, SUSPENSION, two_mass_model
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.loop_problem import Curve, Problem
-from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
@@ -47,7 +47,7 @@ def loop(
     rng = np.random.default_rng(seed)
     problem = problem_for([plant(shift) for shift in shifts], structure, BOUNDS, sampling)
     for _ in range(50):
-        found = kept(problem, at_random(problem, np.exp(rng.uniform(-4.0, -1.0, 40)), rng))
+        found = stabilising(problem, at_random(problem, np.exp(rng.uniform(-4.0, -1.0, 40)), rng))
         if len(found):
             return problem, found[0]
     raise AssertionError("no random controller is stable")

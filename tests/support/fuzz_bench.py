@@ -27,7 +27,7 @@ import ccd_casadi.reporting.solve_page
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.stored import keep_version, load_version, only_job, stored_designs
+from ccd_casadi.codesign.stored import keep_version, only_job, stored_designs
 from ccd_casadi.inner import main as inner
 from ccd_casadi.insight import main as insight
 from ccd_casadi.retrain import formulation_in
@@ -225,7 +225,7 @@ def read(argv: list[str]) -> int:
     readers: list[tuple[Any, tuple[type[Exception], ...]]] = [
         (lambda: read_run(folder), (UserError,)),
         (lambda: load(folder / "surrogate.json"), (SurrogateFileError, OSError)),
-        (lambda: load_version(folder, "0001"), (SurrogateFileError, OSError)),
+        (lambda: load(folder / "surrogates/0001.json"), (SurrogateFileError, OSError)),
         (store, (UserError,)),
         (lambda: formulation_in(folder), (UserError,)),
     ]

@@ -187,7 +187,7 @@ def run_folder(rng: random.Random, folder: Path, run: Path) -> Input:
     copy = Path(shutil.copytree(run, folder / "run"))
     (copy / "index.html").write_text("<html>")
     note = "; ".join(spoil_folder(rng, copy) for _ in range(rng.choice([1, 1, 1, 2])))
-    kind = rng.choices(["read", "solve", "retrain", "insight", "surrogate"], [200, 3, 1, 2, 3])[0]
+    kind = rng.choices(["read", "solve", "retrain", "insight"], [200, 6, 1, 2])[0]
     quick = ["--workers", "1", "--quiet"]
     if kind == "read":
         return Input("folder", "read", [str(copy)], note)
@@ -195,9 +195,7 @@ def run_folder(rng: random.Random, folder: Path, run: Path) -> Input:
         return Input("folder", "retrain", [str(copy), "--budget", "4", *quick], note)
     if kind == "insight":
         return Input("folder", "insight", [str(copy), "--points", "2", *quick], note)
-    name = ["--surrogate", rng.choice(["0001", "0001", "0002", "../0001", "index", "", "1"])]
-    more = name if kind == "surrogate" else []
-    words = [str(copy / "case.toml"), "--out", str(copy), "--formulation", "lifted", *quick, *more]
+    words = [str(copy / "case.toml"), "--out", str(copy), "--formulation", "lifted", *quick]
     return Input("folder", "solve", words, note, report=rng.random() < 0.2)
 
 

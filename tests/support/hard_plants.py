@@ -11,6 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.backends.standard_plant import StandardPlant
 
 Rows = list[list[float]]
@@ -23,6 +24,17 @@ class HardPlant:
     gamma: float | None = None
     digits: float = 0.0
     irregular: bool = False
+
+
+def from_parts(
+    A: Array, B: Array, C: Array, D: Array, measured: int, controls: int
+) -> StandardPlant:
+    """Partition a state space: the last `measured` outputs and last `controls` inputs."""
+    A, B, C, D = (np.array(part, dtype=float, ndmin=2) for part in (A, B, C, D))
+    w, z = B.shape[1] - controls, C.shape[0] - measured
+    return StandardPlant(
+        A, B[:, :w], B[:, w:], C[:z], C[z:], D[:z, :w], D[:z, w:], D[z:, :w], D[z:, w:]
+    )
 
 
 def close(plant: StandardPlant, K: StateSpace) -> StateSpace:
@@ -59,7 +71,7 @@ def regularised(plant: StandardPlant, size: float) -> StandardPlant:
 def given(
     A: Rows, B: Rows, C: Rows, D: Rows, measured: int = 1, controls: int = 1
 ) -> StandardPlant:
-    return StandardPlant.from_parts(*(np.array(M, float) for M in (A, B, C, D)), measured, controls)
+    return from_parts(*(np.array(M, float) for M in (A, B, C, D)), measured, controls)
 
 
 def augmented(G: control.StateSpace, W: control.StateSpace, effort: bool) -> StandardPlant:
@@ -74,7 +86,7 @@ def augmented(G: control.StateSpace, W: control.StateSpace, effort: bool) -> Sta
     rows = [Wz, u, e] if effort else [Wz, e]
     C, D = (np.vstack([row[i] for row in rows]) for i in (0, 1))
     assert C.shape[0] == z + effort * m + p
-    return StandardPlant.from_parts(A, B, C, D, p, m)
+    return from_parts(A, B, C, D, p, m)
 
 
 def performance_weight(bandwidth: float, peak: float, low: float) -> control.StateSpace:
@@ -102,7 +114,7 @@ def balancing_board() -> StandardPlant:
     C[2, 4], D[2, 5] = (5e6 - 5e6 * 1e6) / 0.184 / 1e3, 1e6 / 0.184
     C[3, 0], C[4, 1] = 1.0, 1.0
     D[3, 3], D[4, 4] = 0.087266, 0.015
-    return StandardPlant.from_parts(A, B, C, D, 2, 1)
+    return from_parts(A, B, C, D, 2, 1)
 
 
 def skogestad_3_8(first: float, second: float) -> StandardPlant:

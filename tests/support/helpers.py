@@ -335,6 +335,14 @@ def stack_system(plant: StateSpace, controller: StateSpace, weights: Weights):
     return control.ss(loop.A, loop.B @ inject, select @ loop.C, select @ loop.D @ inject)
 
 
+def responses(
+    plant: ScaledPlant, controller: StateSpace, omega: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """G (k, p, m), K (k, m, p) and S (k, p, p) in SI at ω (k,) in rad/s, by dense solves."""
+    G, K = (state_response(system, omega) for system in (plant.plant_si(), controller))
+    return G, K, np.linalg.inv(np.eye(G.shape[1]) + G @ K)
+
+
 def to_control(system: StateSpace) -> control.StateSpace:
     return control.ss(system.A, system.B, system.C, system.D)
 

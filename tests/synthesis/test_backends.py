@@ -12,7 +12,7 @@ import control
 import numpy as np
 import pytest
 from benchmark_scripts import benchmark
-from hard_plants import close, regularised
+from hard_plants import close, from_parts, regularised
 from helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass
 from hypothesis import given
 from hypothesis import strategies as st
@@ -40,7 +40,7 @@ def random_plant(seed: int) -> tuple[StandardPlant, StateSpace]:
     n, w, m, z, p = (int(k) for k in rng.integers(1, 4, 5))
     A = rng.standard_normal((n, n))
     parts = (rng.standard_normal(shape) for shape in ((n, w + m), (z + p, n), (z + p, w + m)))
-    plant = StandardPlant.from_parts(A, *parts, p, m)
+    plant = from_parts(A, *parts, p, m)
     K = StateSpace(*(rng.standard_normal(shape) for shape in ((2, 2), (2, p), (m, 2), (m, p))))
     return plant, K
 

@@ -10,6 +10,7 @@ from helpers import (
     PAPER,
     dense_grid,
     flexible_case,
+    responses,
     sensitivity,
     sensitivity_gain,
     state_response,
@@ -21,7 +22,7 @@ from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.synthesis.closed_loop import handed_out, measure, responses
+from ccd_casadi.synthesis.closed_loop import handed_out, measure
 from ccd_casadi.synthesis.synthesis import Design, Outcome, figures_from_row, synthesise
 
 

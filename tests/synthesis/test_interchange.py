@@ -52,7 +52,7 @@ def test_the_bandwidth_survives_control_and_mat(run: FinishedRun, tmp_path: Path
     assert (K.input_labels, K.output_labels) == (["e1"], ["u1"])
     plant = plant_from_control(G, run.plant.force)
     figures = measure(
-        plant, from_control(K)[0], run.weights,
+        plant, from_control(K), run.weights,
         gamma=run.figures.gamma * (1 + 1e-6), omega_low=OMEGA_LOW,
     )  # fmt: skip
     assert figures.certified
@@ -74,7 +74,7 @@ def test_many_channels_survive_too(seed: int, tmp_path: Path) -> None:
     write_mat(tmp_path / "x.mat", DesignFile(systems))
     found = read_mat(tmp_path / "x.mat").systems
     plant = plant_from_control(to_control(found["G"]), case.plant.force)
-    K = from_control(to_control(found["K"]))[0]
+    K = from_control(to_control(found["K"]))
     figures = measure(plant, K, case.weights, gamma=UNBOUNDED, omega_low=OMEGA_LOW)
     assert figures.bandwidth == pytest.approx(made.figures.bandwidth, rel=1e-9)
 
@@ -94,7 +94,8 @@ def test_a_foreign_file_with_the_matrices_alone(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "x.mat", {"G": parts, "other": 3.0})
     found = read_mat(tmp_path / "x.mat").systems
     assert list(found) == ["G"]
-    assert (found["G"].inputs, found["G"].outputs, found["G"].period) == (("u1",), ("y1",), 0.0)
+    G = found["G"]
+    assert (G.inputs, G.outputs, G.system.period) == (("u1",), ("y1",), 0.0)
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         return Ordered(variant.mechanics, NAMES, names, derivatives)
 
     evaluate, theta = evaluator(stage, True), ca.SX.sym("theta", len(NAMES))
-    mass, constraints = stage.hardware([theta[i] for i in evaluate.place])
+    mass, constraints = stage.hardware([theta[list(names).index(name)] for name in NAMES])
     count = ROWS.get(stage.outputs)
     references = {}
     if stage.modes != TWENTY:

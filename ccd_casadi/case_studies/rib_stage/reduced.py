@@ -46,6 +46,7 @@ from ccd_casadi.case_studies.rib_stage.symmetry import AS, mirror_signs, swap_di
 from ccd_casadi.case_studies.rib_stage.truncation import TWENTY
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.memory import give_back
 from ccd_casadi.support.threads import side_by_side
 
 KNOWN = 1e-4  # of its length: what of a mode's move is beside the basis and not worth a vector
@@ -135,6 +136,7 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> tuple[Basis, ...]:
 
         # That of the tilts takes longest.
         made = tuple(side_by_side(grown, range(len(SQUARE_GROUPS))[::-1])[::-1])
+        give_back()
     _bases[stage] = known, made
     return made
 
@@ -228,12 +230,15 @@ def _modes(stage: RibStage, group: Group, basis: Basis, theta: Array) -> tuple[S
     lower = disc.assembler.mesh.number[:, :, 0].ravel()
     found = []
     for (symmetry,), face in zip(group.images, basis.faces, strict=True):
-        fields = []
+        known, fields = dict[tuple[float, float], Array](), []
         for x, y in [*points_of(stage), *((p.x, p.y) for p in masses)]:
+            here = abs(x), abs(y)
+            if here not in known:  # the corners are one point of the quarter
+                N = np.vstack(disc.assembler.mesh.interpolate(theta, *here))[:, lower]
+                flat = N @ face.reshape(len(face), -1)
+                known[here] = flat.reshape(count, 3, -1) @ modes
             signs = np.array(mirror_signs(symmetry, x < 0.0, y < 0.0), float)[:, None]
-            N = np.vstack(disc.assembler.mesh.interpolate(theta, abs(x), abs(y)))[:, lower]
-            field = (N @ face.reshape(len(face), -1)).reshape(count, 3, -1) @ modes
-            fields.append((signs * field).transpose(0, 2, 1))
+            fields.append((signs * known[here]).transpose(0, 2, 1))
         u, lam, left = np.stack(fields, 3), values, modes
         if masses:
             lam, turn = _lowest(values, u[0, :, :, -len(masses) :])

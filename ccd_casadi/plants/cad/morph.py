@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.plants.cad import solid
+from ccd_casadi.plants.plant import named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
@@ -48,7 +49,7 @@ class Morph:
         """(n, 3) in m. Raises PlantError where an element is inside out."""
         points = np.tensordot(_terms(self._unit(theta), self.exponents), self.coefficients, 1)
         if not solid.volumes(points, self.tets).min() > 0.0:
-            place = ", ".join(f"{n}={v:g}" for n, v in zip(self.names, theta, strict=True))
+            place = named_values(self.names, theta)
             raise PlantError(f"an element of the mesh is inside out at {place}; narrow the bounds")
         return points
 
@@ -109,10 +110,10 @@ def draw_morph(
         for row in theta:
             try:
                 solid.load(gmsh, drawn(row)[0])
-                samples.append(solid.moved(gmsh, mesh))
+                samples.append(solid.moved_points(gmsh, mesh))
             except PlantError as refused:
-                place = ", ".join(f"{n}={v:g}" for n, v in zip(names, row, strict=True))
-                raise PlantError(f"the solid at {place}: {refused}") from refused
+                words = f"the solid at {named_values(names, row)}: {refused}"
+                raise PlantError(words) from refused
             bar.advance()
     flat = np.array(samples).reshape(count, -1)
     fit = np.array([_terms(row, exponents) for row in unit])

@@ -162,9 +162,8 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
         lambda unit: (half * stage.mass_slope(middle + half * unit))[None],
         hessians=True,
     )  # fmt: skip
-    theta, back = ca.MX.sym("theta", len(names)), [morph.names.index(name) for name in names]
-    evaluate = Ordered(stage.mechanics, morph.names, names)
-    own = ca.vertcat(*(theta[i] for i in evaluate.place))
+    theta, evaluate = ca.MX.sym("theta", len(names)), Ordered(stage.mechanics, morph.names, names)
+    own = ca.vertcat(*(theta[list(names).index(name)] for name in morph.names))
     finer = replace(stage, modes=2 * stage.modes)
     evaluate.keep = mass  # CasADi holds no reference to it
     notes = (
@@ -183,7 +182,7 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
         exact_hessian=False,
         values=Ordered(stage.mechanics, morph.names, names, False),
         notes=lambda theta: notes,
-        domain=(morph.lower[back], morph.upper[back]),
+        domain=(morph.lower[evaluate.place], morph.upper[evaluate.place]),
         shapes=lambda theta, count: stage.shapes(evaluate.own(theta), count),
     )
 

@@ -119,7 +119,7 @@ def meshed(gmsh: Any, size: float) -> SolidMesh:
     )
 
 
-def moved(gmsh: Any, mesh: SolidMesh) -> Array:
+def moved_points(gmsh: Any, mesh: SolidMesh) -> Array:
     """The mesh's points (n, 3) on the solid that is loaded.
 
     Raises PlantError where its boundary has other pieces, or where an element turns inside out.

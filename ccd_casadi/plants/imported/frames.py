@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
 from ccd_casadi.plants.imported.modal_table import ModalTable
@@ -93,18 +93,11 @@ def _matched(table: ModalTable, shapes: Array, order: Index, parents: Index, rig
 
 def _groups(omega: Array, rigid: int) -> Groups:
     """Flexible modes in groups that come close, or cross, at some sample."""
-    count = omega.shape[1]
-    label = np.arange(count)
-    for i in range(rigid, count):
-        for j in range(i + 1, count):
-            ratio = np.log(omega[:, j] / omega[:, i])
-            if np.abs(ratio).min() < CLOSE or np.ptp(np.sign(ratio)) > 0.0:
-                label[label == label[j]] = label[i]
-    flexible = label[rigid:]
-    return tuple(
-        tuple(int(k) + rigid for k in np.flatnonzero(flexible == value))
-        for value in dict.fromkeys(flexible.tolist())
-    )
+    x = np.log(omega[:, rigid:])
+    ratio = x[:, :, None] - x[:, None, :]
+    near = (np.abs(ratio).min(axis=0) < CLOSE) | (np.ptp(np.sign(ratio), axis=0) > 0.0)
+    count, label = connected_components(near, directed=False)
+    return tuple(tuple((rigid + np.flatnonzero(label == i)).tolist()) for i in range(count))
 
 
 def _frame(

@@ -16,7 +16,7 @@ import numpy as np
 from ccd_casadi.plants.imported.entries import Entries, fit_entries
 from ccd_casadi.plants.imported.frames import Frame, frames
 from ccd_casadi.plants.imported.modal_table import ModalTable
-from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.plant import Mechanics, named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -30,7 +30,6 @@ class LeftOut:
 
     frequency: float
     response: float
-    worst_row: int
 
 
 class InterpolatedModes:
@@ -44,9 +43,7 @@ class InterpolatedModes:
         counts = (table.omega < rigid_below).sum(axis=1)
         if np.ptp(counts) > 0:
             s = int(counts.argmin())
-            words = ", ".join(
-                f"{n} = {v:g}" for n, v in zip(table.names, table.theta[s], strict=True)
-            )
+            words = named_values(table.names, table.theta[s])
             raise PlantError(
                 f"the sample {words} has {counts[s]} rigid-body modes, another {counts.max()}; "
                 "correct the table, or rigid_below_hz"
@@ -156,7 +153,7 @@ class InterpolatedModes:
             one, other = (self._response(y, frame) for y in (true, found))
             sizes = np.linalg.norm(one, axis=(1, 2))
             response[s] = (np.linalg.norm(other - one, axis=(1, 2)) / sizes).max()
-        return LeftOut(float(frequency.max()), float(response.max()), int(response.argmax()))
+        return LeftOut(float(frequency.max()), float(response.max()))
 
     def _response(self, y: Array, frame: Frame) -> np.ndarray:
         """G at s = (0.1 + j) ω over the band of the modes, undamped."""

@@ -23,6 +23,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 COLUMNS = ("kind", "name", "dof", "gain")
+KNOWN = ("mass", "stiffness", "results", "damping", "hardware_cost")  # of index.csv: no θ
 SHIFT = 1e-9  # of the largest stiffness over mass: K + s M is regular with rigid-body modes too
 SYMMETRIC = 1e-9
 POINTS = 2  # shape values kept for matching, as a multiple of the modes
@@ -38,43 +39,58 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
     index, dofs = read_rows(folder / "index.csv"), read_rows(folder / "dofs.csv", COLUMNS)
     if modes < 1:
         raise PlantError(f"modes = {modes}; keep at least 1")
-    known = ("mass", "stiffness", "damping", "hardware_cost")
-    names = [n for n in index[0] if n not in known and not n.startswith("constraint:")]
-    constraints = [n for n in index[0] if n.startswith("constraint:")]
     for key in ("mass", "stiffness", "damping"):
         if key not in index[0]:
             raise PlantError(f"{folder / 'index.csv'}: has no column {key}; add it")
-    found, bases, sizes = [], [], set()
+    found, bases = [], []
     for row in index:
         M, K = (_matrix(folder / row[key]) for key in ("mass", "stiffness"))
         if M.shape != K.shape:
             raise PlantError(f"{folder / row['mass']}: is {M.shape}, stiffness {K.shape}")
-        B, C, _ = (_selected(folder, dofs, kind, M.shape[0]) for kind in ("in", "out", "shape"))
+        B, C = (_selected(folder, dofs, kind, M.shape[0]) for kind in ("in", "out"))
         extra = np.hstack([B, C]) if static_correction else None
         omega, basis = modes_of(M, K, modes, extra)
         found.append((omega, basis.T @ B, basis.T @ C))
         bases.append(basis)
-        sizes.add(M.shape[0])
-    shapes = _shape_values(folder, dofs, bases, sizes)
+    shapes = _shape_values(folder, dofs, bases)
+    modes_each = [(*one, own) for one, own in zip(found, shapes, strict=True)]
+    return table_of_samples(folder, index, dofs, modes_each)
 
-    def number(row: Mapping[str, str], key: str) -> float:
-        return number_in(folder / "index.csv", key, row.get(key, "0"))
 
-    counts = {len(omega) for omega, _, _ in found}
-    r = min(counts)
+def table_of_samples(
+    folder: Path,
+    index: list[dict[str, str]],
+    dofs: list[dict[str, str]],
+    modes: Sequence[tuple[Array, ...]],
+) -> ModalTable:
+    """The table of ω (r,) in rad/s, inputs, outputs and shapes (r, .) of every sample, of as many
+    modes as every one has; the rest is in the rows of `index.csv` and `dofs.csv`."""
+    columns = [name for name in index[0] if name not in KNOWN]
+    names = [name for name in columns if not name.startswith("constraint:")]
+    constraints = [name for name in columns if name.startswith("constraint:")]
+    r = min(len(omega) for omega, *_ in modes)
+    omega, inputs, outputs, shapes = (
+        np.array([part[:r] for part in parts]) for parts in zip(*modes, strict=True)
+    )
+
+    def numbers(*keys: str) -> Array:
+        place = folder / "index.csv"
+        return np.array([[number_in(place, key, row.get(key, "0")) for key in keys]
+                         for row in index])  # fmt: skip
+
     return ModalTable(
         names=tuple(names),
-        input_names=named(folder, dofs, "in"),
-        output_names=named(folder, dofs, "out"),
+        input_names=names_of_kind(folder, dofs, "in"),
+        output_names=names_of_kind(folder, dofs, "out"),
         constraint_names=tuple(name.split(":", 1)[1] for name in constraints),
-        theta=np.array([[number(row, name) for name in names] for row in index]),
-        omega=np.array([omega[:r] for omega, _, _ in found]),
-        zeta=np.array([[number(row, "damping")] * r for row in index]),
-        inputs=np.array([b[:r] for _, b, _ in found]),
-        outputs=np.array([c[:r] for _, _, c in found]),
-        shapes=shapes[:, :r],
-        cost=np.array([number(row, "hardware_cost") for row in index]),
-        constraints=np.array([[number(row, name) for name in constraints] for row in index]),
+        theta=numbers(*names),
+        omega=omega,
+        zeta=np.tile(numbers("damping"), (1, r)),
+        inputs=inputs,
+        outputs=outputs,
+        shapes=shapes,
+        cost=numbers("hardware_cost")[:, 0],
+        constraints=numbers(*constraints).reshape(len(index), len(constraints)),
     )
 
 
@@ -109,24 +125,20 @@ def modes_of(
     return np.sqrt(np.maximum(lam, 0.0)), basis
 
 
-def _shape_values(
-    folder: Path, dofs: list[dict[str, str]], bases: list[Array], sizes: set[int]
-) -> Array:
+def _shape_values(folder: Path, dofs: list[dict[str, str]], bases: list[Array]) -> list[Array]:
     """Shapes at the dofs named for it; else, on one mesh, where they tell the modes best apart."""
-    r = min(basis.shape[1] for basis in bases)
     if any(row["kind"] == "shape" for row in dofs):
-        chosen = [_selected(folder, dofs, "shape", len(basis)) for basis in bases]
-        return np.array([(basis.T @ S)[:r] for basis, S in zip(bases, chosen, strict=True)])
-    if len(sizes) > 1:
-        return np.zeros((len(bases), r, 0))
+        return [basis.T @ _selected(folder, dofs, "shape", len(basis)) for basis in bases]
+    if len({len(basis) for basis in bases}) > 1:
+        return [np.zeros((basis.shape[1], 0)) for basis in bases]
     _, _, pivots = qr(bases[0].T, mode="economic", pivoting=True)
-    rows = np.sort(pivots[: POINTS * r])
-    return np.array([basis[rows].T[:r] for basis in bases])
+    rows = np.sort(pivots[: POINTS * min(basis.shape[1] for basis in bases)])
+    return [basis[rows].T for basis in bases]
 
 
 def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) -> Array:
     """(n, k) columns that pick the dofs of each name of this kind."""
-    names = named(folder, dofs, kind)
+    names = names_of_kind(folder, dofs, kind)
     found = np.zeros((size, len(names)))
     for row in dofs:
         if row["kind"] == kind:
@@ -139,7 +151,7 @@ def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) ->
     return found
 
 
-def named(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
+def names_of_kind(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
     """Names of this kind in dofs.csv. Raises PlantError where there is no input or no output."""
     names = tuple(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
     if kind != "shape" and not names:

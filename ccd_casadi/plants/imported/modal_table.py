@@ -111,12 +111,9 @@ def write_modal_table(path: Path, table: ModalTable) -> None:
         for s, theta in enumerate(table.theta):
             for i in range(table.omega.shape[1]):
                 shapes = np.concatenate([values[s, i] for _, values in groups.values()])
-                row = [*theta, i + 1, table.omega[s, i] / (2.0 * np.pi), table.zeta[s, i], *shapes]
-                writer.writerow([_word(v) for v in (*row, table.cost[s], *table.constraints[s])])
-
-
-def _word(value: float) -> str:
-    return repr(int(value)) if isinstance(value, int) else repr(float(value))
+                own = [table.omega[s, i] / (2.0 * np.pi), table.zeta[s, i], *shapes, table.cost[s]]
+                writer.writerow([*theta.tolist(), i + 1, *map(float, own),
+                                 *table.constraints[s].tolist()])  # fmt: skip
 
 
 def _read(path: Path) -> tuple[list[str], list[dict[str, float]]]:

@@ -12,7 +12,7 @@ from ccd_casadi.plants.imported.entries import fit_entries
 from ccd_casadi.plants.imported.interpolation import InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
-from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.plants.plant import Mechanics, Plant, named_values
 from ccd_casadi.support.errors import PlantError
 
 NEAREST = "the nearest sample as it stands"
@@ -104,9 +104,7 @@ def _notes(
     modes: InterpolatedModes, names: tuple[str, ...], source: str, theta: Sequence[float]
 ) -> tuple[str, ...]:
     index, distance = modes.nearest(theta)
-    place = ", ".join(
-        f"{name}={value:g}" for name, value in zip(names, modes.table.theta[index], strict=True)
-    )
+    place = named_values(names, modes.table.theta[index])
     frequency, response = 100 * modes.left_out.frequency, 100 * modes.left_out.response
     count = len(modes.table.theta)
     here = f"is {100 * distance:.2g} % of the sampled range away from the nearest sample"

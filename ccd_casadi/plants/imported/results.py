@@ -15,13 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.plants.imported.matrices import named, number_in, read_rows
+from ccd_casadi.plants.imported.matrices import number_in, read_rows, table_of_samples
 from ccd_casadi.plants.imported.modal_table import ModalTable
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-KNOWN = ("results", "damping", "hardware_cost")
 COLUMNS = ("kind", "name", "node", "direction", "gain")
 _VALUE = re.compile(r"[-+]?\d*\.\d+(?:[EeDd]?[-+]\d+)?")
 _VECTOR = re.compile(r"R E A L   E I G E N V E C T O R   N O \.\s+(\d+)")
@@ -45,32 +44,10 @@ def results_table(folder: Path) -> ModalTable:
     for key in ("results", "damping"):
         if key not in index[0]:
             raise PlantError(f"{folder / 'index.csv'}: has no column {key}; add it")
-    names = [n for n in index[0] if n not in KNOWN and not n.startswith("constraint:")]
-    constraints = [n for n in index[0] if n.startswith("constraint:")]
-    modes = [read_modes(folder / row["results"]) for row in index]
-    r = min(len(item.frequency_hz) for item in modes)
-
-    def picked(kind: str) -> Array:
-        return np.array([_picked(folder, dofs, kind, item)[:r] for item in modes])
-
-    def numbers(*columns: str) -> Array:
-        place = folder / "index.csv"
-        return np.array([[number_in(place, c, row.get(c, "0")) for c in columns] for row in index])
-
-    return ModalTable(
-        names=tuple(names),
-        input_names=named(folder, dofs, "in"),
-        output_names=named(folder, dofs, "out"),
-        constraint_names=tuple(name.split(":", 1)[1] for name in constraints),
-        theta=numbers(*names),
-        omega=2.0 * np.pi * np.array([item.frequency_hz[:r] for item in modes]),
-        zeta=np.tile(numbers("damping"), (1, r)),
-        inputs=picked("in"),
-        outputs=picked("out"),
-        shapes=picked("shape"),
-        cost=numbers("hardware_cost")[:, 0],
-        constraints=numbers(*constraints).reshape(len(index), len(constraints)),
-    )
+    kinds = ("in", "out", "shape")
+    modes = [(2.0 * np.pi * one.frequency_hz, *(_picked(folder, dofs, kind, one) for kind in kinds))
+             for one in (read_modes(folder / row["results"]) for row in index)]  # fmt: skip
+    return table_of_samples(folder, index, dofs, modes)
 
 
 def read_modes(path: Path) -> ResultModes:

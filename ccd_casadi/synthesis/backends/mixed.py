@@ -35,12 +35,10 @@ STARTS = (1e3, 1e6)  # finite γ to bisect from; the second where the first is t
 BISECT, SUBOPTIMAL = 1, 4  # SB10AD's jobs
 
 
-def solve_slicot(
-    plant: StandardPlant, *, gamma_backoff: float = 1.02, tolerance: float = 0.0
-) -> Attempt:
+def solve_slicot(plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt:
     """Bisection for γ_opt (job 1), then a controller at gamma_backoff·γ_opt (job 4).
 
-    `tolerance` is absolute in γ (0: SLICOT's own, 1.5e-8). Raises MissingPackage without slycot.
+    Raises MissingPackage without slycot.
     """
     slycot = require("slycot", "slicot")
     whole = balance(plant).whole()
@@ -52,9 +50,9 @@ def solve_slicot(
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # ill-conditioning is for the certificate to judge
-                found = slycot.sb10ad(*size, start, *parts, job=BISECT, gtol=tolerance)
+                found = slycot.sb10ad(*size, start, *parts, job=BISECT)
                 gamma = gamma_backoff * float(found[0])
-                made = slycot.sb10ad(*size, gamma, *parts, job=SUBOPTIMAL, gtol=tolerance)
+                made = slycot.sb10ad(*size, gamma, *parts, job=SUBOPTIMAL)
         except (slycot.exceptions.SlycotError, ValueError) as error:
             reason = " ".join(str(error).split()).rstrip(".")
             continue

@@ -3,8 +3,8 @@
 ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,18 +29,6 @@ class StandardPlant:
     D12: Array
     D21: Array
     D22: Array
-
-    @classmethod
-    def from_parts(
-        cls, A: Array, B: Array, C: Array, D: Array, measured: int, controls: int
-    ) -> "StandardPlant":
-        """Partition a state space: the last `measured` outputs and last `controls` inputs."""
-        A, B, C, D = (np.array(part, dtype=float, ndmin=2) for part in (A, B, C, D))
-        w, z = B.shape[1] - controls, C.shape[0] - measured
-        return cls(
-            A, B[:, :w], B[:, w:], C[:z], C[z:],
-            D[:z, :w], D[:z, w:], D[z:, :w], D[z:, w:],
-        )  # fmt: skip
 
     def whole(self) -> StateSpace:
         """The plant as one state space."""
@@ -72,7 +60,8 @@ def balance(plant: StandardPlant) -> StandardPlant:
     """The same plant in balanced coordinates of its state."""
     whole = plant.whole()
     A, B, C = balanced(whole.A, whole.B, whole.C)
-    return StandardPlant.from_parts(A, B, C, whole.D, plant.C2.shape[0], plant.B2.shape[1])
+    w, z = plant.D11.shape[1], len(plant.D11)
+    return replace(plant, A=A, B1=B[:, :w], B2=B[:, w:], C1=C[:z], C2=C[z:])
 
 
 @dataclass(frozen=True)
@@ -88,7 +77,5 @@ class Attempt:
     reason: str = ""
 
 
-class Solver(Protocol):
-    """H∞ synthesis for any standard plant at gamma_backoff times its own γ_opt."""
-
-    def __call__(self, plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt: ...
+# (plant, gamma_backoff=1.02): H∞ synthesis for any standard plant at that many times its own γ_opt
+Solver = Callable[..., Attempt]
