@@ -14,7 +14,7 @@ from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.support.arrays import Array
 
-AT_ONCE = 10_000  # boxes that are divided
+AT_ONCE = 2_000  # boxes that are divided at a time
 STUCK = 0.25  # of its boxes still open: it would take many times as many to close them
 DECADES = 6.0  # of frequency cells at the start, downwards; below is one cell to 0
 

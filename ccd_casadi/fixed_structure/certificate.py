@@ -138,11 +138,11 @@ def certify(
         shares = bounds.shares(figures) | bounds.channel_shares(figures.channels)
         for name, ratio in shares.items():
             worst[name] = max(worst.get(name, 0.0), ratio)
-    broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in worst.items()
+    broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
     if broken:
-        words = f"exceeds its bound on {', '.join(broken)} (relative)"
+        words = f"exceeds its bound on {', '.join(broken)}"
     elif not bandwidth > 0.0:
         words = "S does not start below -3 dB on every plant"
     elif lost:

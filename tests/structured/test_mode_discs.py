@@ -239,6 +239,7 @@ def test_every_figure_of_several_channels_is_proven_where_the_boxes_suffice() ->
     assert few.stable
     assert not few.proven
     assert max(few.levels.values()) > 1.05
+    assert all(proof.levels[name] <= level for name, level in few.levels.items())
     tight = replace(bounds, compliance_max=0.9 * bounds.compliance_max)
     refuted = prove(box, BOTH, KAPPA, 1.0, tight, LATE, slack=1e-3)
     assert refuted.outcome is ProofOutcome.REFUTED
