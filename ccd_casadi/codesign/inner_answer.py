@@ -44,7 +44,7 @@ from ccd_casadi.inner_problem.structured_robustness import (
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
-from ccd_casadi.lti.closed_loop import open_alone
+from ccd_casadi.lti.closed_loop import equivalent_open_loop
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
@@ -201,7 +201,7 @@ def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
         return {}
     joints = [(HZ * one.hz, one.matrix @ controller_response(made.controller, one.hz, case.period))
               for one in case.responses]  # fmt: skip
-    loops = [(omega, open_alone(L, i)) for omega, L in joints for i in range(L.shape[1])]
+    loops = [(omega, equivalent_open_loop(L, i)) for omega, L in joints for i in range(L.shape[1])]
     return measured_entry(loops, made.controller, made.bandwidth, made.figures.S_peak)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
@@ -55,7 +55,7 @@ def assess(
     """
     plants = problem.plants
     poles = closed_loops(plants, problem.structure, kappa)[0]
-    good = stable(poles)
+    good = all_stable(poles)
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
     several = len(plants.out) > 1

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.fixed_structure import Certificate, SectionsDesign, certify
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
@@ -105,7 +105,7 @@ def judged_widely(
     controller: StateSpace,
     worst: Excess,
     workers: Pool | None = None,
-) -> tuple[Certificate, int]:
+) -> tuple[SetCertificate, int]:
     """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
 
     The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
@@ -191,7 +191,7 @@ def tolerance_prices(
 
 def judged_corners(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
-) -> Certificate:
+) -> SetCertificate:
     """The same on the model of every option and the corners of the box."""
     uncertain = uncertain_plant(problem, theta)
     return _judged(problem, uncertain.plants(uncertain.corners()), controller)
@@ -202,7 +202,7 @@ def _judged(
     plants: Sequence[ScaledPlant],
     controller: StateSpace,
     workers: Pool | None = None,
-) -> Certificate:
+) -> SetCertificate:
     structured, bounds = structured_of(problem), bounds_of(problem)
     integrator = structure_of(problem).integrator
     return certify(

@@ -76,7 +76,7 @@ def test_the_table_of_the_docs(
         assert shown[2] in README
         assert own["S_max"] == 1.5
         assert "(S_max 1.5)" in channel_words(own)
-        assert "(at least 1.25 omega_b)" in channel_words(own)
+        assert "(at least 1.25 ω_b)" in channel_words(own)
         assert "S_max of channel tilt" in active_of(made)
 
 
