@@ -264,7 +264,9 @@ class StructuredOuter(ThetaOuter):
             problem, best.theta, made.controller, worst, sampler.workers
         )
         proof = proof_of(problem, best.theta, made, sampler.workers)
-        drawn = None if proof.close else fresh_yield(problem, best.theta, made, sampler.workers)
+        drawn = (
+            None if proof.conclusive else fresh_yield(problem, best.theta, made, sampler.workers)
+        )
         with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
