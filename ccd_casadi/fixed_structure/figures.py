@@ -85,12 +85,10 @@ def assess(
         curve.append(np.full(len(row[-1]), end_curve))
         at.append(np.repeat(place[numbers], P))
     i, j, c, k = np.nonzero(regular[..., None, None] & (value > -within))
-    return Assessment(
-        True,
-        poles,
-        constraints(problem, kappa, tau, *(np.concatenate(part) for part in (curve, row, at))),
-        constraints(problem, kappa, tau, curves[c], i + k * P, v[i, j]),
-    )
+    count = sum(map(len, curve))
+    parts = ((*curve, curves[c]), (*row, i + k * P), (*at, v[i, j]))
+    found = constraints(problem, kappa, tau, *(np.concatenate(part) for part in parts))
+    return Assessment(True, poles, found.only(slice(count)), found.only(slice(count, None)))
 
 
 def constraints(

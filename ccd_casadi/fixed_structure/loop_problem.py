@@ -213,8 +213,8 @@ class Constraints:
     to_kappa: Array
     to_tau: Array
 
-    def only(self, chosen: np.ndarray) -> "Constraints":
-        """Some of them, by mask or index."""
+    def only(self, chosen: np.ndarray | slice) -> "Constraints":
+        """Some of them, by mask, index or slice."""
         parts = (self.curve, self.plant, self.v, self.value, self.to_kappa, self.to_tau)
         return Constraints(*(part[chosen] for part in parts))
 

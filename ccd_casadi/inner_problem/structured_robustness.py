@@ -6,6 +6,7 @@ of the box beside them, branch and bound at all of it.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -157,6 +158,12 @@ def proof_of(
         uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
         bounds_of(problem), structured.sampling, workers=workers,
     )  # fmt: skip
+
+
+def looked(task: tuple[Any, ...]) -> tuple[str, Any]:
+    """What a function says of a design, by the function's name: for a worker process."""
+    look, *design = task
+    return look.__name__, look(*design)
 
 
 def tolerance_prices(
