@@ -254,7 +254,7 @@ class StructuredOuter(ThetaOuter):
         kkt = theta_kkt(problem, best, asked, end.found.envelope, beside if known else None)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made, asked.workers)
-        drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
+        drawn = None if proof.conclusive else fresh_yield(problem, best.theta, made, asked.workers)
         with Progress(1, "what limits it", quiet=asked.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = asked.kept("costs", best.theta, Costs, make)

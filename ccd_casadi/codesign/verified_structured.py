@@ -16,7 +16,7 @@ from ccd_casadi.codesign.structured_entries import (
 )
 from ccd_casadi.codesign.verdict import Line, State, survives
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import touched
@@ -72,7 +72,7 @@ class VerifiedStructured(Verified):
 
     design: SectionsDesign
     raced: StructuredValue
-    wide: Certificate
+    wide: SetCertificate
     checked: int
     proof: Proof
     drawn: Yield | None

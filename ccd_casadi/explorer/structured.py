@@ -12,7 +12,7 @@ import numpy as np
 
 from ccd_casadi.explorer.designs import How, Look, Standing, elements_at, without_controller
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.fixed_structure import Certificate as SetCertificate
+from ccd_casadi.fixed_structure import SetCertificate
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.inner_problem.constraints import unmet

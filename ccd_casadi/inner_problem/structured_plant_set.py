@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
-from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, near
+from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, nearby_model
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -105,7 +105,7 @@ def nearby(
     problem: CoDesignProblem, known: Sequence[Sequence[float]], here: Sequence[float]
 ) -> tuple[Evaluate, ...]:
     """The model with every option set, from what is known at some θ; see `plants.plant.near`."""
-    return tuple(near(plant_of(option), known, here) for option in _options(problem))
+    return tuple(nearby_model(plant_of(option), known, here) for option in _options(problem))
 
 
 def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:

@@ -6,11 +6,12 @@ of the box beside them, branch and bound at all of it.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.fixed_structure import Certificate, SectionsDesign, certify
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
@@ -104,7 +105,7 @@ def judged_widely(
     controller: StateSpace,
     worst: Excess,
     workers: Pool | None = None,
-) -> tuple[Certificate, int]:
+) -> tuple[SetCertificate, int]:
     """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
 
     The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
@@ -159,6 +160,12 @@ def proof_of(
     )  # fmt: skip
 
 
+def looked(task: tuple[Any, ...]) -> tuple[str, Any]:
+    """What a function says of a design, by the function's name: for a worker process."""
+    look, *design = task
+    return look.__name__, look(*design)
+
+
 def tolerance_prices(
     problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
 ) -> dict[str, float]:
@@ -184,7 +191,7 @@ def tolerance_prices(
 
 def judged_corners(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
-) -> Certificate:
+) -> SetCertificate:
     """The same on the model of every option and the corners of the box."""
     uncertain = uncertain_plant(problem, theta)
     return _judged(problem, uncertain.plants(uncertain.corners()), controller)
@@ -195,7 +202,7 @@ def _judged(
     plants: Sequence[ScaledPlant],
     controller: StateSpace,
     workers: Pool | None = None,
-) -> Certificate:
+) -> SetCertificate:
     structured, bounds = structured_of(problem), bounds_of(problem)
     integrator = structure_of(problem).integrator
     return certify(
