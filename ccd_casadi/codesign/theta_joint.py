@@ -294,10 +294,13 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         return [self.loops(np.array(z), BESIDE * unit) for unit in np.eye(len(z))]
 
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
-        """With every loop stable."""
+        """With every loop stable, and masses that are positive to first order."""
         x = np.clip(x, self.low, self.high)
         z, kappa, tau = self.parts(x)
-        problem = self.loops(z)
+        try:
+            problem = self.loops(z)
+        except np.linalg.LinAlgError:  # placed masses move so far that M + ∂M Δθ is indefinite
+            return None
         found = assess(problem, kappa, tau)
         if not found.stable:
             return None
@@ -330,8 +333,12 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         of_z = np.pad(own.slopes, ((0, 0), (0, len(here.x) - count)))
 
         def second(index: np.ndarray) -> Array:
-            beside = self.loops_beside(tuple(z.tolist()))
-            return hessians(problem, kappa, tau, found.only(index), beside)
+            chosen = found.only(index)
+            try:
+                beside = self.loops_beside(tuple(z.tolist()))
+            except np.linalg.LinAlgError:  # as in `at`: no curvature is known at the edge
+                return np.zeros((len(chosen.value), len(here.x), len(here.x)))
+            return hessians(problem, kappa, tau, chosen, beside)
 
         return Rows(
             np.concatenate([found.value, own.constraints + INSIDE]), np.vstack([slopes, of_z]),

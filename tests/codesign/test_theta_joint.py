@@ -123,6 +123,21 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         assert told == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
 
 
+def test_a_step_to_where_masses_are_no_longer_positive_is_no_step() -> None:
+    """As placed masses do, whose M to first order is indefinite far away."""
+    problem, theta = built(), (60.0, 60.0)
+    found = mechanics(plant_of(problem), theta)
+    falling = replace(found, derivatives=(np.array([-found.M, -found.M]), *found.derivatives[1:]))
+    at = JointPoint(theta, tuple(STORED["sections"]["kappa"]), 2.0 * np.pi * 20.0)
+    model = JointModel(problem, [lambda z: to_first_order(falling, np.array(z) - theta)], at, 0.3)
+    far = model.start.copy()
+    far[:2] += 0.2  # of the box: some kilograms, at a loss of all mass for each
+    with pytest.raises(np.linalg.LinAlgError):
+        model.loops(far[:2])
+    assert model.at(far) is None
+    assert model.at(model.start) is not None
+
+
 def test_where_each_theta_is_dear_none_is_sampled() -> None:
     runs = ROOT / "runs"
     chosen = {name: usual_name(load_case(runs / f"{name}.toml"), 6)
