@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.grid import climbed
+from ccd_casadi.lti.grid import refine_peak
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -123,7 +123,7 @@ def compliance_of(plant: ScaledPlant, controller: StateSpace) -> Compliance:
     gain, omega = hinf_norm(loop)
     if not np.isfinite(gain) or omega <= 0.0:
         return Compliance(gain, omega, plant)
-    at, top = climbed(
+    at, top = refine_peak(
         lambda w: float(gains(loop, np.array([w]))[0]),
         omega * np.exp(-WITHIN), omega * np.exp(WITHIN),
     )  # fmt: skip
