@@ -15,7 +15,7 @@ import numpy as np
 
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.synthesis.weights import Weights
@@ -82,7 +82,7 @@ def chain_problem(seed: int) -> CoDesignProblem:
         M_K=float(rng.uniform(1.0, 4.0)) * total * crossing**2, A_l=1.0, A_u=1e-2,
         omega_T=crossing,
     )  # fmt: skip
-    inner = InnerProblem(
+    inner = InnerBounds(
         S_max=float(rng.uniform(1.6, 2.2)),
         S_low=0.1,
         omega_low=crossing / 30.0,

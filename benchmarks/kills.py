@@ -55,7 +55,7 @@ if __name__ == "__main__":
     with SampleStore(sys.argv[1] + "/samples.sqlite") as store, Workers(2) as workers:
         sampler = Sampler(problem, store, workers)
         rng = np.random.default_rng(0)
-        sampler.bandwidths(rng.uniform(55.0, 70.0, (30, 2)))
+        sampler.values(rng.uniform(55.0, 70.0, (30, 2)))
         sampler.quantities(rng.uniform([55, 55, 5, 5.1], [70, 70, 9, 8.7], (40, 4)))
 """
 

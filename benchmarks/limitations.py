@@ -24,7 +24,7 @@ from random_sections import HZ, WHOLE, case, climbed
 
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.limitations.bound import inside, outside
+from ccd_casadi.limitations.bound import lower_bound, upper_bound
 from ccd_casadi.limitations.limits import limits_of
 from ccd_casadi.limitations.of_problem import Gap, gap_of
 from ccd_casadi.support.errors import UserError
@@ -40,10 +40,10 @@ def row(seed: int) -> dict[str, Any] | None:
         uncertain.plant(uncertain.nominal).plant_si(), asked.bounds, asked.sampling,
         integrator=asked.structure.integrator,
     )  # fmt: skip
-    most = outside(limits)
+    most = upper_bound(limits)
     between = perf_counter()
     found = {"design": design.bandwidth / HZ, "outside": most / HZ if most < np.inf else None}
-    found |= {"inside": inside(limits, most) / HZ, "seconds_inside": perf_counter() - between}
+    found |= {"inside": lower_bound(limits, most) / HZ, "seconds_inside": perf_counter() - between}
     return {"seed": seed, **found, "seconds_outside": between - begun}
 
 
@@ -70,7 +70,7 @@ def shipped() -> None:
 
 def show(name: str, hz: float, found: Gap, seconds: float) -> None:
     """Over its bound a design would refute it."""
-    most = found.outside / HZ
+    most = found.upper_bound / HZ
     print(f"{name}: {hz:.2f} Hz, bound {most:.2f} Hz, gap {100.0 * (most / hz - 1.0):.0f} %, "
           f"{seconds:.1f} s of a processor{', REFUTED' if hz > most else ''}",
           flush=True)  # fmt: skip

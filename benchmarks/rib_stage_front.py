@@ -41,7 +41,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structured_of,
     with_options,
 )
-from ccd_casadi.inner_problem.structured_robustness import worst_members
+from ccd_casadi.inner_problem.structured_robustness import worst_case
 from ccd_casadi.inner_problem.structured_search import ROUNDS, prepared, with_range
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -120,12 +120,12 @@ def on_the_whole_set(
 
     `worst_excess`: by how much a last search of the box, with another seed, passed a bound.
     """
-    sections = replace(structured_of(problem), anchors=(tuple(map(float, kappa)),))
+    sections = replace(structured_of(problem), warm_starts=(tuple(map(float, kappa)),))
     asked = replace(problem, controller=sections, start=theta)
     asked, made = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
     if not made.certified or made.certificate is None:
         return {"certified": False, "reason": made.words}
-    worst = worst_members(asked, theta, made, turn=ROUNDS)[0]
+    worst = worst_case(asked, theta, made, turn=ROUNDS)[0]
     return {
         "certified": True,
         "bandwidth_hz": made.bandwidth / HZ,

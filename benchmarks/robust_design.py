@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Certificate, Sampling, SectionsDesign, Structure
+from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate, Structure
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.channel_design import synthesise
@@ -23,7 +23,7 @@ class RobustDesign:
 
     design: SectionsDesign
     added: tuple[tuple[int, Array], ...]
-    certificate: Certificate | None
+    certificate: SetCertificate | None
     proof: Proof | None
 
     @property
@@ -63,7 +63,7 @@ def synthesise_robustly(
         members = members + _apart(heads, members, uncertain.box)
         made = synthesise(uncertain.plants(members), structure, bounds, sampling=sampling,
                           seed=seed, initial=[made.kappa], only_initial=True)  # fmt: skip
-    judged: Certificate | None = None
+    judged: SetCertificate | None = None
     proof: Proof | None = None
     if made.certified and made.controller is not None:
         points = [*lattice(uncertain, count, seed + 1000), (worst.option, worst.point)]

@@ -22,7 +22,7 @@ import slycot
 from problems import BACKOFF, HZ, OMEGA_LOW, Problem, stage, two_masses, weights
 
 from ccd_casadi.inner_problem.search import search_inner
-from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.kernels.design import design, judge, sweep
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.gamma import optimal_gamma
@@ -136,7 +136,7 @@ def one_cold(problem: Problem) -> tuple[float, str]:
 
 def inner_optimum(problem: Problem) -> tuple[float, int]:
     """Time of one ω_b*(θ) by `search_inner`, and its syntheses."""
-    box = InnerProblem(
+    box = InnerBounds(
         omega_S=(200 * HZ, 2000 * HZ), omega_T=(20 * HZ, 1000 * HZ), S_max=1.75, S_low=0.05,
         omega_low=OMEGA_LOW,
     )  # fmt: skip

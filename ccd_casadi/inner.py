@@ -28,6 +28,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, structured_answer
     from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
     from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+    from ccd_casadi.inner_problem.structured_robustness import worst_case
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.process_pool import Workers
 
@@ -45,7 +46,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     answer = {MixedSensitivityProblem: mixed_answer, StructuredProblem: structured_answer}
     with Workers(options.workers) as workers:
         if isinstance(problem.controller, StructuredProblem):
-            workers.begin(structured_answer.__module__)
+            workers.begin(worst_case.__module__)  # which imports little more than searches need
         how = InnerOptions(options.seed, workers, PROGRESS, point, options.begin_at)
         try:
             found = answer[type(problem.controller)](problem, theta, how)

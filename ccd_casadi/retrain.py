@@ -42,7 +42,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         SampleStore(folder / "samples.sqlite") as store,
     ):
         outer = outer_of(Sampler(problem, store, workers, quiet=options.quiet))
-        outer = outer.continued(folder, options.seed)
+        outer = outer.resumed(folder, options.seed)
         sampler = outer.sampler
 
         def write(solution: "Solution") -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ccd_casadi.analysis.motor import UNLIMITED, Motion, MotionAt, motion_at
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.plants.fixed import through
+from ccd_casadi.plants.fixed import reparametrised
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.scaling import scale_plant
@@ -77,7 +77,7 @@ def with_motion(
         ends = (motor.moving_mass[0], motor.moving_mass[-1])
         domain = (np.insert(domain[0], place, ends[0]), np.insert(domain[1], place, ends[1]))
     hardware, limited = _hardware(plant, own, names)
-    return through(
+    return reparametrised(
         plant, of, own.own, names=tuple(names), evaluate=own, hardware=hardware, domain=domain,
         constraint_names=(*plant.constraint_names, *limited),
         exact_hessian=plant.exact_hessian and not limited,

@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.lti.closed_loop import largest, responses_of
-from ccd_casadi.lti.grid import around, climbed, frequency_grid, light, local_maxima
+from ccd_casadi.lti.closed_loop import responses_of, sigma_max
+from ccd_casadi.lti.grid import frequency_grid, local_maxima, refine_peak, resonant, root_flanks
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -119,9 +119,9 @@ def loop_view(
     high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
     if model.sampling is not None:
         high = END * 0.5 / model.sampling.period
-    roots = [light(loop.plant.poles) for loop in loops]
-    roots += [light(model.controller.rates), light(model.plant.zeros(_unit(model)))]
-    near = around(np.concatenate(roots), FLANKS) / HZ
+    roots = [resonant(loop.plant.poles) for loop in loops]
+    roots += [resonant(model.controller.rates), resonant(model.plant.zeros(_unit(model)))]
+    near = root_flanks(np.concatenate(roots), FLANKS) / HZ
     places = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
     hz = frequency_grid(low, high, points, near, places, apart=SAME)
     sizes, opened, first = [], [], None
@@ -129,7 +129,7 @@ def loop_view(
         G, K = loop.responses(HZ * hz)
         first = first or (G, K)
         parts = responses_of(G, K)
-        sizes.append([largest(parts[name]) for name in (*NAMES, "GS")])
+        sizes.append([sigma_max(parts[name]) for name in (*NAMES, "GS")])
         opened.append(G @ K)
     assert first is not None
     return LoopView(
@@ -142,12 +142,12 @@ def peaks_of(loop: Loop) -> tuple[tuple[float, float], ...]:
     """Local maxima of σ_max(S) above 1 as (Hz, gain), ascending."""
 
     def gain(omega: Array) -> Array:
-        return largest(loop.sensitivity(omega))
+        return sigma_max(loop.sensitivity(omega))
 
     grid = loop.grid()
     values = gain(grid)
     tops = [i for i in local_maxima(values) if values[i] > 1.0]
-    found = [climbed(lambda w: float(gain(np.array([w]))[0]), grid[i - 1], grid[i + 1])
+    found = [refine_peak(lambda w: float(gain(np.array([w]))[0]), grid[i - 1], grid[i + 1])
              for i in tops]  # fmt: skip
     return tuple((omega / HZ, height) for omega, height in found)
 
@@ -158,7 +158,7 @@ def _unit(loop: Loop) -> float:
 
 def _hz(roots: np.ndarray) -> tuple[float, ...]:
     """Frequencies in Hz of lightly damped pairs, ascending."""
-    return tuple(float(value) for value in np.abs(light(roots)) / HZ)
+    return tuple(float(value) for value in np.abs(resonant(roots)) / HZ)
 
 
 def frequency_and_damping(poles: np.ndarray) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ import numpy as np
 from ccd_casadi.budget.loops import FORCES, process
 from ccd_casadi.budget.sources import Kind, Source
 from ccd_casadi.lti.closed_loop import sensitivity
-from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -188,7 +188,7 @@ def panels(loop: Loop, source: Source) -> Array:
     else:
         low, high = corners[0], corners[-1]
     points = 2 + int(PER_DECADE * np.log10(high / low))
-    special = (corners, sizes, around(roots, FLANKS))
+    special = (corners, sizes, root_flanks(roots, FLANKS))
     return np.asarray(frequency_grid(low, high, points, *special, apart=1e-9) / HZ)
 
 

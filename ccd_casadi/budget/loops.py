@@ -19,7 +19,7 @@ from scipy.linalg import expm, matrix_balance
 
 from ccd_casadi.budget.sources import Kind, Source
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import Sampling, delayed, parts, tustin
+from ccd_casadi.lti.hold import Sampling, delay_parts, delayed, tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 
@@ -151,7 +151,7 @@ def process(loop: Loop, source: Source) -> Process:
 def _held(G: StateSpace, hold: Sampling) -> StateSpace:
     """The plant behind hold and delay, states [x; u_{k-1}; …]; A their change over a period."""
     n, m = G.B.shape
-    whole, rest = parts(hold.period, hold.delay)
+    whole, rest = delay_parts(hold.period, hold.delay)
     (late, late_in), (early, early_in) = over(G.A, hold.period - rest), over(G.A, rest)
     gains = [np.zeros((n, m))] * whole + [late_in @ G.B, (early_in + late @ early_in) @ G.B]
     change = late + early + late @ early

@@ -16,7 +16,7 @@ from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import with_options
-from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
@@ -78,7 +78,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         w2=case.objective.w2,
         cost_unit=case.objective.cost_unit,
         weights=weights_of(case.controller, case.weights, inner),
-        inner=InnerProblem(
+        inner=InnerBounds(
             S_max=inner.S_max,
             S_low=inner.S_low,
             omega_low=HZ * inner.omega_low_hz,

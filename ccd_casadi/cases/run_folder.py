@@ -22,8 +22,8 @@ from ccd_casadi.inner_problem.controller_problem import ControllerProblem, Mixed
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
-from ccd_casadi.inner_problem.structured_robustness import judged_corners
-from ccd_casadi.inner_problem.structured_search import joined, with_range
+from ccd_casadi.inner_problem.structured_robustness import certify_corners
+from ccd_casadi.inner_problem.structured_search import with_range, with_warm_start
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -149,11 +149,11 @@ def _read_structured(
     structure = structure_of(problem)
     kappa = np.array(sections_kappa(folder, structure))
     controller = controller_of(structure, kappa)
-    judged = judged_corners(problem, theta, controller)
+    judged = certify_corners(problem, theta, controller)
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
-    problem = joined(with_function(folder / "result.json", problem, result), kappa, ())
+    problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa, ())
     figures = measure(
         scaled_plant(problem, theta), controller, problem.weights, gamma=UNBOUNDED,
         omega_low=problem.inner.omega_low,
@@ -165,7 +165,7 @@ def _read_structured(
 def with_function(
     path: Path, problem: CoDesignProblem, result: Mapping[str, Any]
 ) -> CoDesignProblem:
-    """The problem with the anchors and the plant set that a run ended with: its ω_b*(θ).
+    """The problem with the warm starts and the plant set that a run ended with: its ω_b*(θ).
 
     Raises UserError where result.json holds others.
     """
@@ -173,8 +173,8 @@ def with_function(
     if "anchors" not in result:
         return problem  # of an earlier version
     try:
-        anchors = tuple(tuple(map(float, kappa)) for kappa in result["anchors"])
-        members = tuple(
+        warm_starts = tuple(tuple(map(float, kappa)) for kappa in result["anchors"])
+        scenarios = tuple(
             (int(item["option"]), tuple(map(float, item["point"])))
             for item in result["robust"]["set"]
         )
@@ -184,9 +184,15 @@ def with_function(
         words = "anchors, robust.set and seed are not those of a solve; solve the case again"
         raise UserError(f"{path}: {words}") from None
     own = len(structure_of(problem).names)
-    if any(len(kappa) != own for kappa in (*anchors, *slower)):
+    if any(len(kappa) != own for kappa in (*warm_starts, *slower)):
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
-    found = replace(structured, anchors=anchors, members=members, seed=seed, error_anchors=slower)
+    found = replace(
+        structured,
+        warm_starts=warm_starts,
+        scenarios=scenarios,
+        seed=seed,
+        error_warm_starts=slower,
+    )
     return with_range(replace(problem, controller=found))
 
 

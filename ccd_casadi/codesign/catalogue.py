@@ -124,7 +124,9 @@ def best_of_lists(
     most = count // 2 if count > FEW else 0
     while open_:
         part = min(open_, key=lambda p: (p.lost, p.bound, p.count > 1, away(p.lists, p.theta)))
-        least = _least(problem, best)
+        least = np.inf  # a design that is not verified cuts nothing
+        if best is not None and best.result["status"] == "verified":
+            least = best.result["objective"] - _same(problem, best)
         if part.bound >= least or (part.lost and np.isfinite(least)):
             break
         open_.remove(part)
@@ -183,13 +185,6 @@ def _same(problem: CoDesignProblem, found: Solution) -> float:
     cost, J = (float(found.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
     share = problem.w1 * cost
     return NO_BETTER * (abs(share) + abs(J - share)) if np.isfinite(J) else 0.0
-
-
-def _least(problem: CoDesignProblem, best: Solution | None) -> float:
-    """The J from which on a part is cut: a design that is not verified cuts nothing."""
-    if best is None or best.result["status"] != "verified":
-        return np.inf
-    return float(best.result["objective"]) - _same(problem, best)
 
 
 def _children(width: Mapping[str, float], lists: Lists, theta: Mapping[str, float]) -> list[Lists]:

@@ -16,7 +16,7 @@ import numpy as np
 from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.formulation import FormulationResult, Terms
 from ccd_casadi.codesign.outer import Outer
-from ccd_casadi.codesign.search import concluded_at
+from ccd_casadi.codesign.search import conclude_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
@@ -79,7 +79,7 @@ def best_over_design_plants(
                 share = max(share, held)
                 if held >= 1.0:
                     outcome = FormulationResult(x, agreed=True, message=CONTINUED)
-                    there = concluded_at(outer_of(each), outcome, terms)
+                    there = conclude_at(outer_of(each), outcome, terms)
                     found[i] = min(found[i], there, key=order)
     violation = [np.inf if each.nearest is None else each.nearest.violation for each in samplers]
     best = min(range(len(found)), key=lambda i: (*order(found[i]), violation[i]))
@@ -91,7 +91,7 @@ def best_over_design_plants(
         tried = dict(zip(names, told, strict=True))
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     sampler.nearest = samplers[best].nearest
-    result["reason"] = outer_of(sampler).explained(found[best], share)
+    result["reason"] = outer_of(sampler).failure_reason(found[best], share)
     return replace(found[best], result=result, problem=choices[best])
 
 

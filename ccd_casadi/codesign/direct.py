@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import kkt_certificate, newton_step
 from ccd_casadi.codesign.peak_constraints import other_peaks
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.objective import objective, objective_terms
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -101,7 +101,7 @@ def true_objective(problem: CoDesignProblem, x: Array, design: Sensitivities) ->
 
 def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
     """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
-    return problem.inner.feasible(design.figures) and not unmet(problem, x[: len(problem.names)])
+    return problem.inner.feasible(design.figures) and not violated(problem, x[: len(problem.names)])
 
 
 def _residual(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:

@@ -64,7 +64,7 @@ class Terms:
 
 
 @dataclass(frozen=True)
-class BoxLook:
+class GlobalCheck:
     """What was looked at: true inner problems at `points` θ, `feasible` of these with a design.
 
     `better`: how many of them beat the J that the formulation came `before` with; `starts` local

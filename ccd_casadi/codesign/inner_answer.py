@@ -35,11 +35,16 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
-from ccd_casadi.inner_problem.structured_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.inner_problem.structured_robustness import (
+    certify_lattice,
+    looked,
+    proof_of,
+    worst_case,
+)
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
-from ccd_casadi.lti.closed_loop import open_alone
+from ccd_casadi.lti.closed_loop import equivalent_open_loop
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
@@ -196,14 +201,8 @@ def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
         return {}
     joints = [(HZ * one.hz, one.matrix @ controller_response(made.controller, one.hz, case.period))
               for one in case.responses]  # fmt: skip
-    loops = [(omega, open_alone(L, i)) for omega, L in joints for i in range(L.shape[1])]
+    loops = [(omega, equivalent_open_loop(L, i)) for omega, L in joints for i in range(L.shape[1])]
     return measured_entry(loops, made.controller, made.bandwidth, made.figures.S_peak)
-
-
-def _looked(task: tuple[Any, ...]) -> tuple[str, Any]:
-    """What a function says of a design, by the function's name."""
-    look, *design = task
-    return look.__name__, look(*design)
 
 
 def structured_answer(
@@ -221,8 +220,8 @@ def structured_answer(
     structured = replace(structured_of(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, controller=structured)), start=theta)
     if begin_at is not None:
-        anchors = (sections_kappa(begin_at, structure_of(asked)),)
-        asked = replace(asked, controller=replace(structured_of(asked), anchors=anchors))
+        warm_starts = (sections_kappa(begin_at, structure_of(asked)),)
+        asked = replace(asked, controller=replace(structured_of(asked), warm_starts=warm_starts))
     asked, made = prepared(asked, progress, workers, begin_at is not None)
     fastest = made.bandwidth
     asked, made, least = least_from(asked, theta, made, progress)
@@ -238,11 +237,11 @@ def structured_answer(
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
-    looks = [(look, asked, theta, made) for look in (worst_members, proof_of)]
-    found = dict(workers.map_unordered(_looked, looks))
-    (worst, _), proof = found[worst_members.__name__], found[proof_of.__name__]
+    looks = [(look, asked, theta, made) for look in (worst_case, proof_of)]
+    found = dict(workers.map_unordered(looked, looks))
+    (worst, _), proof = found[worst_case.__name__], found[proof_of.__name__]
     assert made.controller is not None
-    wide, checked = judged_widely(asked, theta, made.controller, worst, workers)
+    wide, checked = certify_lattice(asked, theta, made.controller, worst, workers)
     passed = wide.passed and not proof.refuted
     figures = head | {
         **design_dict(asked, theta, made),

@@ -17,11 +17,11 @@ from ccd_casadi.codesign.outer_problem import (
     nested_program,
     solve_program,
 )
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design, fit, to_casadi
 
@@ -79,12 +79,12 @@ def solve_nested(
         thetas = _allowed(problem, np.unique(thetas, axis=0))
     else:
         thetas = given.thetas
-    samples = sampler.bandwidths(thetas)
+    samples = sampler.values(thetas)
     if not any(sample.feasible for sample in samples):
         return FormulationResult(message="no sampled theta is feasible")
     iterates: list[Iterate] = []
 
-    def value_of(sample: BandwidthSample) -> float:
+    def value_of(sample: InnerSample) -> float:
         return objective(problem, sample.theta, sample.value)
 
     def refine(number: int) -> None:
@@ -92,15 +92,13 @@ def solve_nested(
         low, high = _region(problem, _best(problem, samples), radius)
         new = design("lhs", low, high, 2 * len(lower) + 1, seed + number)
         with sampler.spent.on("rounds"):
-            samples.extend(
-                sampler.bandwidths(_allowed(problem, new), f"refining round {number + 1}")
-            )
+            samples.extend(sampler.values(_allowed(problem, new), f"refining round {number + 1}"))
 
     radius, agreed = 1.0, False
     surrogate: GaussianProcess | None = None
     solution: OuterSolution | None = None
     for round_number in range(options.max_refinements + 1):
-        samples, raised = sampler.latest(samples), sampler.raised
+        samples, improvements = sampler.latest(samples), sampler.improvements
         best = _best(problem, samples)
         low, high = _region(problem, best, radius)
         local = _local(samples, low, high, upper - lower)
@@ -121,7 +119,7 @@ def solve_nested(
         theta = solution.best.x
         predicted = float(surrogate.predict(theta[None, :])[0])
         with sampler.spent.on("rounds"):
-            sample = sampler.bandwidths(theta, f"verifying round {round_number + 1}")[0]
+            sample = sampler.values(theta, f"verifying round {round_number + 1}")[0]
         iterate = _iterate(problem, best, sample, predicted, radius)
         iterates.append(iterate)
         samples.append(sample)
@@ -130,7 +128,7 @@ def solve_nested(
         settled = abs(iterate.objective - value_of(best)) <= options.tolerance * abs(
             iterate.objective
         )
-        if sampler.raised > raised:
+        if sampler.improvements > improvements:
             continue  # fitted to worse controllers than are known now
         if agreed and (iterate.step <= STEP or settled):
             break
@@ -149,7 +147,7 @@ def solve_nested(
 
 def fit_bandwidth(
     problem: CoDesignProblem,
-    samples: list[BandwidthSample],
+    samples: list[InnerSample],
     seed: int,
     kind: str = "matern52",
     gradients: bool = False,
@@ -174,30 +172,28 @@ def fit_bandwidth(
 
 def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:
     """The points with λ(θ) <= 0; all of them where none has."""
-    keep = [not unmet(problem, theta) for theta in thetas]
+    keep = [not violated(problem, theta) for theta in thetas]
     return thetas[keep] if any(keep) else thetas
 
 
-def _best(problem: CoDesignProblem, samples: list[BandwidthSample]) -> BandwidthSample:
+def _best(problem: CoDesignProblem, samples: list[InnerSample]) -> InnerSample:
     feasible = [sample for sample in samples if sample.feasible]
-    inside = [s for s in feasible if not unmet(problem, s.theta)]
+    inside = [s for s in feasible if not violated(problem, s.theta)]
     return min(inside or feasible, key=lambda s: objective(problem, s.theta, s.value))
 
 
-def _region(problem: CoDesignProblem, best: BandwidthSample, radius: float) -> tuple[Array, Array]:
+def _region(problem: CoDesignProblem, best: InnerSample, radius: float) -> tuple[Array, Array]:
     lower, upper = box(problem)
     half = radius * (upper - lower)
     return np.maximum(lower, best.theta - half), np.minimum(upper, best.theta + half)
 
 
-def _local(
-    samples: list[BandwidthSample], low: Array, high: Array, width: Array
-) -> list[BandwidthSample]:
+def _local(samples: list[InnerSample], low: Array, high: Array, width: Array) -> list[InnerSample]:
     """Feasible samples in the region and a margin; the nearest ones where these are too few."""
     feasible = list({s.theta: s for s in samples if s.feasible}.values())
     centre = 0.5 * (low + high)
 
-    def distance(sample: BandwidthSample) -> float:
+    def distance(sample: InnerSample) -> float:
         return float(np.abs((np.array(sample.theta) - centre) / width).max())
 
     reach = 0.75 * float(((high - low) / width).max())
@@ -208,7 +204,7 @@ def _local(
 
 def _starts(
     problem: CoDesignProblem,
-    samples: list[BandwidthSample],
+    samples: list[InnerSample],
     low: Array,
     high: Array,
     count: int,
@@ -223,8 +219,8 @@ def _starts(
 
 def _iterate(
     problem: CoDesignProblem,
-    best: BandwidthSample,
-    sample: BandwidthSample,
+    best: InnerSample,
+    sample: InnerSample,
     predicted: float,
     radius: float,
 ) -> Iterate:

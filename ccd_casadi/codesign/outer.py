@@ -24,7 +24,7 @@ from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import counted
 from surrogates import design
@@ -61,7 +61,7 @@ class End:
         return bool(np.isfinite(self.objective))
 
 
-def dear(problem: CoDesignProblem) -> bool:
+def is_expensive(problem: CoDesignProblem) -> bool:
     """Whether the elements of another θ take as long as a search there."""
     return plant_of(problem).nearby is not None
 
@@ -70,7 +70,7 @@ class Outer(ABC):
     """The outer problem of one kind of inner problem, on a sampler's store and workers."""
 
     kkt_level: float  # residual up to which an end counts as stationary
-    beside_theta: tuple[str, ...] = ()  # what else x holds, logarithms
+    extra_variables: tuple[str, ...] = ()  # what else x holds, logarithms
 
     def __init__(self, sampler: Sampler) -> None:
         self.sampler = sampler
@@ -85,12 +85,12 @@ class Outer(ABC):
         return np.asarray(x, float)[: len(self.problem.names)]
 
     @property
-    def look_is_cheap(self) -> bool:
+    def global_check_is_cheap(self) -> bool:
         """Whether local solves may start from points that are no better."""
-        return not dear(self.problem)
+        return not is_expensive(self.problem)
 
     @property
-    def may_try_again(self) -> bool:
+    def retries_pay(self) -> bool:
         """Whether searches from beside an end that is not stationary pay."""
         return True
 
@@ -103,38 +103,38 @@ class Outer(ABC):
         """With what every search needs before it begins."""
         return self
 
-    def continued(self, folder: Path, seed: int) -> "Outer":
+    def resumed(self, folder: Path, seed: int) -> "Outer":
         """With what the run in a folder ended with, where its kind needs that."""
         return self
 
-    def formulated(
+    def solve_formulation(
         self, formulation: Formulation, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """One formulation, from the samples that are given where there are any."""
         if isinstance(formulation, Direct):
             with self.sampler.spent.on("search"):
-                return self.climbed(formulation.starts, seed)
-        return self.fitted(formulation, seed, given)
+                return self.solve_on_truth(formulation.starts, seed)
+        return self.solve_on_surrogates(formulation, seed, given)
 
     @abstractmethod
-    def fitted(
+    def solve_on_surrogates(
         self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """A formulation on surrogates, from the samples that are given where there are any."""
 
-    def climbed(self, starts: int, seed: int) -> FormulationResult:
+    def solve_on_truth(self, starts: int, seed: int) -> FormulationResult:
         """The direct formulation: local solves from the case's start and a Sobol set beside it.
 
         From one start that has a design it is the polish that follows.
         """
         problem, (lower, upper) = self.problem, box(self.problem)
         thetas = np.vstack([problem.start, design("sobol", lower, upper, starts, seed)])[:starts]
-        begun = self.sampler.bandwidths(thetas, "direct")
+        begun = self.sampler.values(thetas, "direct")
         if starts == 1 and begun[0].feasible:
             return FormulationResult(begun[0].joint, agreed=True)
         places: list[Place] = []
         for sample in begun:
-            place = self.solved_from(sample, places)
+            place = self.local_solve(sample, places)
             places += [] if place is None else [place]
         if not places:
             words = f"no design meets its constraints from {counted(starts, 'start')}"
@@ -144,41 +144,41 @@ class Outer(ABC):
         return FormulationResult(ends.best.x, outer=ends, agreed=True)
 
     @abstractmethod
-    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
+    def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """A formulation that found nothing: a design to go on from, or why there is none."""
 
     @abstractmethod
-    def ended(self, x: Array) -> End:
+    def polished(self, x: Array) -> End:
         """Polish a point on the truth, and hold the whole inner problem there against it."""
 
-    def joined(self, end: End) -> "Outer | None":
+    def extended(self, end: End) -> "Outer | None":
         """With what stood against an end, to be searched again; None where nothing did."""
         return None
 
-    def learnt(self, outcome: FormulationResult, end: End) -> FormulationResult:
+    def with_training_sample(self, outcome: FormulationResult, end: End) -> FormulationResult:
         """With surrogates that have an end among their samples, which they did not foresee."""
-        values, slopes = self.samples_of(end, outcome.surrogates[0].lower.size)
+        values, slopes = self.training_samples(end, outcome.surrogates[0].lower.size)
         found = [
             with_sample(process, end.x[: process.lower.size], value, slope)
             for process, value, slope in zip(outcome.surrogates, values, slopes, strict=True)
         ]
         return replace(outcome, surrogates=tuple(found))
 
-    def samples_of(self, end: End, inputs: int) -> tuple[Array, Array]:
+    def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
         """Values (k,) and slopes (k, n) at an end of what surrogates of n = `inputs` fit."""
-        found = self.sampler.bandwidths(self.theta_of(end.x), "the end")[0]
+        found = self.sampler.values(self.theta_of(end.x), "the end")[0]
         return np.array([end.value]), np.array([found.gradient])
 
     @abstractmethod
-    def solved_from(
-        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
+    def local_solve(
+        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         """A local solve on the truth from a sample; none goes on near `known` stationary points.
 
         `settled`: relative change of J at which it ends.
         """
 
-    def explained(self, found: Solution, share: float | None) -> str:
+    def failure_reason(self, found: Solution, share: float | None) -> str:
         """Why a solution is not verified; `share` of a robust set that was held on the way."""
         return str(found.result["reason"])
 

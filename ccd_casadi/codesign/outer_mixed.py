@@ -31,7 +31,7 @@ from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
@@ -55,26 +55,26 @@ class MixedOuter(Outer):
     """See the module."""
 
     kkt_level = VerifiedDesign.kkt_level
-    beside_theta = ("omega_S", "omega_T")
+    extra_variables = ("omega_S", "omega_T")
 
     @property
     def bounds(self) -> tuple[Array, Array]:
         return lifted_bounds(self.problem)
 
-    def fitted(
+    def solve_on_surrogates(
         self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         if isinstance(formulation, Nested):
             return solve_nested(self.sampler, formulation, seed=seed, given=given)
         return solve_lifted(self.sampler, formulation, seed=seed, given=given)
 
-    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
+    def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """The true inner problem at a few θ tells an infeasible case from a formulation that
         failed."""
         lower, upper = box(self.problem)
         points = design("sobol", lower, upper, 8, seed)
         with self.sampler.spent.on("rescue"):
-            samples = self.sampler.bandwidths(points, "search for a feasible design")
+            samples = self.sampler.values(points, "search for a feasible design")
         feasible = [sample for sample in samples if sample.feasible]
         if not feasible:
             assert self.sampler.nearest is not None
@@ -83,7 +83,7 @@ class MixedOuter(Outer):
         best = max(feasible, key=lambda sample: sample.bandwidth)
         return replace(outcome, x=best.joint, agreed=False)
 
-    def ended(self, x: Array) -> MixedEnd:
+    def polished(self, x: Array) -> MixedEnd:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
         problem, sampler, truth = self.problem, self.sampler, self.sampler.truth
         gap, made = np.inf, None
@@ -101,7 +101,7 @@ class MixedOuter(Outer):
             if acceptable(problem, at_bounds, truth.at(at_bounds)):
                 x, made = at_bounds, truth.at(at_bounds)
             with sampler.spent.on("checks"):
-                inner = sampler.bandwidths(self.theta_of(x), "verifying")[0]
+                inner = sampler.values(self.theta_of(x), "verifying")[0]
             gap = inner.bandwidth / made.figures.bandwidth - 1.0 if inner.feasible else 0.0
             if gap <= INNER_GAP:
                 break
@@ -111,14 +111,14 @@ class MixedOuter(Outer):
         kkt = kkt_certificate(problem, x, made)
         return MixedEnd(x, made.figures.bandwidth, J, kkt, float(gap), made)
 
-    def samples_of(self, end: End, inputs: int) -> tuple[Array, Array]:
+    def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
         if inputs < end.x.size:
-            return super().samples_of(end, inputs)
+            return super().training_samples(end, inputs)
         found = self.sampler.quantities(end.x)[0]
         return found.values[:-1], found.gradients[:-1]
 
-    def solved_from(
-        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
+    def local_solve(
+        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem, truth = self.problem, self.sampler.truth
         # where no design is feasible it goes from the middle of the weights' frequencies
@@ -133,7 +133,7 @@ class MixedOuter(Outer):
                 return Place(x, true_objective(problem, x, made), stationary)
         return None
 
-    def explained(self, found: Solution, share: float | None) -> str:
+    def failure_reason(self, found: Solution, share: float | None) -> str:
         return failure_words(self.sampler, found, share)
 
     def verified(self, end: End, rounds: int) -> VerifiedDesign:
@@ -142,7 +142,7 @@ class MixedOuter(Outer):
         theta = tuple(float(v) for v in self.theta_of(x))
         figures = end.design.figures
         make = partial(final_design, problem, theta, (figures.omega_S, figures.omega_T))
-        final = sampler.kept("final", tuple(x), Design, make)
+        final = sampler.cached("final", tuple(x), Design, make)
         free = replace(problem, suspension=Suspension(0.0, 0.0))
         unsuspended = measure(
             scaled_plant(free, theta), final.controller, final.weights, gamma=UNBOUNDED,

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
+from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
 from ccd_casadi.plants.plant import constraint_values
@@ -160,7 +160,7 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         return ""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     points = np.vstack([np.array(problem.start), design("sobol", lower, upper, starts, seed)])
-    if not all(unmet(problem, point) for point in points):
+    if not all(violated(problem, point) for point in points):
         return ""
     theta, slack = ca.MX.sym("theta", len(lower)), ca.MX.sym("slack")
     shares = np.array([constraint_shares(problem, point).max() for point in points])
@@ -177,7 +177,7 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         best = solve_program(program, np.column_stack([points, shares])).best.x[:-1]
     except OuterFailure:
         best = points[np.argmin(shares)]
-    if not unmet(problem, best):
+    if not violated(problem, best):
         return ""
     worst = int(np.argmax(constraint_shares(problem, best)))
     least = constraint_values(plant, best)[worst]

@@ -1,8 +1,8 @@
 """The outer problem with controllers of fixed structure, over θ alone.
 
-A formulation works on v(θ) of the problem's anchors and plant set, with envelope gradients. At its
-end a multi-start search and a search for worse plants ask whether these were good enough at that
-θ; if not, what they find joins, and the outer problem is solved again.
+A formulation works on v(θ) of the problem's warm starts and plant set, with envelope gradients. At
+its end a multi-start search and a search for worse plants ask whether these were good enough at
+that θ; if not, what they find joins, and the outer problem is solved again.
 
 The polish works on the true value: it passes kinks, and keeps its controller. Multi-start searches
 are kept in the store of samples: a run that goes on from its store repeats none.
@@ -19,49 +19,53 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
-from ccd_casadi.codesign.outer import End, dear
+from ccd_casadi.codesign.outer import End, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import pieces_from
-from ccd_casadi.codesign.theta_joint import objectives_beside, together, with_members
+from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
-from ccd_casadi.inner_problem.move_figures import told_time
+from ccd_casadi.inner_problem.move_figures import stated_time
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value, valued
+from ccd_casadi.inner_problem.structured_bandwidth import (
+    StructuredValue,
+    structured_value,
+    value_of_design,
+)
 from ccd_casadi.inner_problem.structured_plant_set import (
     plants_of,
     structure_of,
     structured_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.structured_problem import Member
+from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import (
+    certify_lattice,
     fresh_yield,
-    judged_widely,
     proof_of,
     tolerance_prices,
-    worst_members,
+    worst_case,
 )
 from ccd_casadi.inner_problem.structured_search import (
-    joined,
     least_from,
     prepared,
     race,
     with_range,
+    with_warm_start,
 )
 from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.neighbours import WORTH, alone
+from ccd_casadi.sampling.neighbours import WORTH, from_controller
 from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
@@ -70,74 +74,77 @@ from ccd_casadi.support.terminal import say
 
 
 @dataclass(frozen=True)
-class Seeds:
-    """Anchors (κ in SI, rad/s) and members that the search at the start found; `words` why none."""
+class InitialSearch:
+    """Warm starts (κ in SI) and plants of the search at the start, as stores name them; `words`:
+    why there are none."""
 
     anchors: tuple[tuple[float, ...], ...]
-    members: tuple[Member, ...]
+    members: tuple[Scenario, ...]
     error_anchors: tuple[tuple[float, ...], ...]
     words: str
 
 
-def seeded_and_prepared(
+def with_initial_search(
     store: SampleStore,
     problem: CoDesignProblem,
     seed: int,
     quiet: bool,
     workers: Pool | None = None,
 ) -> tuple[CoDesignProblem, str]:
-    """Anchors and members, from the store where an earlier run has found them.
+    """Warm starts and plants, from the store where an earlier run has found them.
 
-    Second, in words, why there are no anchors; empty where there are.
+    Second, in words, why there are no warm starts; empty where there are.
     """
     own = replace(structured_of(problem), seed=seed)
     problem = with_range(replace(problem, controller=own))
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
-    def found() -> Seeds:
-        tell = teller("search at the start", quiet)
+    def searched() -> InitialSearch:
+        tell = printer("search at the start", quiet)
         anchored, made = prepared(problem, tell, workers)
         anchored, made, _ = least_from(anchored, problem.start, made, tell)
         own, start = structured_of(anchored), problem.start
         words = "" if made.certified else made.words
-        alone = len(own.members) == len(uncertain_plant(problem, start).corners())
+        alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
         if made.certified and alone and problem.figure is BANDWIDTH:
             # No plant was found worse: this is the search that an end at the start would ask for.
-            value = valued(anchored, start, plants_of(anchored, start), made, 1)
-            Sampler(anchored, store, Workers(1)).kept("race", start, StructuredValue, lambda: value)
-        return Seeds(own.anchors, own.members, own.error_anchors, words)
+            value = value_of_design(anchored, start, plants_of(anchored, start), made, 1)
+            Sampler(anchored, store, Workers(1)).cached(
+                "race", start, StructuredValue, lambda: value
+            )
+        return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
 
     key = sample_key(owner, problem.start, 0.0, 0.0)
-    seeds = store.kept(key, owner, problem.start, Seeds, found)
+    found = store.cached(key, owner, problem.start, InitialSearch, searched)
     structured = replace(
-        structured_of(problem), anchors=seeds.anchors, members=seeds.members,
-        error_anchors=seeds.error_anchors,
+        structured_of(problem), warm_starts=found.anchors, scenarios=found.members,
+        error_warm_starts=found.error_anchors,
     )  # fmt: skip
-    return replace(problem, controller=structured), seeds.words
+    return replace(problem, controller=structured), found.words
 
 
-def raced_at(sampler: Sampler, best: BandwidthSample) -> StructuredValue:
+def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
     """A multi-start search at the θ of a sample, from its controller too, with all its optima,
     counted; from the store if it is there."""
-    problem, theta = joined(sampler.problem, np.array(best.kappa), ()), best.theta
+    problem, theta = with_warm_start(sampler.problem, np.array(best.kappa), ()), best.theta
 
-    def raced() -> StructuredValue:
-        made = race(problem, theta, teller("search at the end", sampler.quiet), sampler.workers)
-        found = valued(problem, theta, plants_of(problem, theta), made, 1)
+    def multistart() -> StructuredValue:
+        made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
+        found = value_of_design(problem, theta, plants_of(problem, theta), made, 1)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
-    sampler.raced(sample_key(sampler.hash, theta, 0.0, 0.0))
-    return sampler.kept("race", theta, StructuredValue, raced)
+    sampler.count_multistart(sample_key(sampler.hash, theta, 0.0, 0.0))
+    return sampler.cached("race", theta, StructuredValue, multistart)
 
 
-def value_at(sampler: Sampler, best: BandwidthSample) -> StructuredValue:
+def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
     """A sample with its design and envelope, from the store where it was made before."""
-    problem = alone(sampler.problem, best.kappa) if best.kappa else sampler.problem
+    problem = from_controller(sampler.problem, best.kappa) if best.kappa else sampler.problem
     make = partial(structured_value, problem, best.theta)
-    return sampler.of(problem).kept("value", best.theta, StructuredValue, make)
+    return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
 
 
-def teller(label: str, quiet: bool) -> Callable[[str], None]:
+def printer(label: str, quiet: bool) -> Callable[[str], None]:
     """Lines of progress on stderr."""
 
     def tell(words: str) -> None:
@@ -161,16 +168,16 @@ class StructuredEnd(End):
     a multi-start search there (None where plants are to be added first), the worst plant, and those
     to add."""
 
-    asked: Sampler
-    best: BandwidthSample
+    sampler: Sampler
+    best: InnerSample
     found: StructuredValue
-    raced: StructuredValue | None
+    multistart: StructuredValue | None
     worst: Excess
-    members: tuple[Member, ...]
+    scenarios: tuple[Scenario, ...]
 
 
 class StructuredOuter(ThetaOuter):
-    """See the module; `words` say why the search at the start found no anchors."""
+    """See the module; `words` say why the search at the start found no warm starts."""
 
     kkt_level = VerifiedStructured.kkt_level
 
@@ -179,23 +186,24 @@ class StructuredOuter(ThetaOuter):
         self.words = words
 
     @property
-    def may_try_again(self) -> bool:
-        return not dear(self.problem)
+    def retries_pay(self) -> bool:
+        return not is_expensive(self.problem)
 
     def prepared(self, seed: int) -> "StructuredOuter":
-        """Searched at the start for anchors and the plant set, where there are none."""
+        """Searched at the start for warm starts and the plant set, where there are none."""
         sampler = self.sampler
-        if structured_of(sampler.problem).anchors:
+        if structured_of(sampler.problem).warm_starts:
             return self
-        problem, words = seeded_and_prepared(
+        problem, words = with_initial_search(
             sampler.store, sampler.problem, seed, sampler.quiet, sampler.workers
         )
-        sampler.raced(sampler.hash)
-        lost = words and not structured_of(problem).anchors
+        sampler.count_multistart(sampler.hash)
+        lost = words and not structured_of(problem).warm_starts
         return StructuredOuter(sampler.of(problem), words if lost else "")
 
-    def continued(self, folder: Path, seed: int) -> "StructuredOuter":
-        """With the anchors, plants and controller of a run; those of a search where it has none."""
+    def resumed(self, folder: Path, seed: int) -> "StructuredOuter":
+        """With the warm starts, plants and controller of a run; those of a search where it has
+        none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
             return self.prepared(seed)
@@ -204,64 +212,68 @@ class StructuredOuter(ThetaOuter):
         outer = StructuredOuter(sampler.of(problem)).prepared(seed)
         if (folder / "controller.json").exists():
             theta = [float(result["theta"][name]) for name in problem.names]
-            outer.sampler.climbed(theta, sections_kappa(folder, structure_of(problem)))
+            outer.sampler.value_from(theta, sections_kappa(folder, structure_of(problem)))
         return outer
 
-    def ended(self, x: Array) -> StructuredEnd:
-        asked, theta = self.sampler, self.theta_of(x)
+    def polished(self, x: Array) -> StructuredEnd:
+        sampler, theta = self.sampler, self.theta_of(x)
         for _ in range(TAKEN):
-            with asked.spent.on("polish"):
-                asked, best = polish_structured(asked, theta)
-            problem, found = asked.problem, value_at(asked, best)
-            tell = teller("at the end", asked.quiet)
-            worst, members = worst_members(problem, best.theta, found.design, 0, tell)
-            raced = None if members else raced_at(asked, best)
-            gap = 0.0 if raced is None else _gap(problem, best, raced)
-            if raced is None or gap <= (WORTH if self.may_try_again else WORTH_ELEMENTS):
+            with sampler.spent.on("polish"):
+                sampler, best = polish_structured(sampler, theta)
+            problem, found = sampler.problem, value_with_design(sampler, best)
+            tell = printer("at the end", sampler.quiet)
+            worst, scenarios = worst_case(problem, best.theta, found.design, 0, tell)
+            multistart = None if scenarios else multistart_at(sampler, best)
+            gap = 0.0 if multistart is None else _gap(problem, best, multistart)
+            if multistart is None or gap <= (WORTH if self.retries_pay else WORTH_ELEMENTS):
                 break
-            asked.climbed(best.theta, raced.design.kappa.tolist())
+            sampler.value_from(best.theta, multistart.design.kappa.tolist())
             theta = np.array(best.theta)
         return StructuredEnd(
             np.array(best.theta), best.value, objective_of(problem, best),
-            theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found, raced,
-            worst, members,
+            theta_kkt(problem, best, envelope=found.envelope), gap, sampler, best, found,
+            multistart, worst, scenarios,
         )  # fmt: skip
 
-    def joined(self, end: End) -> "StructuredOuter | None":
+    def extended(self, end: End) -> "StructuredOuter | None":
         """With plants that it does not keep, of those searched or drawn for this alone: fresh ones
         judge the answer."""
         end = cast(StructuredEnd, end)
-        problem, theta, members = end.asked.problem, end.best.theta, end.members
-        tell = teller("at the end", end.asked.quiet)
-        for look in range(1, LOOKS + 1 if end.feasible and not members else 1):
-            members = worst_members(problem, theta, end.found.design, APART + look, tell)[1]
-            if members:
+        problem, theta, scenarios = end.sampler.problem, end.best.theta, end.scenarios
+        tell = printer("at the end", end.sampler.quiet)
+        for look in range(1, LOOKS + 1 if end.feasible and not scenarios else 1):
+            scenarios = worst_case(problem, theta, end.found.design, APART + look, tell)[1]
+            if scenarios:
                 break
-        if not members:
+        if not scenarios:
             return None
-        anchored = joined(problem, end.found.design.kappa, ())
-        return StructuredOuter(with_members(end.asked.of(anchored), members))
+        anchored = with_warm_start(problem, end.found.design.kappa, ())
+        return StructuredOuter(with_scenarios(end.sampler.of(anchored), scenarios))
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
         end = cast(StructuredEnd, end)
-        asked, best, made, worst = end.asked, end.best, end.found.design, end.worst
-        problem = asked.problem
-        raced = raced_at(asked, best) if end.raced is None else end.raced
+        sampler, best, made, worst = end.sampler, end.best, end.found.design, end.worst
+        problem = sampler.problem
+        multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
         beside = partial(objectives_beside, problem, best)
-        known = dear(problem) and problem.figure is BANDWIDTH
-        kkt = theta_kkt(problem, best, asked, end.found.envelope, beside if known else None)
-        wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
-        proof = proof_of(problem, best.theta, made, asked.workers)
-        drawn = None if proof.close else fresh_yield(problem, best.theta, made, asked.workers)
-        with Progress(1, "what limits it", quiet=asked.quiet) as bar:
+        known = is_expensive(problem) and problem.figure is BANDWIDTH
+        kkt = theta_kkt(problem, best, sampler, end.found.envelope, beside if known else None)
+        wide, checked = certify_lattice(
+            problem, best.theta, made.controller, worst, sampler.workers
+        )
+        proof = proof_of(problem, best.theta, made, sampler.workers)
+        drawn = (
+            None if proof.conclusive else fresh_yield(problem, best.theta, made, sampler.workers)
+        )
+        with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
-            costs = asked.kept("costs", best.theta, Costs, make)
+            costs = sampler.cached("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
             told = None
             if problem.figure is MOVE_TIME:
-                told = told_time(problem, best.theta, made.controller, best.value)
+                told = stated_time(problem, best.theta, made.controller, best.value)
             bar.advance()
         return VerifiedStructured(
             problem=problem,
@@ -270,12 +282,12 @@ class StructuredOuter(ThetaOuter):
             objective=end.objective,
             hardware_cost=hardware_cost(plant_of(problem), best.theta),
             kkt=kkt,
-            inner_gap=float(max(_gap(problem, best, raced), 0.0)),
-            feasible=made.certified and not unmet(problem, best.theta),
+            inner_gap=float(max(_gap(problem, best, multistart), 0.0)),
+            feasible=made.certified and not violated(problem, best.theta),
             survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
             damping=other_damping(problem, loops),
             design=made,
-            raced=raced,
+            multistart=multistart,
             wide=wide,
             checked=checked,
             proof=proof,
@@ -289,15 +301,15 @@ class StructuredOuter(ThetaOuter):
         )
 
     def responses(self, x: Array) -> PostOptimal:
-        sample = self.sampler.bandwidths(x, "the run's own design")[0]
-        return structured_responses(self.problem, sample, value_at(self.sampler, sample))
+        sample = self.sampler.values(x, "the run's own design")[0]
+        return structured_responses(self.problem, sample, value_with_design(self.sampler, sample))
 
 
-def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: StructuredValue) -> float:
-    return problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
+def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:
+    return problem.figure.gain(multistart.value, best.value) if multistart.feasible else 0.0
 
 
-def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
+def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more plants, where worse ones were found.
 
@@ -306,23 +318,23 @@ def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, Bandwidt
     """
     problem = sampler.problem
     if problem.figure is BANDWIDTH:
-        sampler, best, _ = together(sampler, theta, teller("on the way", sampler.quiet))
+        sampler, best, _ = joint_search(sampler, theta, printer("on the way", sampler.quiet))
         problem = sampler.problem
-        if best.feasible and (dear(problem) or _stationary(sampler, best)):
+        if best.feasible and (is_expensive(problem) or _stationary(sampler, best)):
             return sampler, best
         theta = np.array(best.theta)
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
     near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
-    candidates = sampler.bandwidths(np.unique([near, theta], axis=0), "polishing")
+    candidates = sampler.values(np.unique([near, theta], axis=0), "polishing")
     best = min(candidates, key=lambda s: objective_of(problem, s))
     if theta_kkt(problem, best).stationarity > STATIONARY:
         best = pieces_from(sampler, best, LEVEL)
     return sampler, best
 
 
-def _stationary(sampler: Sampler, best: BandwidthSample) -> bool:
+def _stationary(sampler: Sampler, best: InnerSample) -> bool:
     """Whether a sample is optimal to first order, by the gradients of several sides of it."""
-    envelope = value_at(sampler, best).envelope
+    envelope = value_with_design(sampler, best).envelope
     kkt = theta_kkt(sampler.problem, best, envelope=envelope)
     return kkt.stationarity <= VerifiedStructured.kkt_level

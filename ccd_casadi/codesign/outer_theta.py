@@ -19,7 +19,7 @@ from ccd_casadi.codesign.theta_direct import FAR, SETTLED, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.optim.pieces import FIRST
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -30,10 +30,10 @@ class ThetaOuter(Outer, ABC):
     words = ""
 
     @property
-    def look_is_cheap(self) -> bool:
+    def global_check_is_cheap(self) -> bool:
         return False
 
-    def fitted(
+    def solve_on_surrogates(
         self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """Nested; what is lifted are the exact gradients, as x is θ."""
@@ -45,23 +45,23 @@ class ThetaOuter(Outer, ABC):
         )  # fmt: skip
         return solve_nested(self.sampler, options, seed=seed, given=given, gradients=True)
 
-    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
+    def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """None: what falls short at the nearest θ, in words."""
         nearest = self.sampler.nearest
         words = self.words if nearest is None else nearest.shortfall
         return replace(outcome, message=words or outcome.message)
 
-    def ended(self, x: Array) -> End:
+    def polished(self, x: Array) -> End:
         """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
         problem, sampler = self.problem, self.sampler
         with sampler.spent.on("polish"):
-            best = sampler.bandwidths(self.theta_of(x), "polishing")[0]
+            best = sampler.values(self.theta_of(x), "polishing")[0]
             best = pieces_from(sampler, best, SETTLED)
         kkt = theta_kkt(problem, best, sampler)
         return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
 
-    def solved_from(
-        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
+    def local_solve(
+        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem = self.problem
         first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)

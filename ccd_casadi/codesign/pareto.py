@@ -17,12 +17,12 @@ import numpy as np
 
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.structured_entries import bound_words
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.progress import Progress
 from surrogates import design
@@ -34,7 +34,7 @@ GAIN = 1e-3  # of the triangle between two neighbours: a lesser one is none
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrontPoint(BandwidthSample):
+class FrontPoint(InnerSample):
     """A design that is the best for some weights; `worth`: v(θ), and -v where less is better.
 
     `verified`: the inner problem at θ has a certified design, and the solve ended at a stationary
@@ -74,21 +74,21 @@ def pareto_front(
     f_range = np.ptp(costs)
     if not f_range > FLAT * np.abs(costs).max():
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
-    allowed = [i for i in np.argsort(costs) if not unmet(problem, looked[i])]
-    begun = sampler.bandwidths(looked[[0, allowed[0], allowed[-1]]], "starts of the front")
+    allowed = [i for i in np.argsort(costs) if not violated(problem, looked[i])]
+    begun = sampler.values(looked[[0, allowed[0], allowed[-1]]], "starts of the front")
     if not begun[0].feasible:
         raise UserError(f"the run's design is not certified: {begun[0].shortfall}")
     begun = [sample for sample in begun if sample.feasible]
     size, sign = begun[0].value, 1.0 if problem.figure.larger_is_better else -1.0
 
-    def solved(a: float, b: float, begin: Sequence[BandwidthSample]) -> FrontPoint | None:
+    def solved(a: float, b: float, begin: Sequence[InnerSample]) -> FrontPoint | None:
         """The best design for these weights, of local solves from some designs; where each value
         is a search over the controller, from the best of them alone."""
         weighted = replace(problem, w1=a, w2=-sign * b)
         outer = outer_of(sampler.of(weighted, traced=False, quiet=True))
-        if not outer.look_is_cheap:
+        if not outer.global_check_is_cheap:
             begin = [min(begin, key=lambda sample: objective_of(weighted, sample))]
-        places = [outer.solved_from(sample, ()) for sample in begin]
+        places = [outer.local_solve(sample, ()) for sample in begin]
         found = [place for place in places if place is not None]
         if not found:
             return None
@@ -109,7 +109,7 @@ def pareto_front(
             ]
             widest = int(np.argmax([np.hypot(up / size, along / f_range) for up, along in steps]))
             (light, fast), (a, b) = pairs[widest], steps[widest]
-            new = solved(a, b, sampler.bandwidths(np.array([light.theta, fast.theta])))
+            new = solved(a, b, sampler.values(np.array([light.theta, fast.theta])))
             if new is None or _gain(light, new, a, b) <= GAIN:
                 straight.add((light, fast))
             else:
@@ -124,7 +124,7 @@ def _gain(light: FrontPoint, new: FrontPoint, a: float, b: float) -> float:
 
 def _point(sampler: Sampler, theta: Sequence[float] | np.ndarray, stationary: bool) -> FrontPoint:
     up = sampler.problem.figure.larger_is_better
-    sample = sampler.bandwidths(np.asarray(theta, float), "verifying")[0]
+    sample = sampler.values(np.asarray(theta, float), "verifying")[0]
     active = tuple(bound_words(sample.active)) if sample.kappa else sample.active
     return FrontPoint(
         **vars(sample) | {"active": active},

@@ -31,7 +31,7 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import ACTIVE, ActiveSet, KktCertificate
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -115,7 +115,7 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
 
 
 def structured_responses(
-    problem: CoDesignProblem, sample: BandwidthSample, found: StructuredValue
+    problem: CoDesignProblem, sample: InnerSample, found: StructuredValue
 ) -> PostOptimal:
     """The same over θ alone, with the bounds on the loop by dω_b*/dp = ω_b μ/p.
 

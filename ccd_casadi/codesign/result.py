@@ -13,13 +13,13 @@ from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.codesign.design_entries import budget_entry, move_entry
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.verdict import (
-    Line,
     State,
     Verdict,
+    VerdictLine,
     deployable,
     optimal,
     predicted,
@@ -44,7 +44,7 @@ def result_dict(
     verified: Verified,
     spent: Mapping[str, int],
     quality: tuple[Quality, ...] = (),
-    look: BoxLook | None = None,
+    look: GlobalCheck | None = None,
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     problem, tolerance = verified.problem, terms.tolerance
@@ -103,7 +103,7 @@ def verdict_of(
     tolerance: float,
     error: float,
     quality: tuple[Quality, ...] = (),
-    look: BoxLook | None = None,
+    look: GlobalCheck | None = None,
 ) -> Verdict:
     """The five lines on a verified design; `error` is that of its predicted value."""
     problem = verified.problem
@@ -130,10 +130,10 @@ def optimal_line(
     outcome: FormulationResult,
     verified: Verified,
     tolerance: float,
-    look: BoxLook | None,
+    look: GlobalCheck | None,
     *,
     gap: float,
-) -> Line:
+) -> VerdictLine:
     """Whether θ is stationary, and whether anything better is known."""
     known, figures = verified.searched(outcome, look)
     line = optimal(
@@ -146,7 +146,7 @@ def optimal_line(
         known=known,
         unknown=verified.no_gradient_words(),
     )
-    return Line(line.state, line.words, {**line.figures, **figures})
+    return VerdictLine(line.state, line.words, {**line.figures, **figures})
 
 
 def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float:
@@ -209,7 +209,7 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return before if isinstance(before, Mapping) else line
 
 
-def with_verdict_line(run: FinishedRun, out: Path, name: str, line: Line) -> FinishedRun:
+def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine) -> FinishedRun:
     """The run with a line of its verdict, written into its folder if `out` lies in that.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays

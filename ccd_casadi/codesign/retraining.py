@@ -23,12 +23,12 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import unmet_constraint
-from ccd_casadi.codesign.search import concluded_at
+from ccd_casadi.codesign.search import conclude_at
 from ccd_casadi.codesign.stored import keep_version, stored_designs, stored_thetas
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.sampling.rows import problem_hash
-from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample
+from ccd_casadi.sampling.samples import InnerSample, QuantitySample, quantity_sample
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -83,7 +83,7 @@ class Job:
     @property
     def over_theta(self) -> bool:
         """Whether x = θ: what is sampled is a whole inner problem."""
-        return self.formulation == "nested" or not self.outer.beside_theta
+        return self.formulation == "nested" or not self.outer.extra_variables
 
     def run(self, write: Callable[[Solution], object]) -> Outcome:
         """To its end; `write` puts a solution into the folder.
@@ -104,8 +104,8 @@ class Job:
         if not words:
             outcome = self._trained(terms.tolerance)
             if outcome.x is None:
-                outcome = outer.rescued(outcome, self.seed)
-        solution = concluded_at(outer, outcome, terms)
+                outcome = outer.fallback(outcome, self.seed)
+        solution = conclude_at(outer, outcome, terms)
         version = self._kept(outcome)
         reason = "converged" if outcome.agreed else "budget" if self.left <= 0 else "rounds"
         retraining = mark | {"version": version, "samples": self.spent, "reason": reason}
@@ -141,7 +141,7 @@ class Job:
         options = formulation_of(self.case, name)
         assert not isinstance(options, Direct)
         options = replace(options, tolerance=tolerance, max_refinements=max(rounds - 1, 0))
-        return self.outer.formulated(options, self.seed, given)
+        return self.outer.solve_formulation(options, self.seed, given)
 
     def _cost(self, samples: int) -> float:
         """Syntheses a sample, as far as is known of whole inner problems."""
@@ -188,7 +188,7 @@ class Job:
         if not len(X):
             return []
         if self.over_theta:
-            return [*self.outer.sampler.bandwidths(X, "retraining")]
+            return [*self.outer.sampler.values(X, "retraining")]
         return [*self.outer.sampler.quantities(X, "retraining")]
 
     def _kept(self, outcome: FormulationResult) -> str | None:
@@ -211,12 +211,12 @@ class Job:
         )  # fmt: skip
 
 
-Seen = BandwidthSample | QuantitySample
+Seen = InnerSample | QuantitySample
 
 
 def _usable(samples: list[Seen]) -> list[Seen]:
     """Those with a value."""
-    return [s for s in samples if (s.feasible if isinstance(s, BandwidthSample) else s.certified)]
+    return [s for s in samples if (s.feasible if isinstance(s, InnerSample) else s.certified)]
 
 
 def _distances(X: Array, others: list[Seen], width: Array) -> Array:

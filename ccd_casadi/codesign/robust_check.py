@@ -19,7 +19,7 @@ import numpy as np
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel
 from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival
-from ccd_casadi.fixed_structure import Certificate, certify
+from ccd_casadi.fixed_structure import SetCertificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import Perturbation, modal_plant
@@ -162,7 +162,7 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
     bounds = kind.bounds()
     places = [Perturbation(s, d) for s, d in product((low, high), sorted({1.0, *factors}))]
 
-    def judged(of: LoopsOffModel) -> Certificate:
+    def judged(of: LoopsOffModel) -> SetCertificate:
         plants = []
         for place, gain in product(places, sorted(set(gains))):
             modal = of.modal(place)

@@ -16,7 +16,7 @@ from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.search import concluded, concluded_at, searched
+from ccd_casadi.codesign.search import conclude, conclude_at, search_outer
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
@@ -101,10 +101,10 @@ def co_design(
     require_solvable(sampler.problem)
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
-        return concluded_at(outer_of(sampler), FormulationResult(message=forbidden), terms)
+        return conclude_at(outer_of(sampler), FormulationResult(message=forbidden), terms)
 
     def solved(outer: Outer) -> Solution:
-        return concluded(searched(outer, formulation, seed, known), terms)
+        return conclude(search_outer(outer, formulation, seed, known), terms)
 
     return best_over_design_plants(sampler, outer_of, solved, terms)
 
@@ -135,7 +135,7 @@ def verify(sampler: Sampler, x: Array) -> Verified:
         The design with its certificates.
     """
     outer = outer_of(sampler)
-    end = outer.ended(x)
+    end = outer.polished(x)
     with sampler.spent.on("checks"):
         return outer.verified(end, 1)
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.box_look import look_over_box, perturbed
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
+from ccd_casadi.codesign.global_check import global_check, perturbed
 from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.verified import Solution
@@ -23,19 +23,19 @@ AGAIN = 3  # times at most that a search begins with what the inner problem has 
 
 
 @dataclass(frozen=True)
-class Searched:
+class SearchResult:
     """What a search ends with: `end` None where no design was found; `outer` as it is by then."""
 
     outer: Outer
     outcome: FormulationResult
     end: End | None
     rounds: int = 1
-    look: BoxLook | None = None
+    look: GlobalCheck | None = None
 
 
-def searched(
+def search_outer(
     outer: Outer, formulation: Formulation, seed: int, known: Array | None = None
-) -> Searched:
+) -> SearchResult:
     """Formulation and polish, again with what the inner problem at the end has found better.
 
     `known`: x of a local optimum that another search has found, in place of the formulation.
@@ -45,38 +45,40 @@ def searched(
     while True:
         rounds += 1
         if known is None:
-            outcome = outer.formulated(formulation, seed)
+            outcome = outer.solve_formulation(formulation, seed)
         else:
             outcome = FormulationResult(known, agreed=True)
         if outcome.x is None:
-            outcome = outer.rescued(outcome, seed)
+            outcome = outer.fallback(outcome, seed)
         if outcome.x is None:
-            return Searched(outer, outcome, None, rounds)
-        end = outer.ended(outcome.x)
-        more = None if rounds == AGAIN else outer.joined(end)
+            return SearchResult(outer, outcome, None, rounds)
+        end = outer.polished(outcome.x)
+        more = None if rounds == AGAIN else outer.extended(end)
         if more is None:
-            return _looked(Searched(outer, outcome, end, rounds), formulation, seed)
+            return _looked(SearchResult(outer, outcome, end, rounds), formulation, seed)
         goes_on = known is not None or isinstance(formulation, Direct)
         outer, known = more, end.x if goes_on else None
 
 
-def _looked(found: Searched, formulation: Formulation, seed: int) -> Searched:
+def _looked(found: SearchResult, formulation: Formulation, seed: int) -> SearchResult:
     """After the global check over the box, and a last try where the end is not stationary."""
     outer, outcome, end = found.outer, found.outcome, found.end
     assert end is not None
     with outer.sampler.spent.on("box_look"):
-        look = look_over_box(outer, end, formulation.box_points, seed)
+        look = global_check(outer, end, formulation.box_points, seed)
     if look.x is not None:
-        end = best_end([end, outer.ended(look.x)], outer.kkt_level, formulation.tolerance)
+        end = best_end([end, outer.polished(look.x)], outer.kkt_level, formulation.tolerance)
     residual = end.kkt.stationarity
-    if outer.may_try_again and np.isfinite(residual) and residual > outer.kkt_level:
+    if outer.retries_pay and np.isfinite(residual) and residual > outer.kkt_level:
         with outer.sampler.spent.on("polish"):
             starts = perturbed(outer, end.x, seed)
-        ends = [end, *map(outer.ended, starts)]
+        ends = [end, *map(outer.polished, starts)]
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
     learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
     if learns and end.feasible and _missed(outcome, end) > formulation.tolerance:
-        outcome = outer.learnt(outcome, end)  # left out, it tells how they support the design
+        outcome = outer.with_training_sample(
+            outcome, end
+        )  # left out, it tells how they support the design
     return replace(found, outcome=outcome, end=end, look=look)
 
 
@@ -98,7 +100,7 @@ def best_end(found: Sequence[End], level: float, tolerance: float) -> End:
     return min(stationary or near, key=lambda item: item.objective)
 
 
-def concluded(found: Searched, terms: Terms) -> Solution:
+def conclude(found: SearchResult, terms: Terms) -> Solution:
     """The design judged, and result.json."""
     outcome, sampler = found.outcome, found.outer.sampler
     spent = sampler.spent
@@ -111,7 +113,7 @@ def concluded(found: Searched, terms: Terms) -> Solution:
     return Solution(result, outcome, verified, quality)
 
 
-def concluded_at(outer: Outer, outcome: FormulationResult, terms: Terms) -> Solution:
+def conclude_at(outer: Outer, outcome: FormulationResult, terms: Terms) -> Solution:
     """An outcome polished and judged as it is, without a global check over the box."""
-    end = None if outcome.x is None else outer.ended(outcome.x)
-    return concluded(Searched(outer, outcome, end), terms)
+    end = None if outcome.x is None else outer.polished(outcome.x)
+    return conclude(SearchResult(outer, outcome, end), terms)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
-from ccd_casadi.fixed_structure import Bounds, Certificate, Sampling, SectionsDesign
+from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
@@ -117,7 +117,7 @@ def bound_words(names: Iterable[str]) -> list[str]:
     ]
 
 
-def _channel_entry(bounds: Bounds, judged: Certificate) -> dict[str, Any]:
+def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
     """`channel_bounds`: what channels keep for themselves, the worst of the judge's plants."""
     found = []
     for i, own in enumerate(bounds.channels):
@@ -139,7 +139,7 @@ def _channel_entry(bounds: Bounds, judged: Certificate) -> dict[str, Any]:
     return {"channel_bounds": found} if found else {}
 
 
-def robust_dict(wide: Certificate, plants: int, worst: Excess) -> dict[str, Any]:
+def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, Any]:
     """`robust`: the judge on so many plants of the box, and the worst that was searched."""
     return {
         "plants": plants,

@@ -32,10 +32,10 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     plants_of,
     structure_of,
     structured_of,
-    warm_starts,
+    warm_starts_at,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Member
+from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
@@ -51,14 +51,14 @@ INSIDE = 1e-7  # of λ
 class ListedStructured:
     """`search` and `judge` as `best_of_lists` asks for them.
 
-    `solve` goes on from a θ to a whole co-design. `members`: all plants that were found worse than
-    those of the set, at any of the θ.
+    `solve` goes on from a θ to a whole co-design. `scenarios`: all plants that were found worse
+    than those of the set, at any of the θ.
     """
 
     formulation: Formulation
     seed: int
     solve: Callable[[Sampler, Array], Solution]
-    members: tuple[Member, ...] = ()
+    scenarios: tuple[Scenario, ...] = ()
 
     def search(self, sampler: Sampler, near: Solution | None) -> Solution:
         """The least J that is found with every value in the ranges of the sampler's problem."""
@@ -70,7 +70,7 @@ class ListedStructured:
 
     def _anew(self, sampler: Sampler) -> Solution:
         outer = StructuredOuter(sampler).prepared(self.seed)
-        self.members = structured_of(outer.problem).members
+        self.scenarios = structured_of(outer.problem).scenarios
         found = _climbed(outer.sampler, np.array(sampler.problem.start))
         for theta in design("sobol", *box(sampler.problem), self.formulation.starts, self.seed):
             allowed = _allowed(sampler.problem, theta)
@@ -85,22 +85,24 @@ class ListedStructured:
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
             return _nothing("no theta within the constraints was found")
-        return _climbed(sampler.of(carried(known, problem, self.members)), theta)
+        return _climbed(sampler.of(carried(known, problem, self.scenarios)), theta)
 
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
         near = _start(found)
         begun = replace(sampler.problem, start=near.start)
-        solution = self.solve(sampler.of(carried(near, begun, self.members)), np.array(near.start))
+        solution = self.solve(
+            sampler.of(carried(near, begun, self.scenarios)), np.array(near.start)
+        )
         if solution.verified is not None:
-            self.members = structured_of(solution.verified.problem).members
+            self.scenarios = structured_of(solution.verified.problem).scenarios
         return solution
 
 
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by."""
     problem = sampler.problem
-    best = pieces_from(sampler, sampler.bandwidths(theta, "near by")[0], SETTLED, FAR)
+    best = pieces_from(sampler, sampler.values(theta, "near by")[0], SETTLED, FAR)
     J = objective_of(problem, best)
     if not np.isfinite(J):
         return _nothing(best.shortfall)
@@ -117,22 +119,22 @@ def _climbed(sampler: Sampler, theta: Array) -> Solution:
 
 
 def carried(
-    near: CoDesignProblem, problem: CoDesignProblem, members: tuple[Member, ...]
+    near: CoDesignProblem, problem: CoDesignProblem, scenarios: tuple[Scenario, ...]
 ) -> CoDesignProblem:
-    """A problem with the anchors of one like it, moved from that one's start to its own."""
-    problem = with_structured(problem, seed=structured_of(near).seed, members=members)
+    """A problem with the warm starts of one like it, moved from that one's start to its own."""
+    problem = with_structured(problem, seed=structured_of(near).seed, scenarios=scenarios)
     problem = with_range(problem)
     plants, bounds = plants_of(problem, problem.start), bounds_of(problem)
     moved = {}
-    for name in ("anchors", "error_anchors"):
-        of = with_structured(near, anchors=getattr(structured_of(near), name))
-        kappas = warm_starts(of, structure_of(problem), plants, bounds)
+    for name in ("warm_starts", "error_warm_starts"):
+        of = with_structured(near, warm_starts=getattr(structured_of(near), name))
+        kappas = warm_starts_at(of, structure_of(problem), plants, bounds)
         moved[name] = tuple(tuple(map(float, kappa)) for kappa in kappas)
     return with_structured(problem, **moved)
 
 
 def _start(found: Solution) -> CoDesignProblem:
-    """The problem of a solution with its θ as the start and its controller as the anchor."""
+    """The problem of a solution with its θ as the start and its controller as the warm start."""
     if found.verified is None:
         assert found.problem is not None
         return found.problem
@@ -143,8 +145,8 @@ def _start(found: Solution) -> CoDesignProblem:
 def _at(
     problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
 ) -> CoDesignProblem:
-    own = replace(structured_of(problem), anchors=(kappa,), error_anchors=())
-    return replace(problem, controller=own.with_anchor(kappa, 1), start=theta)
+    own = replace(structured_of(problem), warm_starts=(kappa,), error_warm_starts=())
+    return replace(problem, controller=own.with_warm_start(kappa, 1), start=theta)
 
 
 def _nothing(words: str) -> Solution:

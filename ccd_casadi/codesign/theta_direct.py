@@ -6,7 +6,7 @@ from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, 
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.optim.pieces import FIRST, Local, descend
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 
 SETTLED = 1e-7  # of J: what steps promise less than that is not looked for
@@ -16,8 +16,8 @@ STEPS = 15  # per parameter, at most, to where pieces meet: from near by it take
 
 
 def pieces_from(
-    sampler: Sampler, best: BandwidthSample, settled: float, first: float = FIRST
-) -> BandwidthSample:
+    sampler: Sampler, best: InnerSample, settled: float, first: float = FIRST
+) -> InnerSample:
     """From a sample to where the pieces of J promise no more, with what is known near by.
 
     Again from the best where a better controller was found on the way for what had been known.
@@ -28,10 +28,10 @@ def pieces_from(
 
     def at(z: Array) -> Local | None:
         theta = np.clip(lower + width * z, lower, upper)
-        asked.extend(sampler.bandwidths(theta, "local solve"))
+        asked.extend(sampler.values(theta, "local solve"))
         return local(asked[-1])
 
-    def local(sample: BandwidthSample) -> Local | None:
+    def local(sample: InnerSample) -> Local | None:
         J, gradient = objective_of(problem, sample), objective_gradient(problem, sample)
         if not (np.isfinite(J) and np.isfinite(gradient).all()):
             return None
@@ -43,12 +43,12 @@ def pieces_from(
 
     steps = STEPS * len(lower)
     for _ in range(FOLLOWED):
-        start, raised = local(best), sampler.raised
+        start, improvements = local(best), sampler.improvements
         if start is None:
             break
         others = [found for found in map(local, sampler.solved.values()) if found is not None]
         descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
         best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
-        if sampler.raised == raised:
+        if sampler.improvements == improvements:
             break
     return best

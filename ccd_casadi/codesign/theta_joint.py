@@ -36,12 +36,12 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Member
-from ccd_casadi.inner_problem.structured_robustness import worse_members
+from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
 from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
@@ -64,7 +64,7 @@ FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still
 
 
 @dataclass(frozen=True)
-class Place:
+class JointPoint:
     """θ, κ (SI) and ω_b in rad/s, which may exceed the bounds a little."""
 
     theta: tuple[float, ...]
@@ -76,47 +76,47 @@ class Place:
 class Proposal:
     """The end of a search and by how much J falls there, on the plants to first order."""
 
-    end: Place
+    end: JointPoint
     gain: float
 
 
-def together(
+def joint_search(
     sampler: Sampler, theta: Array, tell: Callable[[str], None] | None = None
-) -> tuple[Sampler, BandwidthSample, bool]:
+) -> tuple[Sampler, InnerSample, bool]:
     """From θ towards where the joint search promises no more on the worst plants: the sampler of
-    the problem that has these and the controller there as its anchor, its true sample, and whether
-    no more is promised."""
-    problem, first = sampler.problem, sampler.bandwidths(theta, "polishing")[0]
+    the problem that has these and the controller there as its warm start, its true sample, and
+    whether no more is promised."""
+    problem, first = sampler.problem, sampler.values(theta, "polishing")[0]
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
-    best, known = Place(first.theta, first.kappa, first.bandwidth), [first.theta]
+    best, known = JointPoint(first.theta, first.kappa, first.bandwidth), [first.theta]
     reach, settled, asked = REACH, False, sampler
     for turn in range(TURNS):
         models, within = nearby(problem, known, best.theta), LOOSE if turn else WITHIN
         uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
-        members = worse_members(
+        scenarios = violations(
             problem, uncertain, np.array(best.kappa), best.bandwidth, turn, tell, within
         )[1]
-        if members:
-            asked = with_members(asked, members)
+        if scenarios:
+            asked = with_scenarios(asked, scenarios)
             problem = asked.problem
         best, J = JointModel(problem, models, best, reach).adapted()
         if not np.isfinite(J):
             break
         make = partial(proposed, problem, models, best, reach)
-        found = asked.kept("together", (*best.theta, reach, turn), Proposal, make)
+        found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
             tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
         promised = found.gain > SETTLED * abs(J) and reach > LEAST
-        if not (members or promised):
+        if not (scenarios or promised):
             best = finished(asked, best)
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
-            members = worse_members(problem, own, kappa, omega_b, TURNS + turn, tell)[1]
-            settled = not members
+            scenarios = violations(problem, own, kappa, omega_b, TURNS + turn, tell)[1]
+            settled = not scenarios
             if settled:
                 break
-            asked = with_members(asked, members)
+            asked = with_scenarios(asked, scenarios)
             problem = asked.problem
         if not promised:
             continue
@@ -134,13 +134,13 @@ def together(
     best = best if settled else finished(asked, best)
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
-    last = asked.climbed(best.theta, best.kappa)
+    last = asked.value_from(best.theta, best.kappa)
     if asked is not sampler or objective_of(problem, last) < objective_of(problem, first):
         return asked, last, settled
     return sampler, first, True
 
 
-def finished(sampler: Sampler, start: Place) -> Place:
+def finished(sampler: Sampler, start: JointPoint) -> JointPoint:
     """The joint optimum near by, on the plants themselves to first order around each end before: so
     near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
     problem, (lower, upper) = sampler.problem, box(sampler.problem)
@@ -149,7 +149,7 @@ def finished(sampler: Sampler, start: Place) -> Place:
     for number in range(ENDINGS):
         make = partial(proposed, problem, models, best, reach, LAST_GAIN)
         at = (*start.theta, start.bandwidth, number)
-        end = sampler.kept("finished", at, Proposal, make).end
+        end = sampler.cached("finished", at, Proposal, make).end
         away = float(np.abs((np.array(end.theta) - best.theta) / (upper - lower)).max())
         others = nearby(problem, (), end.theta)
         end, there = JointModel(problem, others, end, reach).adapted()
@@ -162,19 +162,19 @@ def finished(sampler: Sampler, start: Place) -> Place:
     return best
 
 
-def with_members(sampler: Sampler, members: Sequence[Member]) -> Sampler:
+def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:
     """The sampler of the problem with more plants: on these what was found before is worth
     nothing."""
     trace = sampler.trace
     trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
-    known = structured_of(sampler.problem).members
-    return sampler.of(with_structured(sampler.problem, members=(*known, *members)))
+    known = structured_of(sampler.problem).scenarios
+    return sampler.of(with_structured(sampler.problem, scenarios=(*known, *scenarios)))
 
 
-def objectives_beside(problem: CoDesignProblem, sample: BandwidthSample, thetas: Array) -> Array:
+def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Array) -> Array:
     """By how much J is larger at θ (n, n_θ) beside a sample, by climbs of its controller on the
     plants to first order there."""
-    here, found = Place(sample.theta, sample.kappa, sample.bandwidth), []
+    here, found = JointPoint(sample.theta, sample.kappa, sample.bandwidth), []
     models = nearby(problem, (), here.theta)
     for theta in [np.array(here.theta), *thetas]:
         there = replace(here, theta=tuple(theta.tolist()))
@@ -185,7 +185,7 @@ def objectives_beside(problem: CoDesignProblem, sample: BandwidthSample, thetas:
 def proposed(
     problem: CoDesignProblem,
     models: Sequence[Evaluate],
-    at: Place,
+    at: JointPoint,
     reach: float,
     least_gain: float = LEAST_GAIN,
 ) -> Proposal:
@@ -212,16 +212,16 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
 
     def __init__(
-        self, problem: CoDesignProblem, models: Sequence[Evaluate], place: Place, reach: float
+        self, problem: CoDesignProblem, models: Sequence[Evaluate], place: JointPoint, reach: float
     ) -> None:
         self.problem, self.models, self.middle = problem, models, np.array(place.theta)
         structured = structured_of(problem)
-        known = [(option, np.array(point)) for option, point in structured.members]
+        known = [(option, np.array(point)) for option, point in structured.scenarios]
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
         uncertain = self.uncertain((self.middle - lower) / self.width)
-        self.members = known or uncertain.corners()
-        self.first = uncertain.plants(self.members[:1])[0]
+        self.scenarios = known or uncertain.corners()
+        self.first = uncertain.plants(self.scenarios[:1])[0]
         self.unit = -problem.w2 * place.bandwidth
         middle = (self.middle - lower) / self.width
         loops = self.first_loops = self.loops(middle)
@@ -234,16 +234,16 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self.low = np.concatenate([low, loops.box[0], [-np.inf]])
         self.high = np.concatenate([high, loops.box[1], [np.inf]])
 
-    def place(self, x: Array) -> Place:
+    def place(self, x: Array) -> JointPoint:
         """That of x."""
         z, kappa, tau = self.parts(x)
         loops = self.first_loops
         kappa = loops.structure.in_units(kappa, loops.plants.omega_0, loops.plants.force)
         theta = np.clip(self.theta(z), *box(self.problem))
         omega_b = float(np.exp(tau) * loops.plants.omega_0)
-        return Place(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
+        return JointPoint(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
 
-    def adapted(self, steps: int = ADAPTING) -> tuple[Place, float]:
+    def adapted(self, steps: int = ADAPTING) -> tuple[JointPoint, float]:
         """The middle after a few steps of the controller alone, and J there with what is left of a
         violation; infinite where a loop is unstable."""
         z, kappa, tau = self.parts(self.start)
@@ -282,7 +282,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         share = self.width[:, None, None]
         plants = [
             replace(plant, dA=share * plant.dA, dB=share * plant.dB, dC=share * plant.dC)
-            for plant in self.uncertain(z, beside).plants(self.members)
+            for plant in self.uncertain(z, beside).plants(self.scenarios)
         ]
         structured = structured_of(self.problem)
         return problem_for(
@@ -294,10 +294,13 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         return [self.loops(np.array(z), BESIDE * unit) for unit in np.eye(len(z))]
 
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
-        """With every loop stable."""
+        """With every loop stable, and masses that are positive to first order."""
         x = np.clip(x, self.low, self.high)
         z, kappa, tau = self.parts(x)
-        problem = self.loops(z)
+        try:
+            problem = self.loops(z)
+        except np.linalg.LinAlgError:  # placed masses move so far that M + ∂M Δθ is indefinite
+            return None
         found = assess(problem, kappa, tau)
         if not found.stable:
             return None
@@ -330,8 +333,12 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         of_z = np.pad(own.slopes, ((0, 0), (0, len(here.x) - count)))
 
         def second(index: np.ndarray) -> Array:
-            beside = self.loops_beside(tuple(z.tolist()))
-            return hessians(problem, kappa, tau, found.only(index), beside)
+            chosen = found.only(index)
+            try:
+                beside = self.loops_beside(tuple(z.tolist()))
+            except np.linalg.LinAlgError:  # as in `at`: no curvature is known at the edge
+                return np.zeros((len(chosen.value), len(here.x), len(here.x)))
+            return hessians(problem, kappa, tau, chosen, beside)
 
         return Rows(
             np.concatenate([found.value, own.constraints + INSIDE]), np.vstack([slopes, of_z]),

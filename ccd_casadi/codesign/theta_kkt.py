@@ -41,7 +41,7 @@ from ccd_casadi.optim.kkt import (
     reduced_curvature,
 )
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 
 # The envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3: a residual
@@ -54,7 +54,7 @@ BESIDE = 10.0 * STEP  # of the box: differences of true values and gradients
 
 def theta_kkt(
     problem: CoDesignProblem,
-    sample: BandwidthSample,
+    sample: InnerSample,
     truth: Sampler | None = None,
     envelope: Envelope | None = None,
     beside: Beside | None = None,
@@ -93,7 +93,7 @@ def theta_kkt(
     return at.certificate(nu, residual, second, kink)
 
 
-def active_theta(problem: CoDesignProblem, sample: BandwidthSample) -> ActiveSet:
+def active_theta(problem: CoDesignProblem, sample: InnerSample) -> ActiveSet:
     """∇J at a sample, and what binds of λ and the bounds of θ."""
     (lower, upper), theta = box(problem), np.array(sample.theta)
     own = hardware_at(problem, theta)
@@ -140,7 +140,7 @@ def _steepest_first(Z: Array, gradient: Array) -> Array:
 
 
 def _slopes(
-    problem: CoDesignProblem, more: Beside, sample: BandwidthSample, Z: Array, size: float
+    problem: CoDesignProblem, more: Beside, sample: InnerSample, Z: Array, size: float
 ) -> tuple[tuple[float, float], ...]:
     """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
     and over `size`; all are asked for at once."""
@@ -155,23 +155,21 @@ def _slopes(
     return tuple((float(low), float(high)) for low, high in found.reshape(-1, 2))
 
 
-def _more(
-    problem: CoDesignProblem, truth: Sampler, sample: BandwidthSample, thetas: Array
-) -> Array:
+def _more(problem: CoDesignProblem, truth: Sampler, sample: InnerSample, thetas: Array) -> Array:
     """By how much J is larger at θ (n, n_θ) than at a sample."""
     J = objective(problem, sample.theta, sample.value)
-    there = truth.bandwidths(thetas, "certificate")
+    there = truth.values(thetas, "certificate")
     return np.array([objective(problem, one.theta, one.value) - J for one in there])
 
 
 def _hessian(
-    problem: CoDesignProblem, truth: Sampler, sample: BandwidthSample, Z: Array
+    problem: CoDesignProblem, truth: Sampler, sample: InnerSample, Z: Array
 ) -> Array | None:
     """∇²J Z (n, k) by differences of true gradients; λ's own curvature is left out."""
     lower, upper = box(problem)
 
     def slope(z: Array) -> Array:
-        there = truth.bandwidths(lower + (upper - lower) * z, "certificate")[0]
+        there = truth.values(lower + (upper - lower) * z, "certificate")[0]
         return objective_gradient(problem, there)
 
     z = (np.array(sample.theta) - lower) / (upper - lower)

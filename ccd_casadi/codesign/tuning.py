@@ -22,8 +22,8 @@ from ccd_casadi.fixed_structure.measured import (
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.grid import around, frequency_grid
-from ccd_casadi.lti.hold import delayed, in_w, parts, sampled, tustin
+from ccd_casadi.lti.grid import frequency_grid, root_flanks
+from ccd_casadi.lti.hold import delay_parts, delayed, in_w, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
@@ -180,10 +180,10 @@ def _plant(
     T = 1.0 / rate_hz
     if not own:
         model = sampled(system, T, delay)
-    elif not np.isclose(own, T) or not np.isclose(parts(T, delay)[1], 0.0, atol=1e-6 * T):
+    elif not np.isclose(own, T) or not np.isclose(delay_parts(T, delay)[1], 0.0, atol=1e-6 * T):
         raise UserError("a plant in discrete time runs at its rate, and a delay of whole periods")
     else:
-        whole = parts(T, delay)[0]
+        whole = delay_parts(T, delay)[0]
         model = delayed(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)
     top, rates = np.pi / T, system.rates
     rest = np.abs(rates) <= AT_REST * np.abs(rates).max(initial=0.0)
@@ -193,7 +193,7 @@ def _plant(
     roots = np.concatenate([rates[~rest], zeros, [top]])
     low = BELOW * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
     omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),
-                           around(roots), apart=APART)  # fmt: skip
+                           root_flanks(roots), apart=APART)  # fmt: skip
     unstable = int((rates[~rest].real > 0.0).sum())
     G = model.response(omega)
     one = G.shape[1:] == (1, 1)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
 
-from ccd_casadi.codesign.formulation import BoxLook
+from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
@@ -39,7 +39,7 @@ class State(StrEnum):
 
 
 @dataclass(frozen=True)
-class Line:
+class VerdictLine:
     """One line: its state, its words and the figures behind them."""
 
     state: State
@@ -51,18 +51,18 @@ class Line:
 class Verdict:
     """The five lines, in the order in which they matter."""
 
-    certified: Line
-    optimal: Line
-    predicted: Line
-    survives: Line
-    deployable: Line
+    certified: VerdictLine
+    optimal: VerdictLine
+    predicted: VerdictLine
+    survives: VerdictLine
+    deployable: VerdictLine
 
     @property
     def failed(self) -> tuple[str, ...]:
         """Names of the lines that failed."""
         return tuple(name for name, line in self.lines() if line.state is State.FAILED)
 
-    def lines(self) -> tuple[tuple[str, Line], ...]:
+    def lines(self) -> tuple[tuple[str, VerdictLine], ...]:
         """Name and line, in order."""
         return tuple((item.name, getattr(self, item.name)) for item in fields(self))
 
@@ -77,7 +77,7 @@ def optimal(
     known: str,
     unknown: str = "",
     saddle: float = SADDLE,
-) -> Line:
+) -> VerdictLine:
     """KKT residual over θ up to `level`, and the whole inner problem at θ, `better` by `gap`.
 
     `known`: where something better was looked for; `unknown`: why there may be no gradient; in
@@ -86,23 +86,23 @@ def optimal(
     residual, kink = kkt.stationarity, kkt.kink
     figures: dict[str, Any] = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap}
     if not gap <= tolerance:
-        return Line(State.FAILED, f"not optimal: {better}; {known}", figures)
+        return VerdictLine(State.FAILED, f"not optimal: {better}; {known}", figures)
     if unknown and not math.isfinite(residual):
-        return Line(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
+        return VerdictLine(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
     if not residual <= level:
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
-        return Line(State.FAILED, words, figures)
+        return VerdictLine(State.FAILED, words, figures)
     if kink is None:
         words = f"KKT residual {residual:.1e} over theta; {known}"
         if kkt.second_order is not None and kkt.second_order < saddle:
             figures["least_curvature"] = kkt.second_order
             words = f"a stationary point that curves downwards ({kkt.second_order:.2g}): {words}"
-            return Line(State.WARNED, words, figures)
-        return Line(State.PASSED, words, figures)
+            return VerdictLine(State.WARNED, words, figures)
+        return VerdictLine(State.PASSED, words, figures)
     figures |= {"kkt_residual_one_gradient": kink.one_gradient, "slopes": kink.slopes}
     if kink.least_slope < -level:
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
-        return Line(State.FAILED, f"{words}; {known}", figures)
+        return VerdictLine(State.FAILED, f"{words}; {known}", figures)
     words = (
         f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
         f"controller together ({kink.one_gradient:.2g} with the gradient of one side); "
@@ -110,7 +110,7 @@ def optimal(
         f"{_sides(kink)}; {known}"
     )
     known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)
-    return Line(State.PASSED if known_all else State.WARNED, words, figures)
+    return VerdictLine(State.PASSED if known_all else State.WARNED, words, figures)
 
 
 def _sides(kink: Kink) -> str:
@@ -130,8 +130,8 @@ def _sides(kink: Kink) -> str:
     )
 
 
-def look_words(
-    starts: int, optima: int, look: BoxLook | None, gap: str = "gap not known"
+def search_evidence(
+    starts: int, optima: int, look: GlobalCheck | None, gap: str = "gap not known"
 ) -> tuple[str, dict[str, Any]]:
     """What IPOPT's starts, the global check over the box and bounds say, in words and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
@@ -166,7 +166,7 @@ def predicted(
     extrapolates: Sequence[str] = (),
     surrogate: bool = True,
     of: Figure = BANDWIDTH,
-) -> Line:
+) -> VerdictLine:
     """Surrogate against truth at the design.
 
     Where the design is itself one of the samples the surrogate reproduces it and `error` shows
@@ -176,7 +176,9 @@ def predicted(
     what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
     if not surrogate:
-        return Line(State.PASSED, "nothing was predicted: the search used true values", figures)
+        return VerdictLine(
+            State.PASSED, "nothing was predicted: the search used true values", figures
+        )
     if left_out is not None:
         size = f"left_out_{unit.lower()}"
         figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}
@@ -184,21 +186,23 @@ def predicted(
         words = (
             f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
         )
-        return Line(State.FAILED, words, figures)
+        return VerdictLine(State.FAILED, words, figures)
     if left_out is None:
         words = f"{what} predicted to {100 * error:.2g} %"
         if extrapolates:
             words += f"; the surrogate extrapolates there: {extrapolates[0]}"
-            return Line(State.WARNED, words, figures)
-        return Line(State.PASSED, words, figures)
+            return VerdictLine(State.WARNED, words, figures)
+        return VerdictLine(State.PASSED, words, figures)
     words = (
         f"the optimum is a training sample; left out, its {what} is missed by "
         f"{left_out_size:.2g} {unit} ({100 * left_out:.2g} %"
         + (f", {sigmas:.1f} sigma)" if sigmas is not None else ")")
     )
     if left_out <= tolerance or (sigmas is not None and sigmas <= SIGMAS and left_out <= 0.01):
-        return Line(State.PASSED, words, figures)
-    return Line(State.WARNED, f"{words}: the samples around do not support the design", figures)
+        return VerdictLine(State.PASSED, words, figures)
+    return VerdictLine(
+        State.WARNED, f"{words}: the samples around do not support the design", figures
+    )
 
 
 def survives(
@@ -210,7 +214,7 @@ def survives(
     other_damping: str = "",
     closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
-) -> Line:
+) -> VerdictLine:
     """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none).
 
     `other_damping`: what that set does not keep, in words; `closer` models of the plant by name:
@@ -218,8 +222,8 @@ def survives(
     """
     if found is None:
         if robust is False:
-            return Line(State.FAILED, robust_words, figures or {})
-        return Line(State.UNKNOWN, "the loop could not be perturbed", figures or {})
+            return VerdictLine(State.FAILED, robust_words, figures or {})
+        return VerdictLine(State.UNKNOWN, "the loop could not be perturbed", figures or {})
     state, said = State.PASSED, []
     low, high = found.stable_shift
     said.append(f"stable for resonances {_range(low, high)}")
@@ -269,10 +273,10 @@ def survives(
         "robust_set": robust,
         "closer_models": {name: {"stable": good, "peak": peak} for name, good, peak in closer},
     }
-    return Line(state, "; ".join(said), figures)
+    return VerdictLine(state, "; ".join(said), figures)
 
 
-def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line:
+def deployable(found: Survival | None, sampling: Sampling | None = None) -> VerdictLine:
     """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
     figures: dict[str, float] = {}
     if found is not None:
@@ -283,15 +287,15 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
             "and delay exact at the instants; run deploy for the code"
         )
         figures |= {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
-        return Line(State.PASSED, words, figures)
+        return VerdictLine(State.PASSED, words, figures)
     if found is None or not math.isfinite(found.delay):
-        return Line(State.UNKNOWN, "run deploy", figures)
+        return VerdictLine(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
         f"run deploy; the loops' least delay margin is {with_unit(found.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     ).replace("µ", "u")
-    return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
+    return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
 
 
 def verdict_dict(verdict: Verdict) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
-from ccd_casadi.codesign.verdict import SADDLE, Line, look_words
+from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
@@ -90,11 +90,11 @@ class Verified(ABC):
         """controller.json."""
 
     @abstractmethod
-    def certified_line(self) -> Line:
+    def certified_line(self) -> VerdictLine:
         """What its certificate rests on."""
 
     @abstractmethod
-    def survives_line(self) -> Line:
+    def survives_line(self) -> VerdictLine:
         """Whether the case's own set of plants is kept, and closer models."""
 
     @abstractmethod
@@ -106,12 +106,12 @@ class Verified(ABC):
         return ""
 
     def searched(
-        self, outcome: FormulationResult, look: BoxLook | None
+        self, outcome: FormulationResult, look: GlobalCheck | None
     ) -> tuple[str, Mapping[str, Any]]:
         """Where something better was looked for and not found, in words and figures."""
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        return look_words(starts, optima, look, self.bound_words)
+        return search_evidence(starts, optima, look, self.bound_words)
 
     @property
     def bound_words(self) -> str:

@@ -6,9 +6,9 @@ from typing import Any, ClassVar
 
 from ccd_casadi.codesign.design_entries import controller_dict, mixed_dict
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
-from ccd_casadi.codesign.verdict import Line, State, survives
+from ccd_casadi.codesign.verdict import State, VerdictLine, survives
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.inner_problem.constraints import touched
+from ccd_casadi.inner_problem.constraints import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -53,7 +53,7 @@ class VerifiedDesign(Verified):
         problem = self.problem
         ends = {f"{name} {end}" for name in problem.names for end in ("lower", "upper")}
         inner = active_constraints(problem.inner, self.design.figures)
-        return (*filter(ends.__contains__, self.kkt.active), *inner, *touched(problem, self.theta))
+        return (*filter(ends.__contains__, self.kkt.active), *inner, *binding(problem, self.theta))
 
     def figures(self) -> dict[str, Any]:
         return mixed_dict(self.problem, self.theta, self.design)
@@ -102,7 +102,7 @@ class VerifiedDesign(Verified):
     def controller_entry(self) -> dict[str, Any]:
         return controller_dict(self.controller)
 
-    def certified_line(self) -> Line:
+    def certified_line(self) -> VerdictLine:
         design, bounds = self.design.figures, self.problem.inner.bounds
         norm, norm_bound = design.certificate.norm, design.certificate.norm_bound
         figures = {"norm": norm, "norm_bound": norm_bound}
@@ -116,9 +116,9 @@ class VerifiedDesign(Verified):
         elif not self.feasible:
             words = f"certified, but {', '.join(bounds)} or a constraint on theta is not met"
         good = design.certified and self.feasible
-        return Line(State.PASSED if good else State.FAILED, words, figures)
+        return VerdictLine(State.PASSED if good else State.FAILED, words, figures)
 
-    def survives_line(self) -> Line:
+    def survives_line(self) -> VerdictLine:
         return survives(
             self.survival,
             S_max=self.problem.inner.S_max,

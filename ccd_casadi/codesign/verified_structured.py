@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
@@ -14,19 +14,19 @@ from ccd_casadi.codesign.structured_entries import (
     robust_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.verdict import Line, State, survives
+from ccd_casadi.codesign.verdict import State, VerdictLine, survives
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.constraints import touched
+from ccd_casadi.inner_problem.constraints import binding
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_search import joined
+from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -50,11 +50,13 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
     model = tuple(map(float, uncertain_plant(problem, theta).nominal))
 
     def climbed(easier: StructuredProblem) -> float:
-        value = structured_value(joined(replace(problem, controller=easier), kappa, ()), theta)
+        value = structured_value(
+            with_warm_start(replace(problem, controller=easier), kappa, ()), theta
+        )
         return value.bandwidth if value.feasible else float("nan")
 
     return Costs(
-        climbed(replace(structured, members=((0, model),))),
+        climbed(replace(structured, scenarios=((0, model),))),
         climbed(replace(structured, sampling=None)),
     )
 
@@ -65,14 +67,14 @@ class VerifiedStructured(Verified):
 
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
     the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
-    `worst` the worst plant that was found. `raced` is a multi-start search at θ,
+    `worst` the worst plant that was found. `multistart` is a multi-start search at θ,
     `costs` what easier problems have there, `prices` dω_b/d ln t (rad/s) of every tolerance t, and
     `gap`, of ω_b, what no controller reaches; `told` the time of its move, where that counts.
     """
 
     design: SectionsDesign
-    raced: StructuredValue
-    wide: Certificate
+    multistart: StructuredValue
+    wide: SetCertificate
     checked: int
     proof: Proof
     drawn: Yield | None
@@ -102,7 +104,7 @@ class VerifiedStructured(Verified):
         return self.design.bandwidth
 
     @property
-    def kept(self) -> bool:
+    def set_is_met(self) -> bool:
         """Whether the whole set is: by the judge, proof, draws, and along its common shift."""
         found, ends = self.survival, kind_of(self.problem).common_shifts()
         along = found is None or found.within(*ends)
@@ -117,7 +119,7 @@ class VerifiedStructured(Verified):
     def active(self) -> tuple[str, ...]:
         constraints = plant_of(self.problem).constraint_names
         bounds = [name for name in self.kkt.active if name not in constraints]
-        return (*bounds, *active_of(self.design), *touched(self.problem, self.theta))
+        return (*bounds, *active_of(self.design), *binding(self.problem, self.theta))
 
     def figures(self) -> dict[str, Any]:
         return design_dict(self.problem, self.theta, self.design)
@@ -128,10 +130,10 @@ class VerifiedStructured(Verified):
             "surrogate_bandwidth_hz": predicted / HZ if structured.figure is BANDWIDTH else None,
             "race": [
                 {"bandwidth_hz": optimum.bandwidth / HZ, "searches": optimum.count}
-                for optimum in self.raced.design.local_optima
+                for optimum in self.multistart.design.local_optima
             ],
             "rounds": self.rounds,
-            "anchors": [list(kappa) for kappa in structured.anchors],
+            "anchors": [list(kappa) for kappa in structured.warm_starts],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
             "costs": json_values({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()})
@@ -143,8 +145,8 @@ class VerifiedStructured(Verified):
             found |= {
                 f"{entry}_of_set": self.value,
                 f"surrogate_{entry}": predicted,
-                f"{entry}_raced": self.raced.value,
-                "error_anchors": [list(kappa) for kappa in structured.error_anchors],
+                f"{entry}_raced": self.multistart.value,
+                "error_anchors": [list(kappa) for kappa in structured.error_warm_starts],
             }
         if structured.uncertainty.ranges:
             found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
@@ -160,13 +162,13 @@ class VerifiedStructured(Verified):
     def _robust_entry(self) -> dict[str, Any]:
         """The judge on a lattice of the box, and the worst plant that was searched."""
         stable = [plant for plant in self.wide.plants if plant.stable]
-        members = structured_of(self.problem).members
+        scenarios = structured_of(self.problem).scenarios
         return {
             **robust_dict(self.wide, self.checked, self.worst),
             "stable": len(stable) == len(self.wide.plants),
             "worst_sensitivity_peak": max((plant.S_peak for plant in stable), default=None),
             "worst_plant": {"option": self.worst.option, "point": self.worst.point.tolist()},
-            "set": [{"option": option, "point": list(point)} for option, point in members],
+            "set": [{"option": option, "point": list(point)} for option, point in scenarios],
             "yield": None if self.drawn is None else self.drawn.entry,
             **({} if self.damping is None else self.damping.entry),
         }
@@ -174,24 +176,26 @@ class VerifiedStructured(Verified):
     def checks(self) -> dict[str, bool]:
         drawn = None if self.told is None else self.told[1]
         later = {} if drawn is None else {"move_time": drawn.survived == drawn.draws}
-        return {"robust": self.kept, **later}
+        return {"robust": self.set_is_met, **later}
 
     def controller_entry(self) -> dict[str, Any]:
         return sections_controller(self.design, self.problem.sampling)
 
-    def certified_line(self) -> Line:
+    def certified_line(self) -> VerdictLine:
         judged = self.design.certificate
         figures = {} if judged is None else {"figures_over_bounds": judged.worst}
         if not self.certified:
-            return Line(State.FAILED, self.design.words, figures)
+            return VerdictLine(State.FAILED, self.design.words, figures)
         if not self.feasible:
-            return Line(State.FAILED, "certified, but a constraint on theta is not met", figures)
+            return VerdictLine(
+                State.FAILED, "certified, but a constraint on theta is not met", figures
+            )
         count = 0 if judged is None else len(judged.plants)
         where = "the model" if count == 1 else f"the {count} plants"
         words = f"stable and within every bound on {where} that it was designed on"
-        return Line(State.PASSED, words, figures)
+        return VerdictLine(State.PASSED, words, figures)
 
-    def survives_line(self) -> Line:
+    def survives_line(self) -> VerdictLine:
         excess, proof = math.expm1(self.worst.value), self.proof
         drawn = "" if self.drawn is None else self.drawn.words
         figures = {
@@ -203,7 +207,7 @@ class VerifiedStructured(Verified):
         where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
         share = f"{100.0 + 100.0 * excess:.6g} % of a bound"
         words = f"within every bound on {where}, the worst that a search found at {share}"
-        robust: bool | None = self.kept
+        robust: bool | None = self.set_is_met
         if not self.wide.passed:
             words = f"on {where}: {self.wide.words}"
         elif proof.refuted:
@@ -225,11 +229,11 @@ class VerifiedStructured(Verified):
             figures=figures,
         )
         state = State.WARNED if robust is None and line.state is State.PASSED else line.state
-        return Line(state, line.words, line.figures)
+        return VerdictLine(state, line.words, line.figures)
 
     def gap_words(self) -> str:
         figure = self.problem.figure
-        here, there = figure.shown(self.value), figure.shown(self.raced.value)
+        here, there = figure.shown(self.value), figure.shown(self.multistart.value)
         found = f"found a controller with {there} instead of {here}"
         return f"a multi-start search at this theta {found}"
 
@@ -243,12 +247,12 @@ class VerifiedStructured(Verified):
         return super().bound_words if self.gap is None else self.gap.words(self.bandwidth)
 
     def searched(
-        self, outcome: FormulationResult, look: BoxLook | None
+        self, outcome: FormulationResult, look: GlobalCheck | None
     ) -> tuple[str, Mapping[str, Any]]:
         known, figures = super().searched(outcome, look)
-        found, of = [optimum.bandwidth / HZ for optimum in self.raced.design.local_optima], ""
-        if self.raced.feasible and self.problem.figure is not BANDWIDTH:
-            of = f", from there at {self.problem.figure.shown(self.raced.value)}"
-        raced = ", ".join(f"{value:.2f}" for value in found)
-        words = f"a multi-start search at this theta ended at {raced} Hz{of}; {known}"
+        found, of = [optimum.bandwidth / HZ for optimum in self.multistart.design.local_optima], ""
+        if self.multistart.feasible and self.problem.figure is not BANDWIDTH:
+            of = f", from there at {self.problem.figure.shown(self.multistart.value)}"
+        multistart = ", ".join(f"{value:.2f}" for value in found)
+        words = f"a multi-start search at this theta ended at {multistart} Hz{of}; {known}"
         return words, {**figures, "local_optima_hz": found}

@@ -96,7 +96,7 @@ def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
     """Of a run with sections: corners of its box, its own set, `dense`: a lattice too."""
     sections = structured_of(run.problem)
     uncertain = uncertain_plant(run.problem, run.theta)
-    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.members)]
+    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.scenarios)]
     if dense:
         points += lattice(uncertain, LATTICE, sections.seed)
     found: dict[SetPlace, Member] = {}

@@ -4,7 +4,7 @@ from math import isfinite
 from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.verdict import Line, State
+from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deployment.discretise import Conversion
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.robust_set import place_words
@@ -26,7 +26,7 @@ def short_status(run: FinishedRun, found: Deployment) -> str:
     return "verified"
 
 
-def deployed_line(run: FinishedRun, found: Deployment) -> Line:
+def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
     """`deployable` of the run's verdict."""
     K = found.sampled
     at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
@@ -41,12 +41,12 @@ def deployed_line(run: FinishedRun, found: Deployment) -> Line:
         "plants": 1 + len(found.members),
     }
     if found.shortfalls:
-        return Line(State.FAILED, f"{at}: {found.shortfalls[0]}", figures)
+        return VerdictLine(State.FAILED, f"{at}: {found.shortfalls[0]}", figures)
     kept = f"{at}: bandwidth {K.bandwidth / HZ:.4g} Hz, peak of S {figures['sensitivity_peak']:.5g}"
     reason = reason_words(run, found)
     if reason:
-        return Line(State.WARNED, f"{kept}; {reason}", figures)
-    return Line(State.PASSED, kept, figures)
+        return VerdictLine(State.WARNED, f"{kept}; {reason}", figures)
+    return VerdictLine(State.PASSED, kept, figures)
 
 
 def order_words(run: FinishedRun, found: Deployment) -> str:

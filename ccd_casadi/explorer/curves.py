@@ -14,7 +14,7 @@ from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
-from ccd_casadi.lti.closed_loop import largest
+from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -133,5 +133,5 @@ def as_sampled(
     f = sampled_figures(loop.closed.S)
     near = plant.grid * plant.omega_0 / HZ
     hz = frequency_grid(1e-4 * rate_hz, 0.499 * rate_hz, POINTS, near)
-    gain = largest(loop.sensitivity(HZ * hz))
+    gain = sigma_max(loop.sensitivity(HZ * hz))
     return AsSampled(f.stable, f.bandwidth / HZ, f.sensitivity_peak, hz, gain)

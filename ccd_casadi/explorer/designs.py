@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.codesign.verdict import LEAST_SHIFT
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
@@ -25,7 +25,7 @@ from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import handed_out
+from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import DesignFigures, figures_from_row, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
@@ -173,8 +173,8 @@ def _look(
     look = without_controller(problem, knobs, elements, how)
     weights, inner, plant = problem.weights.at(*point), problem.inner, look.plant
     made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
-    made = handed_out(plant, made, inner.omega_low)
-    standing, reason = judged(problem, made.figures, unmet(problem, knobs.theta))
+    made = recertified_in_si(plant, made, inner.omega_low)
+    standing, reason = judged(problem, made.figures, violated(problem, knobs.theta))
     if elements.error > OWN and standing is not Standing.REFUSED:
         standing, reason = Standing.NEAR, ""
     finite = all(np.isfinite(getattr(made.controller, part)).all() for part in "ABCD")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from ccd_casadi.explorer.designs import Elements
-from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, near
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant, nearby_model
 
 MOST = 6  # θ that the model is made of: more make it slower than a drag
 FLEXIBLE = 1e-6  # of the largest eigenvalue: what is below is a rigid motion's, rounded
@@ -49,7 +49,7 @@ class KnownPlant:
         most = 1 if self.plant.nearby is None else MOST  # to first order: of the newest alone
         close = sorted(known, key=lambda theta: self.distance(theta, known[-1]))[:most]
         used = tuple(theta for theta in known if theta in close)  # a basis grows in one order
-        self.model, self.used = near(self.plant, used, known[-1]), used
+        self.model, self.used = nearby_model(self.plant, used, known[-1]), used
 
     def at(self, theta: Theta) -> Elements:
         """What there is at θ without solving the plant.

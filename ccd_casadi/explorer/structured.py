@@ -12,13 +12,13 @@ import numpy as np
 
 from ccd_casadi.explorer.designs import How, Look, Standing, elements_at, without_controller
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.fixed_structure import Certificate as SetCertificate
+from ccd_casadi.fixed_structure import SetCertificate
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.design import Progress
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
-from ccd_casadi.inner_problem.structured_robustness import judged_corners
+from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.sampling.rows import Sample, hashes_of, sample_key
 from ccd_casadi.sampling.units import structured_unit
@@ -30,7 +30,8 @@ Unit = tuple[str, str, tuple[float, ...], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Designed:
-    """A controller at a θ: κ in SI (None: none was found), the problem with its anchors and set.
+    """A controller at a θ: κ in SI (None: none was found), the problem with its warm starts and
+    set.
 
     `rows` and `unit` go into the store under the hash of that problem.
     """
@@ -44,22 +45,22 @@ class Designed:
 
 
 def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesignProblem:
-    """The problem with the anchors, plant set and channels of one that was designed before."""
+    """The problem with the warm starts, plant set and channels of one that was designed before."""
     if known is None:
         return problem
     mine, theirs = structured_of(problem), structured_of(known)
-    members = theirs.members if mine.uncertainty == theirs.uncertainty else ()
+    scenarios = theirs.scenarios if mine.uncertainty == theirs.uncertainty else ()
     taken = replace(
-        mine, anchors=theirs.anchors, members=members, channels=theirs.channels,
+        mine, warm_starts=theirs.warm_starts, scenarios=scenarios, channels=theirs.channels,
         frequencies=theirs.frequencies, seed=theirs.seed,
     )  # fmt: skip
     return replace(problem, controller=taken, start=known.start)
 
 
 def designed(task: tuple[CoDesignProblem, Knobs], tell: Progress) -> Designed:
-    """The best certified controller at θ from the problem's anchors, or from many starts."""
+    """The best certified controller at θ from the problem's warm starts, or from many starts."""
     problem, knobs = task
-    if not structured_of(problem).anchors:
+    if not structured_of(problem).warm_starts:
         problem = prepared(replace(problem, start=knobs.theta), progress=tell)[0]
     problem = with_range(problem)
     designs, inner = hashes_of(problem)
@@ -75,9 +76,9 @@ def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) 
     """A known controller at θ, judged on the model and the corners of its plant set."""
     began = perf_counter()
     controller = controller_of(structure_of(problem), kappa)
-    found = judged_corners(problem, knobs.theta, controller)
+    found = certify_corners(problem, knobs.theta, controller)
     elements = elements_at(problem, knobs.theta)
-    broken = unmet(problem, knobs.theta)
+    broken = violated(problem, knobs.theta)
     standing, reason = _standing(found)
     if standing is Standing.KEPT and broken:
         standing, reason = Standing.MISSED, f"the constraint {broken[0]} on θ is not met"

@@ -3,7 +3,7 @@
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.bounds import ChannelBounds as ChannelBounds
 from ccd_casadi.fixed_structure.bounds import ShapeEnd as ShapeEnd
-from ccd_casadi.fixed_structure.certificate import Certificate as Certificate
+from ccd_casadi.fixed_structure.certificate import SetCertificate as SetCertificate
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.channel_design import synthesise as synthesise
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure as ChannelStructure

@@ -66,7 +66,7 @@ class Proof:
         return self.outcome is ProofOutcome.PROVEN
 
     @property
-    def close(self) -> bool:
+    def conclusive(self) -> bool:
         """Whether that is all that is asked for, and closely: no plant need be drawn besides."""
         return self.proven and self.slack <= SLACK
 

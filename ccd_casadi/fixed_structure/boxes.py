@@ -12,7 +12,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, variable
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.sections import INTEGRATOR, REAL
-from ccd_casadi.lti.hold import parts
+from ccd_casadi.lti.hold import delay_parts
 from ccd_casadi.support.arrays import Array
 
 Pair = tuple[Affine, Affine]  # D and N of N/D, or a pole and its residue
@@ -72,7 +72,7 @@ class Axis:
         if self.period is None:
             return self.y.of(n) - p * self.x.of(n), residue * self.x.of(n)
         T, turn = self.period, self.turn.of(n)
-        whole, rest = parts(T, self.delay)
+        whole, rest = delay_parts(T, self.delay)
         all_of, early = exponential(p * T), exponential(p * (T - rest))
         N = early - 1.0 + (all_of - early) * turn
         for _ in range(whole):

@@ -17,13 +17,13 @@ from scipy.linalg import expm, matrix_balance
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
 from ccd_casadi.fixed_structure.certificate_curves import (
-    alike,
     crossing_and_bandwidth,
     frequency_grid,
+    padded,
     peaks,
     with_crossings,
 )
-from ccd_casadi.fixed_structure.certificate_responses import Responses, norms
+from ccd_casadi.fixed_structure.certificate_responses import LoopTable, norms
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -82,7 +82,7 @@ class PlantFigures:
 
 
 @dataclass(frozen=True)
-class Certificate:
+class SetCertificate:
     """What the judge found on every plant, and whether all bounds hold with `bandwidth` (rad/s)."""
 
     passed: bool
@@ -100,7 +100,7 @@ def certify(
     *,
     integrator: bool = True,
     workers: Pool | None = None,
-) -> Certificate:
+) -> SetCertificate:
     """Judge an SI controller on plants against the bounds, σ_max of each matrix.
 
     Parameters
@@ -131,18 +131,18 @@ def certify(
     unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]
     if unstable:
         words = f"unstable on plant {unstable[0]} of {len(found)}"
-        return Certificate(False, np.nan, tuple(found), {}, words)
+        return SetCertificate(False, np.nan, tuple(found), {}, words)
     bandwidth = float(np.min([figures.bandwidth for figures in found]))
     worst: dict[str, float] = {}
     for figures in found:
         shares = bounds.shares(figures) | bounds.channel_shares(figures.channels)
         for name, ratio in shares.items():
             worst[name] = max(worst.get(name, 0.0), ratio)
-    broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in worst.items()
+    broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
     if broken:
-        words = f"exceeds its bound on {', '.join(broken)} (relative)"
+        words = f"exceeds its bound on {', '.join(broken)}"
     elif not bandwidth > 0.0:
         words = "S does not start below -3 dB on every plant"
     elif lost:
@@ -150,7 +150,7 @@ def certify(
     else:
         words = f"stable and within every bound on {counted(len(found), 'plant')}"
     passed = not broken and not lost and bandwidth > 0.0
-    return Certificate(passed, bandwidth, tuple(found), worst, words)
+    return SetCertificate(passed, bandwidth, tuple(found), worst, words)
 
 
 Task = tuple[list[ScaledPlant], StateSpace, Bounds, Sampling | None, bool]
@@ -192,8 +192,8 @@ def judged(
     for i in good:
         roots = [poles[i], np.linalg.eigvals(G[i].A), own, free[i].zeros(_size(free[i])), *zeros]
         grids.append(frequency_grid(roots, sampling, bounds.omega_low, _size(free[i]), corner))
-    grid, rows = alike(grids), np.arange(len(good))
-    table = Responses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds)
+    grid, rows = padded(grids), np.arange(len(good))
+    table = LoopTable([free[i] for i in good], [G[i] for i in good], held, sampling, bounds)
     if len(free[0].C) > 1:
         grid = with_crossings(table, grid)
     values = table.at(rows, grid)
@@ -239,7 +239,7 @@ def judged(
 def _rows(
     own: ChannelBounds,
     loops: Sequence[StateSpace],
-    table: Responses,
+    table: LoopTable,
     grid: Array,
     values: dict[str, Array],
     tops: dict[str, tuple[Array, Array]],

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
-from ccd_casadi.fixed_structure.certificate_responses import Responses
+from ccd_casadi.fixed_structure.certificate_responses import LoopTable
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.support.arrays import Array
 
@@ -57,13 +57,13 @@ def frequency_grid(
     return grid[np.append(True, np.diff(grid) > APART * grid[1:])]
 
 
-def alike(grids: Sequence[Array]) -> Array:
+def padded(grids: Sequence[Array]) -> Array:
     """Grids (P, k) of one length: the shorter ones repeat their last frequency."""
     most = max(len(grid) for grid in grids)
     return np.array([np.pad(grid, (0, most - len(grid)), mode="edge") for grid in grids])
 
 
-def with_crossings(table: Responses, grid: Array) -> Array:
+def with_crossings(table: LoopTable, grid: Array) -> Array:
     """Grids (P, k), finer where a lesser singular value has a maximum that comes near the largest.
 
     Where it is the larger one between two points only, neither of these shows a maximum.
@@ -73,11 +73,11 @@ def with_crossings(table: Responses, grid: Array) -> Array:
         for lesser in np.moveaxis(matrix, -1, 0)[1:]:
             for i, j in zip(*_maxima(grid, lesser, NEAR * matrix[..., 0]), strict=True):
                 more[i].append(np.linspace(grid[i, j - 1], grid[i, j + 1], FINER))
-    return alike([np.unique(np.concatenate(own)) for own in more])
+    return padded([np.unique(np.concatenate(own)) for own in more])
 
 
 def peaks(
-    table: Responses, grid: Array, values: dict[str, Array]
+    table: LoopTable, grid: Array, values: dict[str, Array]
 ) -> dict[str, tuple[Array, Array]]:
     """Every curve's largest value (P,) and its frequency, local maxima near it zoomed into.
 
@@ -126,7 +126,7 @@ def _zoomed(function: Callable[[Array], Array], low: Array, high: Array) -> tupl
 
 
 def crossing_and_bandwidth(
-    table: Responses, grid: Array, S: Array, integrator: bool, row: Sequence[float] | None = None
+    table: LoopTable, grid: Array, S: Array, integrator: bool, row: Sequence[float] | None = None
 ) -> tuple[Array, Array]:
     """The first ω with |S| = 1/√2 of every plant (NaN where there is none), and the largest ω_b
     that keeps the shape below it (0 there).
@@ -161,7 +161,7 @@ def crossing_and_bandwidth(
 
 
 def _within_shape(
-    table: Responses,
+    table: LoopTable,
     grid: Array,
     S: Array,
     which: np.ndarray,

@@ -55,7 +55,7 @@ class Triangular:
         return np.asarray(self.D[own, None] + total)
 
 
-class Responses:
+class LoopTable:
     """The loops of a set of plants: `free` and `G` of the plants without and with hold and delay,
     K of the controller.
     """

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
@@ -55,7 +55,7 @@ def assess(
     """
     plants = problem.plants
     poles = closed_loops(plants, problem.structure, kappa)[0]
-    good = stable(poles)
+    good = all_stable(poles)
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
     several = len(plants.out) > 1
@@ -85,12 +85,10 @@ def assess(
         curve.append(np.full(len(row[-1]), end_curve))
         at.append(np.repeat(place[numbers], P))
     i, j, c, k = np.nonzero(regular[..., None, None] & (value > -within))
-    return Assessment(
-        True,
-        poles,
-        constraints(problem, kappa, tau, *(np.concatenate(part) for part in (curve, row, at))),
-        constraints(problem, kappa, tau, curves[c], i + k * P, v[i, j]),
-    )
+    count = sum(map(len, curve))
+    parts = ((*curve, curves[c]), (*row, i + k * P), (*at, v[i, j]))
+    found = constraints(problem, kappa, tau, *(np.concatenate(part) for part in parts))
+    return Assessment(True, poles, found.only(slice(count)), found.only(slice(count, None)))
 
 
 def constraints(

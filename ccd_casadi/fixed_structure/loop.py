@@ -260,7 +260,7 @@ def closed_loops(
     return np.where(posed[..., None], np.linalg.eigvals(joint), np.nan)
 
 
-def stable(poles: np.ndarray) -> np.ndarray:
+def all_stable(poles: np.ndarray) -> np.ndarray:
     """Whether all poles (..., n) lie in the open left half plane."""
     with np.errstate(invalid="ignore"):
         return np.asarray((poles.real < 0.0).all(-1))

@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.structure import Structure, roots
 from ccd_casadi.kernels.limits import HALF_POWER, Curve, Limit
 from ccd_casadi.kernels.loop_point import Loop
-from ccd_casadi.lti.grid import around
+from ccd_casadi.lti.grid import root_flanks
 from ccd_casadi.support.arrays import Array
 
 FIRST = float(np.log(0.1))  # τ, ω_b over ω₀
@@ -213,8 +213,8 @@ class Constraints:
     to_kappa: Array
     to_tau: Array
 
-    def only(self, chosen: np.ndarray) -> "Constraints":
-        """Some of them, by mask or index."""
+    def only(self, chosen: np.ndarray | slice) -> "Constraints":
+        """Some of them, by mask, index or slice."""
         parts = (self.curve, self.plant, self.v, self.value, self.to_kappa, self.to_tau)
         return Constraints(*(part[chosen] for part in parts))
 
@@ -246,4 +246,4 @@ class Assessment:
 
 def flanked(values: np.ndarray) -> Array:
     """Frequencies around roots (P, n): the imaginary part with flanks, and the size."""
-    return np.concatenate([around(values), np.abs(values)], axis=1)
+    return np.concatenate([root_flanks(values), np.abs(values)], axis=1)

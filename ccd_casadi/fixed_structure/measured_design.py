@@ -152,11 +152,12 @@ def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int
     figures = judge_all(
         problem.responses, K, bounds, period=period, integrator=structure.integrator
     )
-    broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in bounds.shares(figures).items()
+    shares = bounds.shares(figures).items()
+    broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in shares
               if figures.stable and not ratio <= 1.0 + EXCEEDED]  # fmt: skip
     words = figures.words
     if broken:
-        words = f"exceeds its bound on {', '.join(broken)} (relative); {words}"
+        words = f"exceeds its bound on {', '.join(broken)}; {words}"
     usable = figures.stable and figures.sure and not broken
     return MeasuredDesign(structure, si, K, figures.bandwidth, figures, usable, words, spent)
 

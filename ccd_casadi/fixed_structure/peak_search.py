@@ -82,8 +82,9 @@ def local_peaks(
     values may cross.
     """
     (P, count), first = v.shape, loop.out.shape[1]
-    beside = np.pad(value, ((0, 0), (1, 1), (0, 0), (0, 0)), constant_values=-np.inf)
-    tops = (value > depth) & (value >= beside[:, :-2]) & (value > beside[:, 2:])
+    tops = value > depth
+    tops[:, 1:] &= value[:, 1:] >= value[:, :-1]
+    tops[:, :-1] &= value[:, :-1] > value[:, 1:]
     i, at, c, k = np.nonzero(tops)
     low, high = v[i, np.maximum(at - 1, 0)], v[i, np.minimum(at + 1, count - 1)]
     found = Brackets(curves[c], i + k * P, v[i, at], low, np.minimum(high, end[c, k]))
@@ -101,15 +102,17 @@ def hidden_peaks(curves: np.ndarray, v: Array, value: Array) -> Brackets:
 
     A parabola through a step and the point before it ends with a slope of the other sign.
     """
+    i, at, c, k = np.nonzero(np.maximum(value[:, 1:-2], value[:, 2:-1]) > -HIDDEN)
+    beside = at[:, None] + np.arange(4)
+    places = v[i[:, None], beside]
     with np.errstate(invalid="ignore"):
-        slope = np.diff(value, axis=1) / np.diff(np.log(v), axis=1)[:, :, None, None]
-        step, before, after = slope[:, 1:-1], slope[:, :-2], slope[:, 2:]
+        rise = np.diff(value[i[:, None], beside, c[:, None], k[:, None]], axis=1)
+        before, step, after = (rise / np.diff(np.log(places), axis=1)).T
         rises = (before > 0.0) & (step > 0.0) & (2.0 * step < before)
         falls = (after < 0.0) & (step < 0.0) & (2.0 * step > after)
         shown = (rises & (after <= 0.0)) | (falls & (before >= 0.0))
-        high = np.maximum(value[:, 1:-2], value[:, 2:-1]) > -HIDDEN
-    i, at, c, k = np.nonzero((rises | falls) & ~shown & high)
-    low, end = v[i, at + 1], v[i, at + 2]
+    hidden = (rises | falls) & ~shown
+    i, c, k, (_, low, end, _) = i[hidden], c[hidden], k[hidden], places[hidden].T
     return Brackets(curves[c], i + k * len(v), end, low, end)
 
 

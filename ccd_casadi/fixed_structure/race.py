@@ -2,7 +2,9 @@
 
 All climb some steps, the better half goes on, and so forth. A search stops early where its steps no
 longer help, where it has come to a controller that a better one has already been at, and where it
-gains so little that it cannot overtake. Each climb is a function of its start alone, so that any
+gains so little that it cannot overtake. One is spared: that of the largest ω_b among those outside
+their bounds, since a climb past a resonance gains little for long and may then end far above all
+others. Each climb is a function of its start alone, so that any
 number of processes finds the same.
 """
 
@@ -202,6 +204,10 @@ def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
     running = [i for i, runner in enumerate(field) if runner.running]
     most = max(LAST, len(running) // 2) if turn in HALVINGS else len(running)
     lead, found = field[0].merit, list(field)
+    outside = [i for i in running if field[i].point.assessment.violation > WITHIN
+               and field[i].point.tau > field[0].point.tau + BEHIND]  # fmt: skip
+    fastest = max(outside, key=lambda i: field[i].point.tau, default=0)
+    spared = (0, fastest if turn < HALVINGS[-1] else 0)
     for place, i in enumerate(running):
         runner = field[i]
         behind = lead - runner.merit
@@ -209,6 +215,6 @@ def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
         lost = lost or (turn >= HALVINGS[-1] and behind > BEHIND)
         missing = PENALTY * runner.point.assessment.violation
         hopeless = turn >= HALVINGS[-1] and missing > OVERTAKING * runner.gained
-        if hopeless or (lost and i):
+        if hopeless or (lost and i not in spared):
             found[i] = replace(runner, running=False)
     return found

@@ -7,7 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.certificate import Certificate, certify
+from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.local_search import Point
@@ -66,7 +66,7 @@ class SectionsDesign(NotebookHtml):
     frequencies: tuple[float, float]
     controller: StateSpace | None
     bandwidth: float
-    certificate: Certificate | None
+    certificate: SetCertificate | None
     multipliers: dict[str, float]
     at_box: tuple[tuple[str, str, float], ...]
     kkt_residual: float

@@ -18,7 +18,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant
-from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
+from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.structure import Kind, response
 from ccd_casadi.lti.hold import Sampling
@@ -127,7 +127,9 @@ def redrawn(problem: Problem, ends: Sequence[Array], count: int, rng: np.random.
 def stabilising(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
     """Those (N, n) with which every closed loop is stable."""
     parts = [kappa[i : i + chunk] for i in range(0, len(kappa), chunk)]
-    good = [stable(closed_loops(problem.plants, problem.structure, part)).all(1) for part in parts]
+    good = [
+        all_stable(closed_loops(problem.plants, problem.structure, part)).all(1) for part in parts
+    ]
     return kappa[np.concatenate(good)] if len(kappa) else kappa
 
 
@@ -189,7 +191,7 @@ def actuator_starts(
     found: list[Array] = []
     for kappa in np.hstack(parts):
         for family in (first, every):
-            if not stable(closed_loops(family, structure, kappa)).all():
+            if not all_stable(closed_loops(family, structure, kappa)).all():
                 break
         else:
             found.append(kappa)

@@ -27,13 +27,13 @@ def constraint_shares(problem: CoDesignProblem, theta: Array | tuple[float, ...]
     return constraint_values(plant_of(problem), theta) / constraint_sizes(problem)
 
 
-def unmet(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
+def violated(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
     """Names of the constraints that θ breaks by more than rounding; none where it is allowed."""
     names, shares = plant_of(problem).constraint_names, constraint_shares(problem, theta)
     return tuple(name for name, share in zip(names, shares, strict=True) if not share <= MET)
 
 
-def touched(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
+def binding(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
     """Names of the constraints that are active at θ."""
     names, shares = plant_of(problem).constraint_names, constraint_shares(problem, theta)
     return tuple(name for name, share in zip(names, shares, strict=True) if share >= -ACTIVE)

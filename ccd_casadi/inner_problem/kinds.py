@@ -147,7 +147,7 @@ class FixedStructure(InnerKind):
         return "of fixed structure", runs
 
     def require_function(self) -> None:
-        if not structured_of(self.problem).anchors:
+        if not structured_of(self.problem).warm_starts:
             words = "has no anchors yet; take that of a finished run, read_run(folder).problem"
             raise UserError(f"the problem of a fixed structure {words}")
 
@@ -210,7 +210,7 @@ def bandwidth_gradient(
     """dω_b*/dθ (n_θ,) in rad/s per unit of θ, where the plant has slopes (else n_θ is 0); NaN where
     the optimality conditions do not hold.
 
-    `bounded` names the rows 1 to -2 of the optimum's values, as `InnerProblem.bounds` does.
+    `bounded` names the rows 1 to -2 of the optimum's values, as `InnerBounds.bounds` does.
     """
     x = optimum.to_break_frequencies
     columns, slopes = [], []

@@ -78,15 +78,15 @@ def latest_plant(
     return float(times.max()), *points[int(times.argmax())]
 
 
-def told_time(
+def stated_time(
     problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, value: float
 ) -> tuple[float, Yield | None]:
     """The time that a design is told to need (s), whose smooth time on the set is `value`, and how
     many fresh plants need no longer."""
     uncertain, structured = free_box(problem, theta), structured_of(problem)
     motion, seed = motion_of(problem, theta), structured.seed
-    members = [(option, np.array(point)) for option, point in structured.members]
-    on_set = exact_times(problem, motion, uncertain.plants(members or uncertain.corners()), K)
+    scenarios = [(option, np.array(point)) for option, point in structured.scenarios]
+    on_set = exact_times(problem, motion, uncertain.plants(scenarios or uncertain.corners()), K)
     told = max(value, float(on_set.max()), latest_plant(problem, theta, K, seed + FRESH_SEED)[0])
     if not uncertain.names:
         return told, None

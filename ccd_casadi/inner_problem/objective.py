@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
+from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.support.arrays import Array
@@ -56,7 +56,7 @@ def objective_terms(
 
 def objective_of(problem: CoDesignProblem, sample: InnerValue) -> float:
     """J of a sample; infinite where no design is certified or λ(θ) <= 0 is not met."""
-    if not sample.feasible or unmet(problem, sample.theta):
+    if not sample.feasible or violated(problem, sample.theta):
         return np.inf
     return objective(problem, sample.theta, sample.value)
 

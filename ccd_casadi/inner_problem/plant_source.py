@@ -11,7 +11,7 @@ from typing import Any
 
 from ccd_casadi.analysis.driven_plant import with_motion
 from ccd_casadi.analysis.motor import Motion
-from ccd_casadi.plants.differenced import own_plant
+from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
@@ -118,7 +118,7 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
         plant = model.build((*names, *held), **dict(source.options))
     else:
         function = fixed_model(_own_function(source), held)
-        return own_plant(function, names, dict(source.options), lower, upper)
+        return user_plant(function, names, dict(source.options), lower, upper)
     return with_fixed(plant, held) if held else plant
 
 

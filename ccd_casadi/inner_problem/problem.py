@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.controller_problem import (
 from ccd_casadi.inner_problem.figure import Figure
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.search import search_inner
-from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
+from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
@@ -48,7 +48,7 @@ class CoDesignProblem(NotebookHtml):
         Of θ, in order.
     w1, w2 : float
         Weights of f(θ) and of the bandwidth (rad/s).
-    weights, inner : Weights, InnerProblem
+    weights, inner : Weights, InnerBounds
         W_S, W_KS, W_T; and S_max, S_low and ω_low (rad/s) of the inner problem.
     suspension : Suspension
         What modes without stiffness are given.
@@ -82,7 +82,7 @@ class CoDesignProblem(NotebookHtml):
     w1: float
     w2: float
     weights: Weights
-    inner: InnerProblem
+    inner: InnerBounds
     suspension: Suspension
     method: str = "search"  # how the inner problem is solved: "search" or "sweep"
     robust: RobustSet | None = None

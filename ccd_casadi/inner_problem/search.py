@@ -9,7 +9,7 @@ solve then ends on the true functions, as after a sweep.
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, refine
+from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, refine
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -25,7 +25,7 @@ BUDGET = 40  # certified syntheses in all, the local solve included
 LENGTHS = np.array([0.35, 0.6])  # correlation lengths as fractions of the box
 
 
-def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) -> InnerResult:
+def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> InnerResult:
     """ω_b*(θ) from derivatives, some forty syntheses, those apart that are not certified."""
     bounds = np.log([problem.omega_S, problem.omega_T])
     width = bounds[:, 1] - bounds[:, 0]
@@ -50,7 +50,7 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
     return refine(plant, weights, problem, rows, _starts(problem, rows), left)
 
 
-def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[float, float]]:
+def _starts(problem: InnerBounds, rows: list[DesignFigures]) -> list[tuple[float, float]]:
     """The best feasible design, else the best within 2 % of feasible, else the nearest to it."""
 
     def rank(row: DesignFigures) -> tuple[int, float]:
@@ -64,7 +64,7 @@ def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[floa
 
 
 def _design(
-    plant: ScaledPlant, weights: Weights, problem: InnerProblem, bounds: Array, point: Array
+    plant: ScaledPlant, weights: Weights, problem: InnerBounds, bounds: Array, point: Array
 ) -> Sensitivities:
     x = bounds[:, 0] + point * (bounds[:, 1] - bounds[:, 0])
     omega = np.clip(np.exp(x), *np.array([problem.omega_S, problem.omega_T]).T)
@@ -101,7 +101,7 @@ def _interpolate(X: Array, Y: Array, dY: Array, fine: Array) -> Array:
 
 
 def _next_point(
-    problem: InnerProblem, fine: Array, predicted: Array, X: Array, designs: list[Sensitivities]
+    problem: InnerBounds, fine: Array, predicted: Array, X: Array, designs: list[Sensitivities]
 ) -> Array | None:
     """The best predicted point over the connected parts of the predicted feasible set.
 

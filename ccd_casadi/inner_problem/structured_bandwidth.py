@@ -1,10 +1,9 @@
 """ω_b*(θ) of a fixed structure: one reproducible function of θ with its envelope gradient.
 
-A multi-start search at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of
-the climbs from all anchors, and from nothing else: it depends neither on the order in which θ are
-asked for nor on the number of workers. Where no anchor climbs to a certified design a
-search of a few seeded starts is run at that θ, which is a function of θ too; not
-with `starts` = 0.
+A multi-start search at one θ gives warm starts, the distinct best controllers. ω_b*(θ) is the best
+of the climbs from all warm starts, and from nothing else: it depends neither on the order in which
+θ are asked for nor on the number of workers. Where no warm start climbs to a certified design a
+search of a few seeded starts is run at that θ, which is a function of θ too; not with `starts` = 0.
 """
 
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     plants_of,
     structure_of,
     structured_of,
-    warm_starts,
+    warm_starts_at,
     with_structured,
 )
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -40,7 +39,7 @@ from ccd_casadi.support.units import HZ
 
 FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
 LOST = 1e-6  # relative: of the bandwidth, by rounding
-FEW = 8  # starts of the search at a θ where no anchor ends certified
+FEW = 8  # starts of the search at a θ where no warm start ends certified
 
 
 @dataclass(frozen=True)
@@ -73,10 +72,10 @@ def searched(
 
 
 def structured_value(problem: CoDesignProblem, theta: Sequence[float]) -> StructuredValue:
-    """The best certified design from the problem's anchors at θ, and the envelope gradient."""
+    """The best certified design from the problem's warm starts at θ, and the envelope gradient."""
     structured = structured_of(problem)
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
-    initial = warm_starts(problem, structure_of(problem), plants, bounds)
+    initial = warm_starts_at(problem, structure_of(problem), plants, bounds)
     made: SectionsDesign | None = None
     spent = 0
     if initial:
@@ -91,10 +90,10 @@ def structured_value(problem: CoDesignProblem, theta: Sequence[float]) -> Struct
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
             break
         made = again
-    return valued(problem, theta, plants, made, spent)
+    return value_of_design(problem, theta, plants, made, spent)
 
 
-def valued(
+def value_of_design(
     problem: CoDesignProblem,
     theta: Sequence[float],
     plants: Sequence[ScaledPlant],
@@ -161,10 +160,10 @@ def _least(
     made = too_slow(problem, made)
     if not made.certified:
         return made, np.nan, None
-    started = with_structured(problem, anchors=structured.error_anchors)
+    started = with_structured(problem, warm_starts=structured.error_warm_starts)
     found = least_value(
         plants, bounds, made, goal_of(problem, theta, plants), sampling=structured.sampling,
         least_bandwidth=structured.bandwidth_least,
-        initial=warm_starts(started, structure_of(problem), plants, bounds),
+        initial=warm_starts_at(started, structure_of(problem), plants, bounds),
     )  # fmt: skip
     return found.design, found.value, found.envelope

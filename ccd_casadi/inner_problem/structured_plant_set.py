@@ -1,5 +1,5 @@
 """What a problem with a fixed structure is made of: structure, channels, bounds, plants at a θ, and
-the anchors as starts there.
+the warm starts as starts there.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
-from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, near
+from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, nearby_model
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -105,7 +105,7 @@ def nearby(
     problem: CoDesignProblem, known: Sequence[Sequence[float]], here: Sequence[float]
 ) -> tuple[Evaluate, ...]:
     """The model with every option set, from what is known at some θ; see `plants.plant.near`."""
-    return tuple(near(plant_of(option), known, here) for option in _options(problem))
+    return tuple(nearby_model(plant_of(option), known, here) for option in _options(problem))
 
 
 def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
@@ -160,9 +160,9 @@ def with_options(
 
 
 def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPlant]:
-    """The plant set at θ: its members, or the corners of the box where none are known yet."""
-    uncertain, members = uncertain_plant(problem, theta), structured_of(problem).members
-    known = [(option, np.array(point)) for option, point in members]
+    """The plant set at θ: its plants, or the corners of the box where none are known yet."""
+    uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
+    known = [(option, np.array(point)) for option, point in scenarios]
     return uncertain.plants(known or uncertain.corners())
 
 
@@ -170,23 +170,24 @@ def with_structured(problem: CoDesignProblem, **changes: object) -> CoDesignProb
     return replace(problem, controller=replace(structured_of(problem), **changes))  # type: ignore[arg-type]
 
 
-def warm_starts(
+def warm_starts_at(
     problem: CoDesignProblem,
     structure: Structure | ChannelStructure,
     plants: Sequence[ScaledPlant],
     bounds: Bounds,
 ) -> list[Array]:
-    """Each anchor as it is or moved with the plant from the start θ, whichever is nearer; κ in SI.
+    """Each warm start as it is or moved with the plant from the start θ, whichever is nearer; κ in
+    SI.
 
     Moved: frequencies with the first flexible mode, the gain as 1/|G| at the frequency that the
     crossover moves with; a notch stays on its resonance. Of several channels each is moved on its
     own, with the first mode that it sees.
     """
     structured = structured_of(problem)
-    if not structured.anchors:
+    if not structured.warm_starts:
         return []
     first = scaled_plant(problem, problem.start)
-    anchors = [np.array(kappa) for kappa in structured.anchors]
+    warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
 
     def nearer(
         own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array, bounds: Bounds
@@ -200,8 +201,8 @@ def warm_starts(
         return both[int(np.argmax(merits))]
 
     if isinstance(structure, Structure):
-        return [nearer(structure, first, list(plants), kappa, bounds) for kappa in anchors]
-    warm = [kappa.copy() for kappa in anchors]
+        return [nearer(structure, first, list(plants), kappa, bounds) for kappa in warm_starts]
+    warm = [kappa.copy() for kappa in warm_starts]
     for i in structure.free:
         own, place = structure.structures[i], structure.slices[i]
         before = channel_plant(first, structure.decoupling, i)

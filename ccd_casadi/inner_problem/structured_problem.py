@@ -20,7 +20,7 @@ from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights
 
-Member = tuple[int, tuple[float, ...]]
+Scenario = tuple[int, tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -69,12 +69,12 @@ class StructuredProblem(ControllerProblem):
 
     `weighted_level` is of |W_KS KS| and |W_T T|, W_T at the lower end of ω_T; None: no bound, as
     with `shape` and `compliance_max` (m/N). A search from `starts` starts and `seed` finds the
-    `anchors` (κ in SI) and the `members` of the plant set (option, point of the box): from these
-    on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
-    before. Both are empty before it. `frequencies` (rad/s) bound those of K, alike at every
+    `warm_starts` (κ in SI) and the `scenarios` of the plant set (option, point of the box): from
+    these on ω_b*(θ) is the best of the climbs from the warm starts, on the plants, whatever was
+    asked before. Both are empty before it. `frequencies` (rad/s) bound those of K, alike at every
     θ; None: by the plant at the start. `minimise` "rms_error" or "move_time": at a θ the search
     goes on from there to the least of it under the problem's budget or in its move, at
-    `bandwidth_least` (rad/s) or more, from that controller and the `error_anchors` (κ in SI).
+    `bandwidth_least` (rad/s) or more, from that controller and the `error_warm_starts` (κ in SI).
     `channels` of a plant with several outputs; where the case names none they are found, with
     `structure` for each.
     """
@@ -89,12 +89,12 @@ class StructuredProblem(ControllerProblem):
     starts: int = 12
     seed: int = 0
     frequencies: tuple[float, float] | None = None
-    anchors: tuple[tuple[float, ...], ...] = ()
-    members: tuple[Member, ...] = ()
+    warm_starts: tuple[tuple[float, ...], ...] = ()
+    scenarios: tuple[Scenario, ...] = ()
     minimise: str = "bandwidth"
     bandwidth_least: float = 0.0
     channels: tuple[ChannelProblem, ...] = ()
-    error_anchors: tuple[tuple[float, ...], ...] = ()
+    error_warm_starts: tuple[tuple[float, ...], ...] = ()
 
     @property
     def figure(self) -> Figure:
@@ -136,9 +136,9 @@ class StructuredProblem(ControllerProblem):
                 words = "where none gives outputs; name one of them, or give them"
                 raise PlantError(f"has channels 1 to {p} {words}")
 
-    def with_anchor(self, kappa: tuple[float, ...], most: int) -> Self:
-        """With one more anchor of what it minimises, first, `most` at most."""
-        name = "anchors" if self.figure is BANDWIDTH else "error_anchors"
+    def with_warm_start(self, kappa: tuple[float, ...], most: int) -> Self:
+        """With one more warm start of what it minimises, first, `most` at most."""
+        name = "warm_starts" if self.figure is BANDWIDTH else "error_warm_starts"
         others = (anchor for anchor in getattr(self, name) if anchor != kappa)
         return replace(self, **{name: (kappa, *others)[:most]})  # type: ignore[arg-type]
 
@@ -164,8 +164,8 @@ class StructuredProblem(ControllerProblem):
             "starts": self.starts,
             "seed": self.seed,
             "frequencies": self.frequencies,
-            "anchors": self.anchors,
-            "members": self.members,
+            "anchors": self.warm_starts,
+            "members": self.scenarios,
         }
         if not self.uncertainty.ranges:  # as stores knew it before
             del found["uncertainty"]["ranges"]
@@ -174,5 +174,5 @@ class StructuredProblem(ControllerProblem):
         if self.channels:
             found["channels"] = [channel.identity() for channel in self.channels]
         if self.figure is not BANDWIDTH:
-            found["least_error"] = [self.bandwidth_least, self.error_anchors]
+            found["least_error"] = [self.bandwidth_least, self.error_warm_starts]
         return found

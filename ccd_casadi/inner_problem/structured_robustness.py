@@ -6,11 +6,12 @@ of the box beside them, branch and bound at all of it.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.fixed_structure import Certificate, SectionsDesign, certify
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
@@ -27,14 +28,14 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structured_of,
     uncertain_plant,
 )
-from ccd_casadi.inner_problem.structured_problem import Member
+from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
 AT_ONCE = 3  # plants added in a round
-APART = 1e-4  # of the box: members that are closer are the same plant
+APART = 1e-4  # of the box: plants that are closer are the same plant
 CHECKED = 200  # plants that the judge looks at in the end
 LOOSE = 2.0 * WITHIN  # relative: by how much they may pass a bound
 # Plants drawn for the yield, by their cost (2 ms, and 120 ms with four channels): where none fails
@@ -43,19 +44,19 @@ FRESH, FRESH_OF_SEVERAL = 3000, 300
 FRESH_SEED = 2000  # apart from those of the search and of the lattice
 
 
-def worst_members(
+def worst_case(
     problem: CoDesignProblem,
     theta: Sequence[float],
     made: SectionsDesign,
     turn: int = 0,
     progress: Progress | None = None,
-) -> tuple[Excess, tuple[Member, ...]]:
+) -> tuple[Excess, tuple[Scenario, ...]]:
     """The worst plant of the box for a design, and those to add: past a bound, each a new one.
 
     Where a move's time counts the plant that settles latest besides, if it is later than v.
     """
     uncertain = uncertain_plant(problem, theta)
-    worst, found = worse_members(problem, uncertain, made.kappa, made.bandwidth, turn, progress)
+    worst, found = violations(problem, uncertain, made.kappa, made.bandwidth, turn, progress)
     if problem.figure is MOVE_TIME and made.controller is not None:
         value = float(np.exp(goal_of(problem, theta, ()).at(made.kappa)[0]))
         seed = structured_of(problem).seed + turn
@@ -67,7 +68,7 @@ def worst_members(
     return worst, found
 
 
-def worse_members(
+def violations(
     problem: CoDesignProblem,
     uncertain: UncertainPlant,
     kappa: Array,
@@ -75,7 +76,7 @@ def worse_members(
     turn: int,
     progress: Progress | None = None,
     within: float = WITHIN,
-) -> tuple[Excess, tuple[Member, ...]]:
+) -> tuple[Excess, tuple[Scenario, ...]]:
     """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
     structured = structured_of(problem)
     heads, count = worst_plants(
@@ -85,8 +86,8 @@ def worse_members(
     if progress is not None:
         progress(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
-    known = list(structured.members)
-    found: list[Member] = []
+    known = list(structured.scenarios)
+    found: list[Scenario] = []
     for head in heads:
         near = [
             float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
@@ -98,13 +99,13 @@ def worse_members(
     return heads[0], tuple(found)
 
 
-def judged_widely(
+def certify_lattice(
     problem: CoDesignProblem,
     theta: Sequence[float],
     controller: StateSpace,
     worst: Excess,
     workers: Pool | None = None,
-) -> tuple[Certificate, int]:
+) -> tuple[SetCertificate, int]:
     """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
 
     The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
@@ -159,6 +160,12 @@ def proof_of(
     )  # fmt: skip
 
 
+def looked(task: tuple[Any, ...]) -> tuple[str, Any]:
+    """What a function says of a design, by the function's name: for a worker process."""
+    look, *design = task
+    return look.__name__, look(*design)
+
+
 def tolerance_prices(
     problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
 ) -> dict[str, float]:
@@ -171,7 +178,7 @@ def tolerance_prices(
     uncertain, plants = uncertain_plant(problem, theta), []
     if problem.figure is not BANDWIDTH or not uncertain.names:
         return {}
-    for option, point in structured_of(problem).members or uncertain.corners():
+    for option, point in structured_of(problem).scenarios or uncertain.corners():
         plant = uncertain.sloped(np.array(point), option)
         further = (np.array(point) - uncertain.nominal)[:, None, None]
         slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
@@ -182,9 +189,9 @@ def tolerance_prices(
     return dict(zip(uncertain.names, gradient, strict=False))
 
 
-def judged_corners(
+def certify_corners(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
-) -> Certificate:
+) -> SetCertificate:
     """The same on the model of every option and the corners of the box."""
     uncertain = uncertain_plant(problem, theta)
     return _judged(problem, uncertain.plants(uncertain.corners()), controller)
@@ -195,7 +202,7 @@ def _judged(
     plants: Sequence[ScaledPlant],
     controller: StateSpace,
     workers: Pool | None = None,
-) -> Certificate:
+) -> SetCertificate:
     structured, bounds = structured_of(problem), bounds_of(problem)
     integrator = structure_of(problem).integrator
     return certify(

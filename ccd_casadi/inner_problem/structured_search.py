@@ -1,7 +1,8 @@
-"""The search of a controller of fixed structure at a θ, its anchors, and the worst plants.
+"""The search of a controller of fixed structure at a θ, its warm starts, and the worst plants.
 
-A multi-start search gives anchors, the distinct best controllers; plants of the box on which these
-exceed a bound join the set, and the design is made anew from the anchors, until none is found.
+A multi-start search gives warm starts, the distinct best controllers; plants of the box on which
+these exceed a bound join the set, and the design is made anew from the warm starts, until none is
+found.
 """
 
 from collections.abc import Sequence
@@ -28,14 +29,14 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_channels,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Member
-from ccd_casadi.inner_problem.structured_robustness import worst_members
+from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_robustness import worst_case
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
-MOST_ANCHORS = 3
+MOST_WARM_STARTS = 3
 ENOUGH = 12  # starts before a search may say that it found no controller within the bounds
-DISTINCT = 0.1  # relative: local optima further below the best are no anchors
+DISTINCT = 0.1  # relative: local optima further below the best are no warm starts
 ROUNDS, ROUNDS_OF_ERROR = 6, 4  # of a design on the set and a search for plants that are worse
 SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
 
@@ -45,19 +46,19 @@ def race(
     theta: Sequence[float],
     progress: Progress | None = None,
     workers: Pool | None = None,
-    only_anchors: bool = False,
+    only_warm_starts: bool = False,
 ) -> SectionsDesign:
-    """A multi-start search at θ: the problem's starts, and its anchors beside them or alone.
+    """A multi-start search at θ: the problem's starts, and its warm starts beside them or alone.
 
     Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
     """
     structured, plants = structured_of(problem), plants_of(problem, theta)
-    anchors = [np.array(kappa) for kappa in structured.anchors]
-    starts = None if only_anchors else structured.starts
-    made = searched(problem, plants, anchors, starts, progress, workers)
+    warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
+    starts = None if only_warm_starts else structured.starts
+    made = searched(problem, plants, warm_starts, starts, progress, workers)
     if made.certified or starts is None or starts >= ENOUGH:
         return made
-    return searched(problem, plants, anchors, ENOUGH, progress, workers)
+    return searched(problem, plants, warm_starts, ENOUGH, progress, workers)
 
 
 def with_range(problem: CoDesignProblem) -> CoDesignProblem:
@@ -84,29 +85,29 @@ def prepared(
     problem: CoDesignProblem,
     progress: Progress | None = None,
     workers: Pool | None = None,
-    only_anchors: bool = False,
+    only_warm_starts: bool = False,
 ) -> tuple[CoDesignProblem, SectionsDesign]:
-    """The problem with anchors and members: searched at its start θ, worst plants added.
+    """The problem with warm starts and plants: searched at its start θ, worst plants added.
 
-    With `only_anchors` the anchors that it has alone are where searches start. The design is the
-    search's last; where it is not certified the problem has no anchors, and each θ is searched on
-    its own. All of it is of the largest bandwidth, whatever the problem minimises.
+    With `only_warm_starts` the warm starts that it has alone are where searches start. The design
+    is the search's last; where it is not certified the problem has no warm starts, and each θ is
+    searched on its own. All of it is of the largest bandwidth, whatever the problem minimises.
     """
     asked = structured_of(problem).minimise
     problem = with_range(with_structured(problem, minimise="bandwidth"))
     corners = uncertain_plant(problem, problem.start).corners()
-    members = tuple((option, tuple(map(float, point))) for option, point in corners)
-    problem = with_structured(problem, members=members)
+    scenarios = tuple((option, tuple(map(float, point))) for option, point in corners)
+    problem = with_structured(problem, scenarios=scenarios)
 
-    made = race(problem, problem.start, progress, workers, only_anchors)
+    made = race(problem, problem.start, progress, workers, only_warm_starts)
     for turn in range(ROUNDS):
         wider = _wider(problem, problem.start, made, turn, progress) if made.certified else None
         if wider is None:
             break
-        problem = with_structured(wider, anchors=_anchors(made))
+        problem = with_structured(wider, warm_starts=_warm_starts(made))
         made = structured_value(problem, problem.start).design
     if made.certified:
-        problem = with_structured(problem, anchors=_anchors(made))
+        problem = with_structured(problem, warm_starts=_warm_starts(made))
     return with_structured(problem, minimise=asked), made
 
 
@@ -115,12 +116,12 @@ def _wider(
     progress: Progress | None,
 ) -> CoDesignProblem | None:  # fmt: skip
     """The problem with the plants that are worse than its own, None where there are none."""
-    found = worst_members(problem, theta, made, turn, progress)[1]
-    members = (*structured_of(problem).members, *found)
-    return with_structured(problem, members=members) if found else None
+    found = worst_case(problem, theta, made, turn, progress)[1]
+    scenarios = (*structured_of(problem).scenarios, *found)
+    return with_structured(problem, scenarios=scenarios) if found else None
 
 
-def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
+def _warm_starts(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
     """The certified design's κ first, then those of the other local optima near it."""
     own = tuple(map(float, made.kappa))
     others = [
@@ -128,14 +129,18 @@ def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
         for optimum in made.local_optima
         if (1.0 - DISTINCT) * made.bandwidth <= optimum.bandwidth < (1.0 - 1e-3) * made.bandwidth
     ]
-    return (own, *others)[:MOST_ANCHORS]
+    return (own, *others)[:MOST_WARM_STARTS]
 
 
-def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) -> CoDesignProblem:
-    """The problem with one more anchor, first, of what it minimises, and more members."""
+def with_warm_start(
+    problem: CoDesignProblem, kappa: Array, scenarios: Sequence[Scenario]
+) -> CoDesignProblem:
+    """The problem with one more warm start, first, of what it minimises, and more plants."""
     structured = structured_of(problem)
-    structured = structured.with_anchor(tuple(map(float, kappa)), MOST_ANCHORS + 1)
-    return replace(problem, controller=replace(structured, members=(*structured.members, *members)))
+    structured = structured.with_warm_start(tuple(map(float, kappa)), MOST_WARM_STARTS + 1)
+    return replace(
+        problem, controller=replace(structured, scenarios=(*structured.scenarios, *scenarios))
+    )
 
 
 def least_value_at(
@@ -145,7 +150,7 @@ def least_value_at(
     progress: Progress | None = None,
 ) -> tuple[CoDesignProblem, LeastValue]:
     """The problem with the plants that were found worse on the way, and the design on all of them,
-    which is the first of its anchors of least error.
+    which is the first of its warm starts of least error.
 
     `made` is its certified design of largest bandwidth.
     """
@@ -156,12 +161,12 @@ def least_value_at(
         found = least_value(
             plants, bounds_of(problem), made, goal_of(problem, theta, plants),
             sampling=structured.sampling, least_bandwidth=structured.bandwidth_least,
-            initial=[np.array(kappa) for kappa in structured.error_anchors], progress=progress,
+            initial=[np.array(kappa) for kappa in structured.error_warm_starts], progress=progress,
         )  # fmt: skip
         wider = _wider(problem, theta, found.design, turn, progress) or problem
         if wider is problem:
             break
-    return joined(problem, found.design.kappa, ()), found
+    return with_warm_start(problem, found.design.kappa, ()), found
 
 
 def least_from(

@@ -34,7 +34,7 @@ LABELS = {
 
 
 @dataclass(frozen=True)
-class InnerProblem:
+class InnerBounds:
     """Constraints and search box of the inner problem; frequencies in rad/s."""
 
     S_max: float
@@ -109,7 +109,7 @@ class InnerResult(NotebookHtml):
         return np.nan if self.optimum is None else self.optimum.figures.bandwidth
 
 
-def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) -> InnerResult:
+def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> InnerResult:
     """The paper's sweep over the whole box, refined to the continuous optimum."""
     omega_S, omega_T = problem.axes()
     rows = sweep(
@@ -127,7 +127,7 @@ def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) -> 
 def refine(
     plant: ScaledPlant,
     weights: Weights,
-    problem: InnerProblem,
+    problem: InnerBounds,
     rows: Sequence[DesignFigures],
     starts: Iterable[tuple[float, float]],
     limit: int = 40,
@@ -164,7 +164,7 @@ def refine(
 
 
 def evaluate(
-    plant: ScaledPlant, weights: Weights, problem: InnerProblem, point: tuple[float, float]
+    plant: ScaledPlant, weights: Weights, problem: InnerBounds, point: tuple[float, float]
 ) -> Sensitivities:
     """One certified synthesis with derivatives at (ω_S, ω_T) in rad/s."""
     return sensitivities(
@@ -176,7 +176,7 @@ def evaluate(
     )
 
 
-def sweep_starts(problem: InnerProblem, rows: Sequence[DesignFigures]) -> list[tuple[float, float]]:
+def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[tuple[float, float]]:
     """Local maxima of ln ω_b - 3·violation over the sweep grid, best first.
 
     Designs a little outside the bounds count too: a feasible sliver may lie between grid points.
@@ -199,7 +199,7 @@ def sweep_starts(problem: InnerProblem, rows: Sequence[DesignFigures]) -> list[t
     return [point for _, point in found[:STARTS]]
 
 
-def _violation(problem: InnerProblem, row: DesignFigures) -> float:
+def _violation(problem: InnerBounds, row: DesignFigures) -> float:
     return max(0.0, problem.excess(row))
 
 
@@ -210,7 +210,7 @@ class _Uncertified(Exception):
 def local_solve(
     plant: ScaledPlant,
     weights: Weights,
-    problem: InnerProblem,
+    problem: InnerBounds,
     start: tuple[float, float],
     limit: int = 40,
 ) -> list[Sensitivities]:
@@ -274,7 +274,7 @@ def local_solve(
     return list(seen.values())
 
 
-def active_constraints(problem: InnerProblem, figures: DesignFigures) -> tuple[str, ...]:
+def active_constraints(problem: InnerBounds, figures: DesignFigures) -> tuple[str, ...]:
     """Names of the constraints and range ends that bind at a design."""
     values = {
         **{name: getattr(figures, of) / bound for name, (of, bound) in problem.bounds.items()},
@@ -286,7 +286,7 @@ def active_constraints(problem: InnerProblem, figures: DesignFigures) -> tuple[s
     return tuple(name for name, ratio in values.items() if ratio >= 1.0 - ACTIVE)
 
 
-def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
+def shortfall(problem: InnerBounds, rows: Sequence[DesignFigures]) -> str:
     """How near the certified designs came, and in which constraint, from every synthesis tried.
 
     What was not found may exist all the same: these are the controllers of one synthesis with its
@@ -314,7 +314,7 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
     return "; ".join([words, *kept, *least])
 
 
-def missed_bounds(problem: InnerProblem, figures: DesignFigures) -> list[str]:
+def missed_bounds(problem: InnerBounds, figures: DesignFigures) -> list[str]:
     """Which bounds a design misses, and by how much; none where it keeps them all."""
     return [
         f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is required"

@@ -16,7 +16,7 @@ import numpy as np
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, scaled_plant, true_design
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
-from ccd_casadi.synthesis.closed_loop import handed_out
+from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
@@ -30,7 +30,7 @@ def final_design(
         plant, problem.weights.at(*point), omega_low=inner.omega_low,
         gamma_backoff=inner.gamma_backoff, compliance=True,
     )  # fmt: skip
-    return handed_out(plant, made, inner.omega_low)
+    return recertified_in_si(plant, made, inner.omega_low)
 
 
 class TrueQuantities(VectorCallback):

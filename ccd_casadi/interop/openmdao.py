@@ -97,9 +97,9 @@ class LargestBandwidth(_Component):
     Outputs `bandwidth` (rad/s), or `rms_error` (m) or `move_time` (s) where the case minimises
     that, `hardware_cost` and `constraints`. The partials are the envelope gradient; it jumps where
     the binding bounds change. A fixed structure needs the problem of a finished run,
-    `read_run(folder).problem`, whose anchors make ω_b*(θ) a function of θ alone.
+    `read_run(folder).problem`, whose warm starts make ω_b*(θ) a function of θ alone.
 
-    Raises UserError for a fixed structure without anchors.
+    Raises UserError for a fixed structure without warm starts.
     """
 
     def setup(self) -> None:

@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.optimize import brentq
 
 from ccd_casadi.limitations.basis import Basis
-from ccd_casadi.limitations.certificate import forbids
+from ccd_casadi.limitations.certificate import rules_out
 from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
@@ -28,7 +28,7 @@ SECANTS, LARGEST = 10, 1.0  # programmes, and how far one step goes in ln ω_b
 CLOSE = 1e-3  # of the scaling: to what aims are met, and by how much T may pass a bound
 
 
-def outside(limits: Limits, known: float = np.inf) -> float:
+def upper_bound(limits: Limits, known: float = np.inf) -> float:
     """An ω_b (rad/s) that no controller reaches, near the least; `known` where that is less.
 
     Infinite where nothing forbids any bandwidth.
@@ -50,14 +50,14 @@ def outside(limits: Limits, known: float = np.inf) -> float:
     for number in range(TRIES):
         if omega_b >= most:
             break
-        if forbids(limits, search.basis, weight, omega_b, _grid(limits, omega_b, MANY[1])):
+        if rules_out(limits, search.basis, weight, omega_b, _grid(limits, omega_b, MANY[1])):
             return min(omega_b, known)
         omega_b = min(omega_b * (1.0 + OVER * 2.0 ** (number + 1)), most)
         weight = search.multiplier(omega_b)[1]
     return min(most, known)
 
 
-def inside(limits: Limits, most: float) -> float:
+def lower_bound(limits: Limits, most: float) -> float:
     """The ω_b (rad/s) of a T that keeps every bound on a fine grid, near `most`; 0: none found."""
     if not most < np.inf:
         return 0.0

@@ -83,7 +83,7 @@ class _Multiplier:
         return found
 
 
-def forbids(limits: Limits, basis: Basis, weight: Array, omega_b: float, start: Array) -> bool:
+def rules_out(limits: Limits, basis: Basis, weight: Array, omega_b: float, start: Array) -> bool:
     """Whether h = Σ weight_k h_k shows that no controller reaches ω_b (rad/s).
 
     `start`: frequencies v that the first intervals end at.

@@ -16,7 +16,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.limitations.bound import inside, outside, pointwise
+from ccd_casadi.limitations.bound import lower_bound, pointwise, upper_bound
 from ccd_casadi.limitations.limits import Limits, limits_of
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import json_values
@@ -25,21 +25,21 @@ from ccd_casadi.support.units import HZ
 
 @dataclass(frozen=True)
 class Gap:
-    """ω_b in rad/s: no controller that keeps the bounds on the model has `outside` (infinite:
-    nothing bounds it), some controller has `inside` (0: none was looked for); `channel` binds."""
+    """ω_b in rad/s: no controller that keeps the bounds on the model has `upper_bound` (infinite:
+    nothing bounds it), some controller has `lower_bound` (0: not computed); `channel` binds."""
 
-    outside: float
-    inside: float
+    upper_bound: float
+    lower_bound: float
     channel: str = ""
 
     def words(self, bandwidth: float) -> str:
         """Of the verdict, with a design's ω_b in rad/s."""
-        if not np.isfinite(self.outside):
+        if not np.isfinite(self.upper_bound):
             return "no bound on every controller, gap not known"
         return (
-            f"no controller of any order exceeds {self.outside / HZ:.2f} Hz on the model here "
-            f"(gap at most {100.0 * (self.outside / bandwidth - 1.0):.0f} %), gap over theta not "
-            "known"
+            f"no controller of any order exceeds {self.upper_bound / HZ:.2f} Hz on the model here "
+            f"(gap at most {100.0 * (self.upper_bound / bandwidth - 1.0):.0f} %), gap over theta "
+            "not known"
         )
 
     def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:
@@ -48,9 +48,9 @@ class Gap:
         `objective_bound`, of J over θ, is not known yet.
         """
         found = {
-            "bandwidth_bound_hz": self.outside / HZ,
-            "inside_hz": self.inside / HZ or np.nan,
-            "relative": self.outside / bandwidth - 1.0,
+            "bandwidth_bound_hz": self.upper_bound / HZ,
+            "inside_hz": self.lower_bound / HZ or np.nan,
+            "relative": self.upper_bound / bandwidth - 1.0,
             "channel": self.channel,
             "objective_bound": np.nan,
             "words": self.words(bandwidth) if np.isfinite(bandwidth) else "",
@@ -66,10 +66,10 @@ def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True
     found, channel = np.inf, ""
     loops = sorted(limits_of_problem(problem, theta), key=pointwise)
     for limits in loops:
-        bound = outside(limits, found)
+        bound = upper_bound(limits, found)
         if bound < found:
             found, channel = bound, limits.name
-    return Gap(found, inside(loops[0], found) if within and len(loops) == 1 else 0.0, channel)
+    return Gap(found, lower_bound(loops[0], found) if within and len(loops) == 1 else 0.0, channel)
 
 
 def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:

@@ -69,12 +69,12 @@ def sensitivity(L: np.ndarray) -> np.ndarray:
     return 1.0 / (1.0 + L) if L.shape[-1] == 1 else np.linalg.inv(np.eye(L.shape[-1]) + L)
 
 
-def open_alone(L: np.ndarray, i: int) -> np.ndarray:
+def equivalent_open_loop(L: np.ndarray, i: int) -> np.ndarray:
     """1/S_ii - 1 (k,) of S = (1 + L)⁻¹: what channel i sees while the others are closed."""
     return np.asarray(L[:, 0, 0] if L.shape[1] == 1 else 1.0 / sensitivity(L)[:, i, i] - 1.0)
 
 
-def largest(response: np.ndarray) -> Array:
+def sigma_max(response: np.ndarray) -> Array:
     """σ_max (k,) of a response (k, p, m)."""
     if response.shape[1:] == (1, 1):
         return np.abs(response[:, 0, 0])

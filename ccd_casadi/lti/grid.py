@@ -13,13 +13,13 @@ FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a
 LIGHT = 0.3  # damping ratio below which a pole or zero is a resonance
 
 
-def around(roots: np.ndarray, flanks: Array = FLANKS) -> Array:
+def root_flanks(roots: np.ndarray, flanks: Array = FLANKS) -> Array:
     """|Im p| + flank |Re p| (..., kf) of roots p (..., k) of any plane in 1/s, rad/s, unsorted."""
     found = np.abs(roots.imag)[..., None] + np.abs(roots.real)[..., None] * flanks
     return np.asarray(found.reshape(*roots.shape[:-1], -1))
 
 
-def light(roots: np.ndarray) -> np.ndarray:
+def resonant(roots: np.ndarray) -> np.ndarray:
     """Those of the upper half plane with a damping ratio below 0.3, ascending by size."""
     upper = roots[roots.imag > 1e-9 * np.abs(roots)]
     upper = upper[np.abs(upper.real) < LIGHT * np.abs(upper)]
@@ -43,7 +43,7 @@ def local_maxima(values: Array) -> np.ndarray:
     return np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
 
 
-def climbed(
+def refine_peak(
     gain: Callable[[float], float], low: float, high: float, xatol: float = 1e-10
 ) -> tuple[float, float]:
     """(ω, gain) at the local maximum between two frequencies above 0, by Brent's method in ln ω.

@@ -46,7 +46,7 @@ class Sampling:
         return 1e-6 * self.delay_us
 
 
-def parts(period: float, delay: float) -> tuple[int, float]:
+def delay_parts(period: float, delay: float) -> tuple[int, float]:
     """Whole periods of a delay (s), and the rest in s."""
     whole = int(np.floor(delay / period + INSTANT))
     return whole, max(delay - whole * period, 0.0)
@@ -62,7 +62,7 @@ def transfer(
         return f, f * f
     T = period
     d, late, early = moments(p, T, delay)
-    rest = parts(T, delay)[1]
+    rest = delay_parts(T, delay)[1]
     h = T - rest
     z = np.exp(s * T)
     lam = np.exp(p * T)
@@ -78,7 +78,7 @@ def transfer(
 
 def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, np.ndarray]:
     """Whole periods d of delay, and what u_{k-d} and u_{k-d-1} give a mode in one period."""
-    d, rest = parts(T, delay)
+    d, rest = delay_parts(T, delay)
     h = T - rest
     late = np.expm1(p * h) / p
     early = np.exp(p * h) * np.expm1(p * rest) / p
@@ -92,7 +92,7 @@ def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
     in the plant's matrices.
     """
     n, m = G.B.shape
-    whole, rest = parts(period, delay)
+    whole, rest = delay_parts(period, delay)
     joint = np.zeros((n + m, n + m), np.result_type(G.A, G.B))
     joint[:n, :n], joint[:n, n:] = G.A, G.B
     late = expm(joint * (period - rest))[:n]

@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, largest, sensitivity
-from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, sensitivity, sigma_max
+from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.hold import Sampling, sampled, transfer, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -78,7 +78,7 @@ class Loop:
 
     def over_a_step(self, longest: float) -> ClosedLoop:
         """The closed loop over a sampling period, or over `longest` s where it is continuous."""
-        return self.closed if self.sampling is not None else over(self.closed, longest)
+        return self.closed if self.sampling is not None else at_instants(self.closed, longest)
 
     @property
     def poles(self) -> np.ndarray:
@@ -96,20 +96,20 @@ class Loop:
         if self.sampling is not None:
             high = np.pi / self.sampling.period
         count = int(PER_DECADE * np.log10(high / low)) + 1
-        return frequency_grid(low, high, count, around(roots), apart=APART)
+        return frequency_grid(low, high, count, root_flanks(roots), apart=APART)
 
     @cached_property
     def peak(self) -> float:
         """‖S‖∞ of a stable loop: every local maximum on the grid near the largest closed in on."""
         grid = self.grid()
-        S = largest(self.sensitivity(grid))
+        S = sigma_max(self.sensitivity(grid))
         top = float(S.max())
         at = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
         at = at[S[at] > NEAR * top]
         low, high, rows = grid[at - 1], grid[at + 1], np.arange(len(at))
         for _ in range(ZOOMS if len(at) else 0):
             points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
-            found = largest(self.sensitivity(points.ravel())).reshape(points.shape)
+            found = sigma_max(self.sensitivity(points.ravel())).reshape(points.shape)
             i = found.argmax(axis=1)
             top = max(top, float(found.max()))
             low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
@@ -126,7 +126,7 @@ class Loop:
         return sampled(self.plant, T, self.sampling.delay), K
 
 
-def over(loop: ClosedLoop, period: float) -> ClosedLoop:
+def at_instants(loop: ClosedLoop, period: float) -> ClosedLoop:
     """A continuous loop at instants `period` s apart, r and d constant in between; exact."""
     both = np.hstack([loop.B_r, loop.B_d])
     joint = StateSpace(loop.A, both, loop.C_y, np.zeros((len(loop.C_y), both.shape[1])))

@@ -7,7 +7,7 @@ Balakrishnan & Kabamba 1989; Bruinsma & Steinbuch 1990.)
 import numpy as np
 from scipy.linalg import eigvals, solve
 
-from ccd_casadi.lti.grid import around
+from ccd_casadi.lti.grid import root_flanks
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 
@@ -98,6 +98,6 @@ def _first_grid(poles: np.ndarray) -> Array:
     size = np.abs(poles)
     low, high = 0.01 * size.min(), 100.0 * size.max()
     count = int(10 * np.log10(high / low)) + 2
-    flanks = around(poles[poles.imag > 0.0], np.array([-1.0, 0.0, 1.0]))
+    flanks = root_flanks(poles[poles.imag > 0.0], np.array([-1.0, 0.0, 1.0]))
     grid = np.concatenate([[0.0, np.inf], np.geomspace(low, high, count), flanks])
     return np.unique(grid[grid >= 0.0])

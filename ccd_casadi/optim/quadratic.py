@@ -74,25 +74,29 @@ def solve_elastic(
     leaves exceeded, until there is none. None as in `solve_quadratic`.
     """
     m, n = slopes.shape
-    A = np.column_stack([slopes, -elastic])
-    hessian = np.zeros((n + 1, n + 1))
-    hessian[:n, :n] = radius / unit * H
-    hessian[range(n), range(n)] += CURVED
-    hessian[n, n] = CURVED if free else SLACK * penalty / unit
-    ends = np.append(low / radius, -np.inf if free else 0.0), np.append(high / radius, np.inf)
-    cost, upper, held = np.append(c, penalty) / unit, -value / radius, np.arange(m) < AT_FIRST
+    A, hessian, cost = np.empty((m, n + 1)), np.zeros((n + 1, n + 1)), np.empty(n + 1)
+    A[:, :n], A[:, n] = slopes, -elastic
+    hessian[:n, :n], cost[:n], cost[n] = radius / unit * H, c / unit, penalty / unit
+    hessian.ravel()[:: n + 2] += CURVED
+    ends = np.full((2, n + 1), np.inf)
+    ends[0, :n], ends[1, :n], ends[0, n] = low / radius, high / radius, -np.inf
+    if not free:
+        hessian[n, n], ends[0, n] = SLACK * penalty / unit, 0.0
+    upper, held = -value / radius, np.arange(min(m, AT_FIRST))
     while True:
         found = solve_quadratic(hessian, cost, A[held], upper[held], *ends)
         if found is None:
             return None
-        missed = np.where(held, -np.inf, A @ found.x - upper)
-        if not (missed > KEPT).any():
-            break
+        missed = A @ found.x - upper if len(held) < m else np.zeros(0)
+        missed[held[: len(missed)]] = -np.inf
         worst = np.argsort(-missed)[:ADDED]
-        held[worst[missed[worst] > KEPT]] = True
+        fresh = worst[missed[worst] > KEPT]
+        if not len(fresh):
+            break
+        held = np.concatenate([held, fresh])
     multipliers = np.zeros(m)
     multipliers[held] = unit * found.multipliers
-    return radius * np.clip(found.x[:n], ends[0][:n], ends[1][:n]), multipliers
+    return radius * np.clip(found.x[:n], *ends[:, :n]), multipliers
 
 
 @lru_cache(maxsize=256)

@@ -226,18 +226,20 @@ def best_step(
     n = len(here.x)
     value, slopes = rows.value[chosen], rows.slopes[chosen]
     elastic = np.ones(len(chosen)) if rows.hard is None else 1.0 - rows.hard[chosen]
+    soft = elastic > 0.0
     unit = _unit(here, penalty if model.carried else 0.0)
     weight = ELASTIC * (unit + penalty) if model.growing else penalty
     multipliers = np.zeros(len(rows.value))
 
     curved, bent = np.zeros((0, n, n)), np.zeros(0, int)  # Hessians, and the rows that have them
 
-    def gain(p: Array) -> float:
-        """Of merit at p, with what is known of the curvature of the rows."""
-        level = value + slopes @ p
-        level[bent] += 0.5 * (curved @ p) @ p
-        most = float(level[elastic > 0.0].max(initial=-np.inf if model.carried else 0.0))
-        return penalty * (here.violation - most) - float(here.gradient @ p + 0.5 * p @ H @ p)
+    def gains(ends: Array) -> Array:
+        """Of merit at p (k, n), with what is known of the curvature of the rows."""
+        level = value + ends @ slopes.T
+        level[:, bent] += 0.5 * ((ends @ curved) * ends).sum(axis=2).T
+        most = level[:, soft].max(axis=1, initial=-np.inf if model.carried else 0.0)
+        curve = 0.5 * ((ends @ H) * ends).sum(axis=1)
+        return np.asarray(penalty * (here.violation - most) - ends @ here.gradient - curve)
 
     def answer(offset: Array) -> tuple[Array, Array] | None:
         """That of the programme around p with these rows: M acts on what is left of p."""
@@ -260,7 +262,7 @@ def best_step(
         elif rows.curved:
             penalty = min(weight, TIMES * float(mu.sum() + unit))
         if turn == 0:
-            straight = gain(way)
+            straight = float(gains(way[None])[0])
         holds = mu > HOLDS * weight
         counts = holds.copy()
         if model.bending:
@@ -270,20 +272,20 @@ def best_step(
         if len(fresh) and rows.hessians is not None:
             curved = np.concatenate([curved, rows.hessians(chosen[fresh])])
             bent = np.concatenate([bent, fresh])
-        known, size = gain(p), float(np.abs(way).max())
+        size = float(np.abs(way).max())
         # The rows bend less on part of the way: a whole one may lead further and further out.
-        tried = [p + share * way for share in (SHARES if rows.curved else SHARES[:1])]
-        gains = [gain(end) for end in tried]
-        if turn and gains[0] < max(gains):  # the whole of it, with what the rows bend on it
+        tried = p + np.array(SHARES if rows.curved else SHARES[:1])[:, None] * way
+        known, *reached = gains(np.vstack([p, tried])).tolist()
+        if turn and reached[0] < max(reached):  # the whole of it, with what the rows bend on it
             bends = offset.copy()
             bends[bent] += 0.5 * (curved @ way) @ way
             if (other := answer(bends)) is not None:
-                tried.append(other[0])
-                gains.append(gain(other[0]))
-        predicted = max(gains)
+                tried = np.vstack([tried, other[0]])
+                reached += gains(other[0][None]).tolist()
+        predicted = max(reached)
         better = predicted - known
         if better > 0.0 or not rows.curved:
-            end = tried[gains.index(predicted)]
+            end = tried[reached.index(predicted)]
             near, p = 2.0 * float(np.abs(end - p).max()), end
         else:
             near, predicted = 0.5 * SHARES[-1] * size, known

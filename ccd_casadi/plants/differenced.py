@@ -38,7 +38,7 @@ NOISE = 1e-4  # of a matrix over the box: a derivative below it is none
 AGREEMENT = 1e-9  # relative; a function gives the same numbers for numbers and for symbols
 
 
-def own_plant(
+def user_plant(
     model: ModelFunction,
     names: Sequence[str],
     options: Mapping[str, Any],

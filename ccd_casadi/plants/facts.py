@@ -24,7 +24,7 @@ ALIKE = 0.3  # relative: a zero with and without suspension is the same within t
 
 
 @dataclass(frozen=True)
-class Mode:
+class PlantMode:
     """One mode of the undamped plant; driven and measured: its gains over the largest."""
 
     frequency_hz: float
@@ -60,7 +60,7 @@ class PlantFacts:
     """
 
     theta: tuple[float, ...]
-    modes: tuple[Mode, ...]
+    modes: tuple[PlantMode, ...]
     zeros: tuple[Zero, ...]
     effort_hz: float
     inertia: float = float("inf")
@@ -82,12 +82,12 @@ def facts_of(
     return PlantFacts(theta, _modes(modal), _zeros(scaled, effort, free), effort, inertia)
 
 
-def _modes(modal: ModalPlant) -> tuple[Mode, ...]:
+def _modes(modal: ModalPlant) -> tuple[PlantMode, ...]:
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
     zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.diag(modal.K)))
     return tuple(
-        Mode(float(w) / HZ, float(z), bool(r), float(drive), float(seen))
+        PlantMode(float(w) / HZ, float(z), bool(r), float(drive), float(seen))
         for w, z, r, drive, seen in zip(
             modal.natural, zeta, modal.rigid, b / b.max(), c / c.max(), strict=True
         )

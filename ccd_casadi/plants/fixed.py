@@ -27,7 +27,7 @@ def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFuncti
     return of_free
 
 
-class WithFixed:
+class Reparametrised:
     """Free θ -> Mechanics of a plant at all of θ, with the derivatives to the free ones.
 
     `place` is where the free parameters are in the whole θ, whose others are those of `whole`.
@@ -63,15 +63,15 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
     place = [i for i, name in enumerate(plant.names) if name not in fixed]
     whole = np.array([fixed.get(name, np.nan) for name in plant.names])
 
-    def of(evaluate: Evaluate) -> WithFixed:
-        return WithFixed(evaluate, place, whole)
+    def of(evaluate: Evaluate) -> Reparametrised:
+        return Reparametrised(evaluate, place, whole)
 
     own = of(plant.evaluate)
     free = ca.MX.sym("theta", len(place))
     entries = iter(ca.vertsplit(free))
     theta = [fixed[name] if name in fixed else next(entries) for name in plant.names]
     domain = plant.domain
-    return through(
+    return reparametrised(
         plant, of, own.own,
         names=tuple(plant.names[i] for i in place),
         hardware=ca.Function("hardware", [free], plant.hardware.call([ca.vertcat(*theta)])),
@@ -79,7 +79,7 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
     )  # fmt: skip
 
 
-def through(
+def reparametrised(
     plant: Plant,
     of: Callable[[Evaluate], Evaluate],
     own: Callable[[Sequence[float]], tuple[float, ...]],
@@ -119,7 +119,7 @@ def through(
 REMEMBERED = 64  # θ whose matrices are kept
 
 
-class Ordered(WithFixed):
+class Ordered(Reparametrised):
     """θ in the order of `names` -> Mechanics, of `mechanics(θ in the order `own`, derivatives)`."""
 
     keep: object = None  # what has to live as long

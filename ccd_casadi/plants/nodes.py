@@ -16,7 +16,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 Coordinate = float | str  # a number, the name of a θ, or that name after a minus sign
-Point = tuple[Coordinate, ...]
+Position = tuple[Coordinate, ...]
 
 
 def names_in(points: Sequence[Sequence[Coordinate]]) -> tuple[str, ...]:
@@ -29,7 +29,7 @@ def names_in(points: Sequence[Sequence[Coordinate]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(text.removeprefix("-") for text in texts))
 
 
-class Points:
+class Positions:
     """Rows of coordinates as a linear function of θ: `constant` (m, d) + `slope` (m, d, n) θ."""
 
     def __init__(self, points: Sequence[Sequence[Coordinate]], names: Sequence[str]) -> None:
@@ -48,7 +48,7 @@ class Points:
         return np.asarray(self.constant + self.slope @ theta)
 
 
-class Between:
+class NodeInterpolation:
     """w(p) and its slopes, for nodes (N, d)."""
 
     def __init__(self, nodes: Array) -> None:
@@ -65,7 +65,7 @@ class Between:
         self._inverse = np.linalg.inv(np.block([[kernel, power], [power.T, np.zeros((q, q))]]))
         self._inverse = self._inverse[:, :count]
 
-    def weights(self, points: Points, theta: Array) -> tuple[Array, Array]:
+    def weights(self, points: Positions, theta: Array) -> tuple[Array, Array]:
         """w of every point at θ, (N, m), and its slopes (n, N, m)."""
         found = [self.at(point) for point in points.at(theta)]
         W = np.array([w for w, _ in found]).reshape(-1, len(self.nodes)).T

@@ -19,9 +19,9 @@ from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
 from ccd_casadi.plants.axes import followed_modes, in_axes
-from ccd_casadi.plants.fixed import through
+from ccd_casadi.plants.fixed import reparametrised
 from ccd_casadi.plants.modal import RIGID_RATIO
-from ccd_casadi.plants.nodes import Between, Point, Points, names_in
+from ccd_casadi.plants.nodes import NodeInterpolation, Position, Positions, names_in
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -42,8 +42,8 @@ class Places:
     """
 
     nodes: tuple[tuple[float, ...], ...]
-    actuators: tuple[Point, ...]
-    sensors: tuple[Point, ...] = ()
+    actuators: tuple[Position, ...]
+    sensors: tuple[Position, ...] = ()
     actuator_mass: float = 0.0
     sensor_mass: float = 0.0
     apart: float = 0.0
@@ -75,8 +75,8 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     if axes and least < axes + len(places.quiet):
         words = f"need {axes + len(places.quiet)} actuators and sensors or more"
         raise PlantError(f"places.axes, quiet and damped {words}; add some, or drop a mode")
-    between, own = Between(nodes), [list(names).index(name) for name in plant.names]
-    points = Points(places.actuators, names), Points(places.sensors, names)
+    between, own = NodeInterpolation(nodes), [list(names).index(name) for name in plant.names]
+    points = Positions(places.actuators, names), Positions(places.sensors, names)
     for group in points if places.sensors else points[:1]:
         still, slack = ~group.slope.any(axis=2), 1e-9 * np.ptp(nodes, axis=0)
         beyond = np.clip(group.constant, nodes.min(axis=0) - slack, nodes.max(axis=0) + slack)
@@ -102,7 +102,7 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     x = ca.MX.sym("theta", len(names))
     f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
     rules = _rules(whole, x)
-    return through(
+    return reparametrised(
         plant,
         of,
         below,
@@ -125,9 +125,9 @@ class PlacedMechanics:
 
     evaluate: Evaluate
     places: Places
-    between: Between
-    actuators: Points
-    sensors: Points
+    between: NodeInterpolation
+    actuators: Positions
+    sensors: Positions
     own: list[int]
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
@@ -210,7 +210,7 @@ def _flexible(system: Mechanics) -> tuple[Array, Array]:
 
 def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
     """λ by name: least distances, where θ moves them."""
-    found: dict[frozenset[Point], tuple[str, ca.MX]] = {}  # a force and its sensor are one place
+    found: dict[frozenset[Position], tuple[str, ca.MX]] = {}  # a force and its sensor are one place
     for word, points, group in (("actuators", of.places.actuators, of.actuators),
                                 ("sensors", of.places.sensors, of.sensors)):  # fmt: skip
         for i, j in combinations(range(len(points)) if of.places.apart else (), 2):

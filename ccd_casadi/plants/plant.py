@@ -248,7 +248,7 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
     return system
 
 
-def near(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[float]) -> Evaluate:
+def nearby_model(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[float]) -> Evaluate:
     """θ -> Mechanics from what is known: the plant's own way, or to first order around `here`."""
     if plant.nearby is not None and known:
         return plant.nearby(known)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.kernels.gamma import plant_gain
-from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.channels import Channel, find_channels
 from ccd_casadi.plants.modal import ModalPlant
@@ -200,7 +200,7 @@ def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
     roots = np.concatenate([system.poles, system.zeros()])
     roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
     wide = np.maximum(np.abs(roots.real), 1e-9 * roots.imag) + 1j * roots.imag
-    return np.ascontiguousarray(frequency_grid(1e-5, 1e5, 121, around(wide, FLANKS)))
+    return np.ascontiguousarray(frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS)))
 
 
 def _system(A: Array, B: Array, C: Array) -> StateSpace:

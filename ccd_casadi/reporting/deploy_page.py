@@ -14,7 +14,7 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
-from ccd_casadi.lti.closed_loop import largest, sensitivity
+from ccd_casadi.lti.closed_loop import sensitivity, sigma_max
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
@@ -84,8 +84,8 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     for loop, name, colour, line in _loops(run, found):
         G, K = loop.responses(HZ * hz)
         label = name if loop.sampling is None else f"{name} at {number(found.rate_hz)} Hz"
-        curves.append(c.Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
-        drawn.append(c.Curve(hz, largest(K), name, colour, line))
+        curves.append(c.Curve(hz, sigma_max(sensitivity(G @ K)), label, colour, line))
+        drawn.append(c.Curve(hz, sigma_max(K), name, colour, line))
     S_max, own = run.problem.inner.S_max, found.sampled.bandwidth / HZ
     crossing = bandwidth_level(own, text=", sampled") if np.isfinite(own) else (
         bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")

@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.support.units import HZ, counted, display_unit, number
+from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
@@ -210,7 +210,7 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
         )  # fmt: skip
         found += [
             ("Step response", f"overshoot {shown('step_overshoot', ' %', 100.0)}", settled),
-            ("Force step", shown("force_step_max", " µm", 1e6), "largest displacement by 1 N"),
+            ("Force step", with_unit(r["force_step_max"], "m"), "largest displacement by 1 N"),
         ]
     return found + [("Warning", "narrow", words) for words in r.get("loop_warnings", ())]
 

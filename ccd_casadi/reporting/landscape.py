@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.drawing.content import Landscape
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, sample_key
 from ccd_casadi.sampling.store import SampleStore
@@ -75,7 +75,7 @@ def landscape_data(
     forbidden = None
     plant = plant_of(problem)
     if plant.constraint_names:
-        bad = [bool(unmet(problem, tuple(place))) for place in thetas]
+        bad = [bool(violated(problem, tuple(place))) for place in thetas]
         forbidden = np.array(bad).reshape(count, count)
     region = None
     if radius < 1.0:

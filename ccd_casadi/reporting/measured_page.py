@@ -11,7 +11,7 @@ from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.fixed_structure.measured_loop import between, controller_response
-from ccd_casadi.lti.closed_loop import largest, open_alone, sensitivity
+from ccd_casadi.lti.closed_loop import equivalent_open_loop, sensitivity, sigma_max
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
@@ -69,8 +69,8 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
                                            "between lines, at most", GREY, width=0.9))  # fmt: skip
         gains = {"G": one.matrix, "S": S, "KS": K @ S, "T": joint @ S}
         for name, M in gains.items():
-            curves[name].append(c.Curve(hz, largest(M), colour=colour))
-        loops = [open_alone(joint, i) for i in range(joint.shape[1])]
+            curves[name].append(c.Curve(hz, sigma_max(M), colour=colour))
+        loops = [equivalent_open_loop(joint, i) for i in range(joint.shape[1])]
         curves["L"] += [c.Curve(hz, np.abs(L), colour=colour) for L in loops]
         loci += loops
     hz, size = curves["S"][0].x, curves["S"][0].y

@@ -10,7 +10,7 @@ from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
 from ccd_casadi.drawing.content import Chapter, Curve, Figure, Level, Lines, Panel, Table, Words
 from ccd_casadi.drawing.svg import CYCLE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
-from ccd_casadi.lti.closed_loop import largest
+from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.loops import gain_panels, over_hz, synthesised_loop, view_of
@@ -63,7 +63,7 @@ def _roots(loop: LoopView) -> tuple[np.ndarray, np.ndarray]:
 def _panels(loops: Sequence[LoopView]) -> tuple[tuple[Panel, ...], ...]:
     """S over the plants and the poles of the loops."""
     coloured = list(zip(loops, CYCLE, strict=False))
-    G = [Curve(v.hz, largest(v.plant), v.label, colour) for v, colour in coloured]
+    G = [Curve(v.hz, sigma_max(v.plant), v.label, colour) for v, colour in coloured]
     poles = tuple(Curve(*_roots(v), v.label, colour, "", "x") for v, colour in coloured)
     pole_map = Panel(
         "|pole| (Hz)", "damping ratio of the loop's poles (–)", poles, log_x=True, legend=None,

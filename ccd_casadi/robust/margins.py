@@ -15,11 +15,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.lti.closed_loop import open_alone, sensitivity
+from ccd_casadi.lti.closed_loop import equivalent_open_loop, sensitivity
 from ccd_casadi.robust.mu_bound import mu_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import Responses, classical_margins
+from ccd_casadi.synthesis.classical_margins import PlantAndController, classical_margins
 
 FINE = 61  # points between the neighbours of the least disk margin found
 
@@ -68,7 +68,7 @@ class Margins:
     inputs: DiskMargin
 
 
-def margins(respond: Responses, hz: Array) -> Margins:
+def margins(respond: PlantAndController, hz: Array) -> Margins:
     """Margins of a loop from its responses in SI, on a grid in Hz that resolves resonances.
 
     The grid only brackets: crossings are bisected on the response itself, and the least disk margin
@@ -83,13 +83,13 @@ def margins(respond: Responses, hz: Array) -> Margins:
     return Margins(tuple(loops), *together)
 
 
-def _broken(respond: Responses, name: str, omega: Array) -> NDArray:
+def _broken(respond: PlantAndController, name: str, omega: Array) -> NDArray:
     G, K = respond(omega)
     return np.asarray(G @ K if name == "output" else K @ G)
 
 
 def _alone(L: Callable[[Array], NDArray], i: int, omega: Array) -> NDArray:
-    return open_alone(L(omega), i)
+    return equivalent_open_loop(L(omega), i)
 
 
 def _loop(name: str, L: Callable[[Array], NDArray], hz: Array) -> LoopMargins:

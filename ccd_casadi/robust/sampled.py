@@ -13,8 +13,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
-from ccd_casadi.lti.closed_loop import largest
-from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.closed_loop import sigma_max
+from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.hold import in_w
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
@@ -66,9 +66,9 @@ def sampled_compliance(plant: StateSpace, S: StateSpace) -> float:
     S G f. What faster forces leave (aliased) is not in it. S is stable.
     """
     end = np.pi / S.period
-    near = around(np.concatenate([S.rates, plant.poles]))
+    near = root_flanks(np.concatenate([S.rates, plant.poles]))
     grid = frequency_grid(end * 10.0**-DECADES, end, DECADES * PER_DECADE, near)
-    return highest(lambda at: largest(S.response(at) @ plant.response(at))[None], grid)[0][0]
+    return highest(lambda at: sigma_max(S.response(at) @ plant.response(at))[None], grid)[0][0]
 
 
 def _from_w(S: StateSpace, v: Array | float) -> Array:
@@ -90,9 +90,9 @@ def _bandwidth(S: StateSpace, over_w: StateSpace) -> float:
         return np.nan
     last = min(2.0 * crossings[-1], np.pi / S.period)
     ends = np.array([0.5 * crossings[0], *np.sqrt(crossings[1:] * crossings[:-1]), last])
-    above = largest(S.response(ends)) > HALF_POWER
+    above = sigma_max(S.response(ends)) > HALF_POWER
     if above[0] or not above.any():
         return np.nan
     first = int(np.argmax(above))
-    excess = lambda omega: float(largest(S.response(np.array([omega])))[0] - HALF_POWER)  # noqa: E731
+    excess = lambda omega: float(sigma_max(S.response(np.array([omega])))[0] - HALF_POWER)  # noqa: E731
     return float(brentq(excess, ends[first - 1], ends[first], (), 1e-12 * ends[first], 1e-14))

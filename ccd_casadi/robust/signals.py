@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ccd_casadi.budget.derivatives import covariance
 from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.sources import Kind, ShapedSpectrum, Source
-from ccd_casadi.lti.closed_loop import ClosedLoop, largest, responses_of
-from ccd_casadi.lti.grid import climbed
+from ccd_casadi.lti.closed_loop import ClosedLoop, responses_of, sigma_max
+from ccd_casadi.lti.grid import refine_peak
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.support.arrays import Array
@@ -35,7 +35,7 @@ class Noise:
 def gains(G: NDArray, K: NDArray) -> Array:
     """σ_max of S, T, GS (disturbance force to position) and KS (noise to force), rows (4, k)."""
     found = responses_of(G, K)
-    return np.array([largest(found[name]) for name in ("S", "T", "GS", "KS")])
+    return np.array([sigma_max(found[name]) for name in ("S", "T", "GS", "KS")])
 
 
 def norms(loop: ClosedLoop) -> tuple[tuple[float, float], ...]:
@@ -52,7 +52,7 @@ def highest(gain: Callable[[Array], Array], omega: Array) -> tuple[tuple[float, 
     values, found = gain(omega), []
     for row, i in enumerate(values.argmax(axis=1)):
         ends = omega[max(i - 1, 0)], omega[min(i + 1, len(omega) - 1)]
-        top = climbed(partial(_of_row, gain, row), *ends)
+        top = refine_peak(partial(_of_row, gain, row), *ends)
         tops = (float(values[row, i]), 0.0 if i == 0 else float(omega[i]))
         found.append(max(tops, top[::-1]) if i else tops)
     return tuple(found)

@@ -10,8 +10,7 @@ from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.result import at_solve
-from ccd_casadi.codesign.verdict import Line as VerdictLine
-from ccd_casadi.codesign.verdict import State
+from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.modal import Suspension, modal_plant

@@ -17,8 +17,8 @@ import numpy as np
 from ccd_casadi.inner_problem.objective import objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
-from ccd_casadi.inner_problem.structured_search import joined
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.inner_problem.structured_search import with_warm_start
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 
 WORTH = 1e-3  # relative: what another branch has to promise, and what a verdict counts as better
@@ -29,30 +29,28 @@ TRIES = 2  # climbs from neighbours, of a sample, that may be in vain
 Theta = tuple[float, ...]
 
 
-def with_warm_start(
-    problem: CoDesignProblem, known: Iterable[BandwidthSample], theta: Theta
+def from_neighbour(
+    problem: CoDesignProblem, known: Iterable[InnerSample], theta: Theta
 ) -> CoDesignProblem:
-    """The problem with the neighbour's controller that promises most at a new θ as an anchor."""
+    """The problem with the neighbour's controller that promises most at a new θ as a warm start."""
     near = _nearest(problem, _usable(known), theta)
     if not near:
         return problem
 
-    def promise(one: BandwidthSample) -> float:
+    def promise(one: InnerSample) -> float:
         return problem.figure.gain(_branch(one, theta, one.gradient), near[0].value)
 
-    return joined(problem, np.array(max(near, key=promise).kappa), ())
+    return with_warm_start(problem, np.array(max(near, key=promise).kappa), ())
 
 
-def alone(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
+def from_controller(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
     """The problem whose value is that of the climb from one controller, κ in SI."""
-    structured = structured_of(problem).with_anchor(tuple(map(float, kappa)), 1)
+    structured = structured_of(problem).with_warm_start(tuple(map(float, kappa)), 1)
     return replace(problem, controller=replace(structured, starts=0))
 
 
-def promised(
-    problem: CoDesignProblem,
-    known: Iterable[BandwidthSample],
-    tried: Mapping[Theta, Sequence[Theta]],
+def promising_starts(
+    problem: CoDesignProblem, known: Iterable[InnerSample], tried: Mapping[Theta, Sequence[Theta]]
 ) -> dict[Theta, Theta]:
     """κ to climb from at each θ whose sample falls short of what a neighbour promises.
 
@@ -75,20 +73,20 @@ def promised(
     return {theta: kappa for theta, (_, kappa) in found.items()}
 
 
-def _usable(known: Iterable[BandwidthSample]) -> list[BandwidthSample]:
+def _usable(known: Iterable[InnerSample]) -> list[InnerSample]:
     """Those with a controller of fixed structure, and slopes."""
     return [one for one in known if one.kappa and np.isfinite(one.gradient).all()]
 
 
-def _branch(one: BandwidthSample, theta: Theta, gradient: Theta) -> float:
+def _branch(one: InnerSample, theta: Theta, gradient: Theta) -> float:
     """The value that a sample's branch has at another θ, where its gradient is this one."""
     slope = 0.5 * np.add(one.gradient, gradient)
     return one.value + float(np.subtract(theta, one.theta) @ slope)
 
 
 def _nearest(
-    problem: CoDesignProblem, samples: Sequence[BandwidthSample], theta: Theta
-) -> list[BandwidthSample]:
+    problem: CoDesignProblem, samples: Sequence[InnerSample], theta: Theta
+) -> list[InnerSample]:
     """The nearest samples at other θ."""
     others = [one for one in samples if one.theta != theta]
     if not others:

@@ -14,16 +14,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.sampling.neighbours import alone, promised, with_warm_start
+from ccd_casadi.sampling.neighbours import from_controller, from_neighbour, promising_starts
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import (
-    BandwidthSample,
+    InnerSample,
     QuantitySample,
-    bandwidth_sample,
+    inner_sample,
     quantity_sample,
     sample_of,
 )
@@ -70,9 +70,9 @@ class Sampler:
         store.put_problem(self.hash, problem.identity())
         self.spent = SynthesisCounts()
         self.trace: list[TraceEntry] = []
-        self.nearest: BandwidthSample | None = None  # of the infeasible ones
-        self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # the best at each θ asked for
-        self.raised = 0  # times that a better controller was found where one had been known
+        self.nearest: InnerSample | None = None  # of the infeasible ones
+        self.solved: dict[tuple[float, ...], InnerSample] = {}  # the best at each θ asked for
+        self.improvements = 0  # times that a better controller was found where one had been known
         self._tried: dict[tuple[float, ...], list[tuple[float, ...]]] = {}  # κ, in vain
 
     def of(
@@ -93,12 +93,12 @@ class Sampler:
         """Distinct true syntheses asked for so far."""
         return self.spent.total
 
-    def raced(self, key: str) -> None:
+    def count_multistart(self, key: str) -> None:
         """Count a multi-start search once, as one synthesis."""
         with self.spent.on("races"):
             self.spent.once(f"race {key}", 1)
 
-    def bandwidths(self, thetas: Array, label: str = "sampling") -> list[BandwidthSample]:
+    def values(self, thetas: Array, label: str = "sampling") -> list[InnerSample]:
         """ω_b* at every row of `thetas`, in their order: the best that is known there.
 
         Of fixed structures a new θ begins from what is known near by too, and what falls short of
@@ -107,28 +107,30 @@ class Sampler:
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]
         known, before = list(self.solved.values()), len(self.trace)
         new = [theta for theta in points if theta not in self.solved]
-        self._solve({theta: with_warm_start(self.problem, known, theta) for theta in new}, label)
-        self._raise()
+        self._solve({theta: from_neighbour(self.problem, known, theta) for theta in new}, label)
+        self._improve()
         self.report(before)
         return [self.solved[theta] for theta in points]
 
-    def climbed(self, theta: Sequence[float], kappa: Sequence[float]) -> BandwidthSample:
+    def value_from(self, theta: Sequence[float], kappa: Sequence[float]) -> InnerSample:
         """The sample at θ, where a controller (κ in SI) was found for it: also from that one."""
         point, before = tuple(float(v) for v in theta), len(self.trace)
-        self._solve({point: alone(self.problem, kappa)}, "from a controller")
-        self._raise()
+        self._solve({point: from_controller(self.problem, kappa)}, "from a controller")
+        self._improve()
         self.report(before)
         return self.solved[point]
 
-    def latest(self, samples: Sequence[BandwidthSample]) -> list[BandwidthSample]:
+    def latest(self, samples: Sequence[InnerSample]) -> list[InnerSample]:
         """What is known by now at the θ of samples."""
         return [self.solved.get(sample.theta, sample) for sample in samples]
 
-    def _raise(self) -> None:
+    def _improve(self) -> None:
         """Climb anew from their neighbours where samples fall short of them, until none does."""
-        while tasks := promised(self.problem, self.solved.values(), self._tried):
+        while tasks := promising_starts(self.problem, self.solved.values(), self._tried):
             before = {theta: self.solved[theta] for theta in tasks}
-            problems = {theta: alone(self.problem, kappa) for theta, kappa in tasks.items()}
+            problems = {
+                theta: from_controller(self.problem, kappa) for theta, kappa in tasks.items()
+            }
             self._solve(problems, "from neighbours")
             for theta, kappa in tasks.items():
                 if self.solved[theta] is before[theta]:
@@ -153,14 +155,14 @@ class Sampler:
             known = payloads[key]
             assert known is not None
             try:
-                sample = bandwidth_sample(theta, known)
+                sample = inner_sample(theta, known)
             except (KeyError, TypeError, ValueError) as error:
                 raise self.store.damaged() from error
             before = self.solved.get(theta, sample)
             gain = self.problem.figure.gain(sample.value, before.value)  # NaN: one is infeasible
             if theta not in self.solved or gain > 0.0 or sample.feasible > before.feasible:
                 if theta in self.solved:
-                    self.raised += 1
+                    self.improvements += 1
                     best = (best_key(self.inner_hash, theta), owners[theta], theta, known)
                     self.store.put_unit([], best, anew=True)
                 self.solved[theta] = sample
@@ -202,15 +204,15 @@ class Sampler:
         """The true quantities at any x, for IPOPT and what polishes: made in this process."""
         return TrueQuantities(self.problem, self._recorded)
 
-    def kept(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
+    def cached(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
         """What `make` gives at a point of this problem, once for all runs on the store."""
         owner = problem_hash({what: self.inner_hash})
-        return self.store.kept(sample_key(owner, point, 0.0, 0.0), owner, point, kind, make)
+        return self.store.cached(sample_key(owner, point, 0.0, 0.0), owner, point, kind, make)
 
     def _recorded(self, x: Array, make: Callable[[], Sensitivities]) -> Sensitivities:
         """A design made outside the pool (IPOPT on the true function): a row too, and counted."""
         point = tuple(float(v) for v in x)
-        design = self.kept("design", point, Sensitivities, make)
+        design = self.cached("design", point, Sensitivities, make)
         key = self._design_key(point)
         sample = sample_of(key, point[:-2], design.figures, 0.0, design)
         self.store.put([sample], self.hash)
@@ -235,7 +237,7 @@ class Sampler:
         if not self.spent.once(key, count):
             return
         J, value = np.nan, bandwidth if value is None else value
-        if np.isfinite(value) and not unmet(self.problem, theta):
+        if np.isfinite(value) and not violated(self.problem, theta):
             J = objective(self.problem, theta, value)
         self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(J)))
 

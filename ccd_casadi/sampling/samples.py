@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.inner_problem.objective import InnerValue
-from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.sampling.rows import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.plain_values import restored
@@ -14,7 +14,7 @@ from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 @dataclass(frozen=True)
-class BandwidthSample(InnerValue):
+class InnerSample(InnerValue):
     """With where it is reached, and what binds.
 
     An infeasible one says what falls short, and by how much (ln) at least: `violation`.
@@ -74,13 +74,13 @@ def sample_of(
     return Sample(**known | own, key=key, theta=theta, seconds=seconds, gradients=gradients)
 
 
-def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample:
+def inner_sample(theta: tuple[float, ...], payload: dict) -> InnerSample:
     """What was stored of a unit of work. Raises KeyError, TypeError or ValueError if damaged."""
     gradient = payload["gradient"] or [None] * len(theta)
     nothing = dict.fromkeys(("bandwidth", "omega_S", "omega_T"), np.nan) | {"violation": np.inf}
     given = nothing | {key: value for key, value in payload.items() if value is not None}
     given |= {"theta": theta, "gradient": [np.nan if v is None else v for v in gradient]}
-    sample: BandwidthSample = restored(BandwidthSample, given)
+    sample: InnerSample = restored(InnerSample, given)
     sizes = [1.0 if payload.get("error") is None else sample.error]
     if payload["bandwidth"] is not None:
         sizes += [sample.bandwidth]
@@ -90,7 +90,7 @@ def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample
     return sample
 
 
-def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerProblem) -> QuantitySample:
+def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerBounds) -> QuantitySample:
     """A row with derivatives as values at x, of the figures that `inner` bounds."""
     assert sample.gradients is not None
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -166,7 +166,7 @@ class SampleStore:
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
             return None if row is None else decoded(row[0])
 
-    def kept(
+    def cached(
         self, key: str, owner: str, theta: Sequence[float], kind: type[T], make: Callable[[], T]
     ) -> T:
         """The dataclass that was stored under a key, else what `make` gives, which is stored.

@@ -13,7 +13,7 @@ from ccd_casadi.inner_problem.kinds import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, true_design, true_inner
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
+from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult
 from ccd_casadi.sampling.rows import Sample, sample_key
 from ccd_casadi.sampling.samples import sample_of
 
@@ -39,11 +39,7 @@ def mixed_unit(
 
 
 def unit_of(
-    problem_key: str,
-    theta: tuple[float, ...],
-    result: InnerResult,
-    inner: InnerProblem,
-    each: float,
+    problem_key: str, theta: tuple[float, ...], result: InnerResult, inner: InnerBounds, each: float
 ) -> tuple[list[Sample], dict]:
     """Rows and payload of one θ's inner problem; `each` synthesis took so many seconds."""
     rows = {}

@@ -2,7 +2,7 @@
 
 At the first θ the paper's sweep covers the whole box of (ω_S, ω_T), afterwards a small range around
 the last optimum (paper, section 3.1.2). A controller of fixed structure is not swept: its designs
-are those of the problem's anchors.
+are those of the problem's warm starts.
 """
 
 from abc import ABC, abstractmethod
@@ -25,7 +25,7 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -80,7 +80,7 @@ class Baseline(ABC):
         """The best design at θ, near (ω_S, ω_T) where these are given, and the syntheses spent."""
 
     @abstractmethod
-    def design_of(self, sample: BandwidthSample) -> AnyDesign:
+    def design_of(self, sample: InnerSample) -> AnyDesign:
         """The design of a sample of ω_b*(θ)."""
 
     @abstractmethod
@@ -110,7 +110,7 @@ class MixedBaseline(Baseline):
         omega = figures.bandwidth
         return Answer(design, omega, omega, np.asarray(slope, float), frequencies), spent
 
-    def design_of(self, sample: BandwidthSample) -> Sensitivities:
+    def design_of(self, sample: InnerSample) -> Sensitivities:
         return true_design(self.problem, sample.theta, sample.omega_S, sample.omega_T)
 
     def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
@@ -124,7 +124,7 @@ class MixedBaseline(Baseline):
 
 
 class StructuredBaseline(Baseline):
-    """Climbs from the anchors; climbs and multi-start searches are what it spends."""
+    """Climbs from the warm starts; climbs and multi-start searches are what it spends."""
 
     gradients = (Gradient.TOTAL,)
     swept = False
@@ -138,7 +138,7 @@ class StructuredBaseline(Baseline):
         slope = np.array(value.gradient)
         return Answer(value.design, value.bandwidth, value.value, slope), value.syntheses
 
-    def design_of(self, sample: BandwidthSample) -> SectionsDesign:
+    def design_of(self, sample: InnerSample) -> SectionsDesign:
         return structured_value(self.problem, sample.theta).design
 
     def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:

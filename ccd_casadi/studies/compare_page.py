@@ -128,7 +128,9 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
     nested = comparison.method("nested").solution
     if nested is not None:
         process = bandwidth_process(nested.outcome.surrogates)
-    if nested is not None and nested.verified is not None:  # its samples may be of its own anchors
+    if (
+        nested is not None and nested.verified is not None
+    ):  # its samples may be of its own warm starts
         problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, process, truths)

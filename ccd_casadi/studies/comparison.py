@@ -85,7 +85,7 @@ def compare(
     """Run every method, each with its own store and count.
 
     With a controller of fixed structure the descents and the sequential designs climb from the
-    anchors of the best formulation, and its search is not counted as theirs; the descent with K
+    warm starts of the best formulation, and its search is not counted as theirs; the descent with K
     held fixed sweeps weights, which sections do not have, and is left out.
 
     Parameters
@@ -115,7 +115,7 @@ def compare(
 def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
     """The problem with the design plant of the best formulation, where the case leaves it open.
 
-    And with what its search has added: anchors and plants of a fixed structure.
+    And with what its search has added: warm starts and plants of a fixed structure.
     """
     ends = [
         (method.figures["objective"], method.solution.verified.problem)
@@ -218,7 +218,7 @@ def _sequential(given: _Setting, name: str, starts: int) -> Method:
     )
     with given.store(name) as store:
         sampler = Sampler(problem, store, given.workers)
-        sample = sampler.bandwidths(np.array(hardware.theta))[0]
+        sample = sampler.values(np.array(hardware.theta))[0]
         trace = tuple(sampler.trace)
         spent = sampler.spent.by_purpose
         if not sample.feasible:

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, solve_program
-from ccd_casadi.inner_problem.constraints import constraint_sizes, unmet
+from ccd_casadi.inner_problem.constraints import constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics
@@ -89,7 +89,7 @@ def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> Hardw
         if abs(predicted / omega - 1.0) <= AGREED or np.isnan(omega):
             break
         known = (*known[1 - KNOWN :], theta)
-    met = bool(omega >= resonance * (1.0 - AGREED)) and not unmet(problem, point)
+    met = bool(omega >= resonance * (1.0 - AGREED)) and not violated(problem, point)
     return HardwareDesign(theta, hardware_cost(plant, point), omega, met)
 
 

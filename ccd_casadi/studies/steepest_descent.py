@@ -16,8 +16,8 @@ What the paper leaves open, and what is done here: θ is scaled to the unit box;
 and the descent ends when α falls under `smallest_step` of the box, when the projected gradient
 vanishes, or after `max_iterations`. The synthesis, its certificate, S_max and the case are ours.
 
-With a controller of fixed structure nothing is swept: ω_b*(θ) is that of the problem's anchors, and
-its envelope gradient the only one there is.
+With a controller of fixed structure nothing is swept: ω_b*(θ) is that of the problem's warm starts,
+and its envelope gradient the only one there is.
 """
 
 from collections.abc import Sequence

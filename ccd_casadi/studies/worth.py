@@ -51,8 +51,8 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     outer = outer_of(sampler).prepared(seed)
     sampler, problem = outer.sampler, outer.problem
     looks = (LOOKS_SLOW if slow else LOOKS) * len(problem.names)
-    known = sampler.bandwidths(np.array([hardware.theta, problem.start]), "first designs")
-    known += sampler.bandwidths(design("sobol", *box(problem), looks, seed), "global check")
+    known = sampler.values(np.array([hardware.theta, problem.start]), "first designs")
+    known += sampler.values(design("sobol", *box(problem), looks, seed), "global check")
     best = min(known, key=lambda sample: objective_of(problem, sample))
     missed: list[float] = []
     settled = False
@@ -71,7 +71,7 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
             expected = solve_program(program, starts).best
         except OuterFailure:  # the surrogate expects a feasible design nowhere
             break
-        new = sampler.bandwidths(expected.x, "the best expected")[0]
+        new = sampler.values(expected.x, "the best expected")[0]
         missed.append(
             abs(process.predict(expected.x[None])[0] - new.value) if new.feasible else 0.0
         )

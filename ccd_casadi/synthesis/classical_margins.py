@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.lti.closed_loop import open_alone
+from ccd_casadi.lti.closed_loop import equivalent_open_loop
 from ccd_casadi.support.arrays import Array
 
-Responses = Callable[[Array], tuple[NDArray, NDArray]]  # G (k, p, m) and K (k, m, p) at ω
+PlantAndController = Callable[[Array], tuple[NDArray, NDArray]]  # G (k, p, m) and K (k, m, p) at ω
 
 HALVINGS = 48  # of a bracket between two points of the grid: to rounding
 
@@ -75,13 +75,13 @@ def _at_least(values: Array, places: Array) -> float:
     return float(places[values.argmin()]) if values.size else np.inf
 
 
-def least_margins(respond: Responses, omega: Array) -> ClassicalMargins:
+def least_margins(respond: PlantAndController, omega: Array) -> ClassicalMargins:
     """The least of all loops broken one at a time at the plant's inputs."""
 
     def broken(i: int) -> Callable[[Array], NDArray[np.complex128]]:
         def L(at: Array) -> NDArray[np.complex128]:
             G, K = respond(at)
-            return open_alone(K @ G, i)
+            return equivalent_open_loop(K @ G, i)
 
         return L
 

@@ -38,7 +38,7 @@ def measure(
     return figures_from_row(row, weights.omega_S, weights.omega_T, w0)
 
 
-def handed_out(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
+def recertified_in_si(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
     """The design, no longer certified where the numbers of its controller in SI do not carry it.
 
     What is certified in a synthesis is the controller in the plant's own units. Where the loop

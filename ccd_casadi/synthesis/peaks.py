@@ -13,7 +13,7 @@ from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gradients import DesignPlant, Loop, peak_gradients
 from ccd_casadi.kernels.sensitivity import sensitivity_gain, sensitivity_gains
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.grid import around, climbed, frequency_grid, local_maxima
+from ccd_casadi.lti.grid import frequency_grid, local_maxima, refine_peak, root_flanks
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -93,7 +93,7 @@ def _peaks(
     Ak, Bk, Ck = (np.ascontiguousarray(part) for part in controller)
     Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
     poles = closed_loop(plant.system, StateSpace(Ak, Bk, Ck, Dk)).S.poles
-    near = around(poles[poles.imag > 0.0], FLANKS)
+    near = root_flanks(poles[poles.imag > 0.0], FLANKS)
     low, high = float(plant.grid[0]), float(plant.grid[-1])
     grid = np.ascontiguousarray(frequency_grid(low, high, 2, plant.grid, BROAD, near, apart=APART))
     G, K = prepare(plant.A, plant.B, plant.C), prepare(Ak, Bk, Ck)
@@ -101,7 +101,9 @@ def _peaks(
     found = []
     for i in local_maxima(gain):
         if gain[i] >= 0.98 * least:
-            omega, top = climbed(lambda w: sensitivity_gain(G, K, Dk, w), grid[i - 1], grid[i + 1])
+            omega, top = refine_peak(
+                lambda w: sensitivity_gain(G, K, Dk, w), grid[i - 1], grid[i + 1]
+            )
             if top >= least:
                 found.append((omega, top))
     return found

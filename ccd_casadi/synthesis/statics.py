@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.grid import climbed
+from ccd_casadi.lti.grid import refine_peak
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -96,9 +96,13 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
 
     >>> compliance_words(2e-6, 0.0, 5e-7, 1.0)
     '2 um/N at most, 0.5 um/N at 1 Hz, none at rest (an integrator)'
+    >>> compliance_words(64e-3, 59e-3, 5.5e-3, 1.0)
+    '64 mm/N at most, 5.5 mm/N at 1 Hz, 59 mm/N at rest'
     """
-    rest = f"{1e6 * at_rest:.4g} um/N at rest" if at_rest else "none at rest (an integrator)"
-    return f"{1e6 * most:.4g} um/N at most, {1e6 * low:.4g} um/N at {low_hz:.3g} Hz, {rest}"
+    unit, factor = ("mm/N", 1e3) if most >= 1e-3 else ("um/N", 1e6)
+    rest = f"{factor * at_rest:.4g} {unit} at rest" if at_rest else "none at rest (an integrator)"
+    at_low = f"{factor * low:.4g} {unit} at {low_hz:.3g} Hz"
+    return f"{factor * most:.4g} {unit} at most, {at_low}, {rest}"
 
 
 WITHIN = 1e-3  # relative: where the maximum is, from where the norm was found
@@ -119,7 +123,7 @@ def compliance_of(plant: ScaledPlant, controller: StateSpace) -> Compliance:
     gain, omega = hinf_norm(loop)
     if not np.isfinite(gain) or omega <= 0.0:
         return Compliance(gain, omega, plant)
-    at, top = climbed(
+    at, top = refine_peak(
         lambda w: float(gains(loop, np.array([w]))[0]),
         omega * np.exp(-WITHIN), omega * np.exp(WITHIN),
     )  # fmt: skip

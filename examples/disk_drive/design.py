@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure import (
     Structure,
     synthesise,
 )
-from ccd_casadi.fixed_structure.certificate import Certificate, certify
+from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.fixed_structure.design import Progress, problem_for
@@ -119,7 +119,7 @@ class ErrorDesign:
     structure: ChannelStructure
     kappa: np.ndarray
     errors: np.ndarray
-    judged: Certificate
+    judged: SetCertificate
 
 
 def least_error(

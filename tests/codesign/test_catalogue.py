@@ -27,7 +27,7 @@ from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
 from ccd_casadi.codesign.run_files import write_run
-from ccd_casadi.codesign.search import searched
+from ccd_casadi.codesign.search import search_outer
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
@@ -329,14 +329,14 @@ def test_what_sections_spend_is_counted_over_all_nodes(
 ) -> None:
     """They were solved on a sampler of their own, and a catalogue said "syntheses": 0."""
 
-    def formulated(outer: StructuredOuter, *_: object) -> FormulationResult:
+    def solve_formulation(outer: StructuredOuter, *_: object) -> FormulationResult:
         outer.sampler._spend("a design", 5, (60.0, 60.0), 12.0)
         return FormulationResult(message="nothing is feasible")
 
-    monkeypatch.setattr(StructuredOuter, "formulated", formulated)
-    monkeypatch.setattr(outer_structured, "seeded_and_prepared", lambda _, own, *__: (own, ""))
+    monkeypatch.setattr(StructuredOuter, "solve_formulation", solve_formulation)
+    monkeypatch.setattr(outer_structured, "with_initial_search", lambda _, own, *__: (own, ""))
     own = problem(controller=StructuredProblem())
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(own, store, Workers(1))
-        searched(StructuredOuter(sampler.of(own)), Direct(), 0)
+        search_outer(StructuredOuter(sampler.of(own)), Direct(), 0)
         assert sampler.syntheses == 6  # five designs and a multi-start search

@@ -12,7 +12,7 @@ from ccd_casadi.codesign.direct import Direct, acceptable
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.inner_problem.constraints import ACTIVE, MET, constraint_shares, touched, unmet
+from ccd_casadi.inner_problem.constraints import ACTIVE, MET, binding, constraint_shares, violated
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -59,7 +59,7 @@ def test_what_is_met_and_what_is_active_is_the_same_in_every_unit(
         shares = constraint_shares(case, theta)
         assert shares[0] == pytest.approx(share, rel=1e-3, abs=1e-13)
         assert shares[1] == pytest.approx((theta[0] - theta[1]) / 30.0, rel=1e-9, abs=1e-13)
-        found.append((unmet(case, theta), touched(case, theta)))
+        found.append((violated(case, theta), binding(case, theta)))
     assert found[0] == found[1] == found[2]
     assert ("least mass" in found[0][0]) == (share > MET)
     assert ("least mass" in found[0][1]) == (share >= -ACTIVE)

@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.spent import SynthesisCounts
 
 ROOT = Path(__file__).parents[2]
@@ -144,17 +144,17 @@ def test_nested_looks_around_the_only_feasible_sample(reach: float) -> None:
     centre, width = np.array([55.0, 62.5]), np.array([15.0, 15.0])
     asked: list[tuple[float, ...]] = []
 
-    def bandwidths(thetas: np.ndarray, *_: object) -> list[BandwidthSample]:
+    def values(thetas: np.ndarray, *_: object) -> list[InnerSample]:
         found = []
         for theta in map(tuple, np.atleast_2d(thetas).tolist()):
             inside = np.abs((theta - centre) / width).max() < reach
             value = 400.0 + theta[1] if inside else np.nan
             asked.append(theta)
-            found.append(BandwidthSample(theta, value, (0.0, 1.0), 1e3, 1e2, (), "", 0.0, 1))
+            found.append(InnerSample(theta, value, (0.0, 1.0), 1e3, 1e2, (), "", 0.0, 1))
         return found
 
     sampler = SimpleNamespace(
-        problem=case, bandwidths=bandwidths, spent=SynthesisCounts(), latest=list, raised=0
+        problem=case, values=values, spent=SynthesisCounts(), latest=list, improvements=0
     )
     options = Nested(points=3, starts=4, max_refinements=3)
     found = solve_nested(sampler, options, seed=0)  # type: ignore[arg-type]

@@ -24,7 +24,7 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.insight import main
 from ccd_casadi.reporting.insight import front_answer, front_figure
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -160,7 +160,7 @@ def test_the_lightest_may_be_the_fastest(truth_of: Callable[[CoDesignProblem], S
 class ErrorOverMasses:
     """A sampler and an outer problem in one, by hand: the error falls with both masses."""
 
-    quiet, syntheses, look_is_cheap = True, 0, True
+    quiet, syntheses, global_check_is_cheap = True, 0, True
     grid = np.array([[m1, m2] for m1 in range(55, 71) for m2 in range(55, 71)], float)
 
     def __init__(self, problem: CoDesignProblem) -> None:
@@ -169,15 +169,15 @@ class ErrorOverMasses:
     def of(self, problem: CoDesignProblem, **_: bool) -> "ErrorOverMasses":
         return ErrorOverMasses(problem)
 
-    def bandwidths(self, thetas: Array, _: str = "") -> list[BandwidthSample]:
+    def values(self, thetas: Array, _: str = "") -> list[InnerSample]:
         return [
-            BandwidthSample(tuple(theta), 300.0, (), np.nan, np.nan, (), "", 0.0, 0,
+            InnerSample(tuple(theta), 300.0, (), np.nan, np.nan, (), "", 0.0, 0,
                             error=float(1e-3 * (55.0 / theta[0] + 2.0 * (55.0 / theta[1]) ** 3)))
             for theta in np.atleast_2d(thetas)
         ]  # fmt: skip
 
-    def solved_from(self, *_: object) -> Place:
-        found = [objective_of(self.problem, one) for one in self.bandwidths(self.grid)]
+    def local_solve(self, *_: object) -> Place:
+        found = [objective_of(self.problem, one) for one in self.values(self.grid)]
         return Place(self.grid[int(np.argmin(found))], min(found), True)
 
     def theta_of(self, x: Array) -> Array:

@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.optim.pieces import Local, descend
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 
 J0 = -700.0
 SEEDS = st.integers(0, 2**32 - 1)
@@ -174,17 +174,17 @@ class Told:
     of: Pieces
     worth: float = 0.0  # of another controller, which is better for θ above the minimiser
 
-    def at(self, theta: np.ndarray) -> BandwidthSample:
+    def at(self, theta: np.ndarray) -> InnerSample:
         lower, width = np.array(self.case.lower), np.subtract(self.case.upper, self.case.lower)
         z = (np.asarray(theta) - lower) / width
         found = self.of.at(z)
         value = found.value - self.worth * max(0.0, float(z[0] - self.of.minimiser[0]))
         gradient = tuple(-found.gradient / width)
-        return BandwidthSample(
+        return InnerSample(
             tuple(map(float, theta)), -value, gradient, np.nan, np.nan, (), "", 0.0, 1
         )
 
-    def bandwidths(self, thetas: np.ndarray, label: str) -> list[BandwidthSample]:
+    def values(self, thetas: np.ndarray, label: str) -> list[InnerSample]:
         return [self.at(theta) for theta in np.atleast_2d(thetas)]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.codesign.result import with_verdict_line
-from ccd_casadi.codesign.verdict import Line, State
+from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Page
 from ccd_casadi.drawing.paint import page_html
@@ -93,7 +93,7 @@ def test_words_from_anywhere_stay_words_and_a_study_kept_apart_changes_no_run(tm
         (folder / name).write_text(page_html(Page(run_head("t", result, "", ""), ())))
     (folder / "other" / "result.json").write_text("{}")  # another run, below this one
     run, kept = run_in(folder, result), place.read_bytes()
-    line = Line(State.FAILED, r"</table><script>\1 \g<0>", {"figure": 1.0})
+    line = VerdictLine(State.FAILED, r"</table><script>\1 \g<0>", {"figure": 1.0})
     assert with_verdict_line(run, tmp_path / "elsewhere", "deployable", line) is run
     old = replace(run, result={k: v for k, v in result.items() if k != "verdict"})
     assert with_verdict_line(old, folder, "deployable", line) is old

@@ -52,12 +52,12 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     spent = (SimpleNamespace(),) * (rounds + 1)
     outcome = FormulationResult(end.x, spent, (process,), None, False, "")  # type: ignore[arg-type]
     outer = SimpleNamespace(
-        sampler=SimpleNamespace(spent=SynthesisCounts()), kkt_level=1e-4, may_try_again=False,
-        samples_of=lambda end, inputs: (np.array([end.value]), np.full((1, 1), np.nan)),
-        learnt=lambda outcome, end: Outer.learnt(outer, outcome, end),
+        sampler=SimpleNamespace(spent=SynthesisCounts()), kkt_level=1e-4, retries_pay=False,
+        training_samples=lambda end, inputs: (np.array([end.value]), np.full((1, 1), np.nan)),
+        with_training_sample=lambda outcome, end: Outer.with_training_sample(outer, outcome, end),
     )  # fmt: skip
-    monkeypatch.setattr(search, "look_over_box", lambda *_: SimpleNamespace(x=None))
+    monkeypatch.setattr(search, "global_check", lambda *_: SimpleNamespace(x=None))
     options = SimpleNamespace(box_points=0, max_refinements=rounds, tolerance=1e-3)
-    found = search._looked(search.Searched(outer, outcome, end, 1), options, 0)
+    found = search._looked(search.SearchResult(outer, outcome, end, 1), options, 0)
     assert search._missed(outcome, end) > 0.1
     assert (search._missed(found.outcome, end) < 1e-3) is (rounds > 0)

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign import peak_constraints
-from ccd_casadi.codesign.box_look import look_over_box
 from ccd_casadi.codesign.direct import true_objective as objective
+from ccd_casadi.codesign.global_check import global_check
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
@@ -113,8 +113,8 @@ def test_a_verification_synthesises_every_design_once(
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(), store, Workers(1))
         outer = MixedOuter(sampler)
-        end = outer.ended(at((62.0, 64.0, 500.0, 45.0)))
-        look_over_box(outer, end, 4, 0)
+        end = outer.polished(at((62.0, 64.0, 500.0, 45.0)))
+        global_check(outer, end, 4, 0)
         verified = outer.verified(end, 1)
     assert verified.feasible
     assert len(set(asked)) == len(asked)

@@ -10,7 +10,13 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
-from ccd_casadi.codesign.theta_joint import JointModel, Place, objectives_beside, proposed, together
+from ccd_casadi.codesign.theta_joint import (
+    JointModel,
+    JointPoint,
+    joint_search,
+    objectives_beside,
+    proposed,
+)
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
@@ -32,7 +38,7 @@ def built(start: tuple[float, float] = (55.0, 55.0)) -> CoDesignProblem:
     corners = uncertain_plant(problem, problem.start).corners()
     members = tuple((option, tuple(map(float, point))) for option, point in corners)
     kappa = tuple(STORED["sections"]["kappa"])
-    return replace(with_structured(problem, anchors=(kappa,), members=members), start=start)
+    return replace(with_structured(problem, warm_starts=(kappa,), scenarios=members), start=start)
 
 
 def test_what_the_first_order_leaves_out_is_of_second_order() -> None:
@@ -56,7 +62,8 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
     """Of peaks that move, along random directions, the frequency of each found anew."""
     omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
     problem, theta = built(), (60.0, 60.0)
-    model = JointModel(problem, nearby(problem, [theta], theta), Place(theta, stored, omega), 0.1)
+    at = JointPoint(theta, stored, omega)
+    model = JointModel(problem, nearby(problem, [theta], theta), at, 0.1)
     family, start = model.loops, model.start
     z, kappa, tau = model.parts(start)
     loops = family(z)
@@ -93,12 +100,12 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
     problem = built(start=(58.0, 57.0))
     with SampleStore(tmp_path / "samples.sqlite") as store:
         sampler = Sampler(problem, store, Workers(1))
-        first = sampler.bandwidths(np.array(problem.start))[0]
-        at = Place(first.theta, first.kappa, first.bandwidth)
+        first = sampler.values(np.array(problem.start))[0]
+        at = JointPoint(first.theta, first.kappa, first.bandwidth)
         models = nearby(problem, [at.theta], at.theta)
         promised, whole = (proposed(problem, models, at, 0.05, least) for least in (1e-7, 1e-10))
         assert promised.gain > 0.8 * whole.gain > 0.0
-        _, best, settled = together(sampler, np.array(problem.start))
+        _, best, settled = joint_search(sampler, np.array(problem.start))
         assert settled
         assert best.feasible
         assert objective_of(problem, best) < objective_of(problem, first) - 0.5 * promised.gain
@@ -106,14 +113,29 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         assert best.bandwidth >= 0.99 * 2.0 * np.pi * STORED["bandwidth_hz"]
         spent = sampler.spent.total
         other = Sampler(problem, store, Workers(1))
-        again = together(other, np.array(problem.start))[1]
+        again = joint_search(other, np.array(problem.start))[1]
         assert (again.theta, again.kappa) == (best.theta, best.kappa)  # all from the store
         assert other.spent.total == spent
         # Beside it J is told by plants to first order as by true ones, but for their curvature.
         there = np.array(best.theta) + 0.03 * np.array([[1, 0], [0, 1], [1, 1]])
         told = objectives_beside(problem, best, there)
-        true = [objective_of(problem, one) for one in sampler.bandwidths(there)]
+        true = [objective_of(problem, one) for one in sampler.values(there)]
         assert told == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
+
+
+def test_a_step_to_where_masses_are_no_longer_positive_is_no_step() -> None:
+    """As placed masses do, whose M to first order is indefinite far away."""
+    problem, theta = built(), (60.0, 60.0)
+    found = mechanics(plant_of(problem), theta)
+    falling = replace(found, derivatives=(np.array([-found.M, -found.M]), *found.derivatives[1:]))
+    at = JointPoint(theta, tuple(STORED["sections"]["kappa"]), 2.0 * np.pi * 20.0)
+    model = JointModel(problem, [lambda z: to_first_order(falling, np.array(z) - theta)], at, 0.3)
+    far = model.start.copy()
+    far[:2] += 0.2  # of the box: some kilograms, at a loss of all mass for each
+    with pytest.raises(np.linalg.LinAlgError):
+        model.loops(far[:2])
+    assert model.at(far) is None
+    assert model.at(model.start) is not None
 
 
 def test_where_each_theta_is_dear_none_is_sampled() -> None:

@@ -16,11 +16,11 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.box_look import _starts
 from ccd_casadi.codesign.direct import acceptable
 from ccd_casadi.codesign.direct import true_objective as objective
-from ccd_casadi.codesign.formulation import BoxLook
+from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.formulations import formulation_of
+from ccd_casadi.codesign.global_check import _starts
 from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
@@ -37,7 +37,7 @@ from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting import verdict as shown
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from ccd_casadi.synthesis.statics import Statics
@@ -61,9 +61,11 @@ SOUND = Survival(
 )
 
 
-def optimal_line(residual: float, gap: float = 0.0, look: BoxLook | None = None) -> v.Line:
+def optimal_line(
+    residual: float, gap: float = 0.0, look: GlobalCheck | None = None
+) -> v.VerdictLine:
     kkt = KktCertificate(residual, 0.0, 0.0, {}, (), None, ())
-    known, _ = v.look_words(16, 2, look)
+    known, _ = v.search_evidence(16, 2, look)
     return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", known=known)
 
 
@@ -86,7 +88,7 @@ def test_a_better_inner_design_fails_the_line() -> None:
 
 
 def test_the_look_at_the_box_is_said() -> None:
-    look = BoxLook(32, 12, 3, 4, 0, -290.0, -350.0, np.zeros(4))
+    look = GlobalCheck(32, 12, 3, 4, 0, -290.0, -350.0, np.zeros(4))
     words = optimal_line(1e-9, look=look).words
     assert "-290" in words
     assert "32 spread theta" in words
@@ -289,7 +291,7 @@ def test_local_solves_start_from_more_than_what_beats_its_neighbours() -> None:
     case = problem()
     thetas = design("sobol", np.array(case.lower), np.array(case.upper), 16, 0)
     samples = [
-        BandwidthSample(tuple(theta), 1.0, (0.0, 0.0), 1.0, 1.0, (), "", 0.0, 1)
+        InnerSample(tuple(theta), 1.0, (0.0, 0.0), 1.0, 1.0, (), "", 0.0, 1)
         for theta in thetas
     ]  # fmt: skip
     values = ((thetas - np.array(case.lower)) ** 2).sum(axis=1)  # one basin, one lowest point

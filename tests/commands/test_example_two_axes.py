@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import channel_words
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_search import prepared
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.errors import UserError
 
 ROOT = Path(__file__).parents[2]
@@ -76,7 +76,7 @@ def test_the_table_of_the_docs(
         assert shown[2] in README
         assert own["S_max"] == 1.5
         assert "(S_max 1.5)" in channel_words(own)
-        assert "(at least 1.25 omega_b)" in channel_words(own)
+        assert "(at least 1.25 ω_b)" in channel_words(own)
         assert "S_max of channel tilt" in active_of(made)
 
 
@@ -84,12 +84,12 @@ def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
     """ω_b*(h) is the least of two: an optimum at their kink is seen to be one."""
     problem = as_shipped()[0]
 
-    def at(h: float) -> tuple[BandwidthSample, Envelope | None]:
+    def at(h: float) -> tuple[InnerSample, Envelope | None]:
         value = structured_value(problem, (h,))
-        own = BandwidthSample((h,), value.bandwidth, value.gradient, np.nan, np.nan, (), "", 0.0, 1)
+        own = InnerSample((h,), value.bandwidth, value.gradient, np.nan, np.nan, (), "", 0.0, 1)
         return own, value.envelope
 
-    def meeting(first: BandwidthSample, second: BandwidthSample) -> float:
+    def meeting(first: InnerSample, second: InnerSample) -> float:
         """Where the tangents of both sides cross."""
         (a,), (b,) = first.theta, second.theta
         (down,), (up,) = first.gradient, second.gradient

@@ -17,14 +17,14 @@ from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.codesign import outer as outer_room
 from ccd_casadi.codesign.design_entries import controller_dict, figures_dict
 from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.run import OUTERS, solve
-from ccd_casadi.codesign.verdict import Line, State, look_words
+from ccd_casadi.codesign.verdict import State, VerdictLine, search_evidence
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import Bounds
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem
 from ccd_casadi.inner_problem.kinds import KINDS, InnerKind
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
@@ -153,20 +153,20 @@ class VerifiedRule(Verified):
     def controller_entry(self) -> dict[str, Any]:
         return controller_dict(self.made)
 
-    def certified_line(self) -> Line:
+    def certified_line(self) -> VerdictLine:
         state = State.PASSED if self.feasible else State.FAILED
-        return Line(state, "stable and within S_max and S_low on the model", {})
+        return VerdictLine(state, "stable and within S_max and S_low on the model", {})
 
-    def survives_line(self) -> Line:
-        return Line(State.UNKNOWN, "not looked at", {})
+    def survives_line(self) -> VerdictLine:
+        return VerdictLine(State.UNKNOWN, "not looked at", {})
 
     def gap_words(self) -> str:
         return ""
 
     def searched(
-        self, outcome: FormulationResult, look: BoxLook | None
+        self, outcome: FormulationResult, look: GlobalCheck | None
     ) -> tuple[str, Mapping[str, Any]]:
-        return look_words(1, 1, look)
+        return search_evidence(1, 1, look)
 
 
 # 4. The outer problem.
@@ -176,7 +176,7 @@ class RuleOuter(ThetaOuter):
     def verified(self, end: outer_room.End, rounds: int) -> VerifiedRule:
         theta = tuple(map(float, self.theta_of(end.x)))
         K, figures = ByRule(self.problem).at(theta)
-        feasible = self.problem.inner.feasible(figures) and not unmet(self.problem, theta)
+        feasible = self.problem.inner.feasible(figures) and not violated(self.problem, theta)
         return VerifiedRule(
             problem=self.problem, theta=theta, value=end.value, objective=end.objective,
             hardware_cost=hardware_cost(plant_of(self.problem), theta), kkt=end.kkt,

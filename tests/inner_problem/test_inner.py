@@ -11,7 +11,7 @@ from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant, true_inner
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import (
-    InnerProblem,
+    InnerBounds,
     InnerResult,
     InnerStatus,
     active_constraints,
@@ -24,7 +24,7 @@ from ccd_casadi.synthesis.synthesis import sweep
 BUDGET = 40
 
 
-def check_result(result: InnerResult, inner: InnerProblem) -> None:
+def check_result(result: InnerResult, inner: InnerBounds) -> None:
     """Feasible, counted, named by what binds, and stationary in what does not."""
     assert result.status is InnerStatus.SOLVED
     assert result.optimum is not None
@@ -40,7 +40,7 @@ def check_result(result: InnerResult, inner: InnerProblem) -> None:
     assert result.active  # ω_b grows with ω_S: something must bind
 
 
-def compare(theta: tuple[float, float], inner: InnerProblem) -> float:
+def compare(theta: tuple[float, float], inner: InnerBounds) -> float:
     """Difference of the two methods, relative; the search's budget is checked on the way."""
     plant = two_mass(*theta)
     swept, searched = (solve(plant, PAPER, inner) for solve in (sweep_inner, search_inner))

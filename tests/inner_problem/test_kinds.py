@@ -40,7 +40,7 @@ SYNTHESISE = [  # every way to a controller
     (structured_bandwidth, "synthesise"), (structured_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design
-    "mixed": (outer_mixed, "kkt_certificate"), "sections": (outer_structured, "worst_members"),
+    "mixed": (outer_mixed, "kkt_certificate"), "sections": (outer_structured, "worst_case"),
 }  # fmt: skip
 EVERY = {  # beside the schema's
     "compliance_max", "compliance_words", "cost_unit", "force_step_max", "globality", "iterates",
@@ -122,7 +122,7 @@ def test_the_gradient_is_the_slope(run: Run, tmp_path: Path) -> None:
     theta, way, h = np.array([60.3, 59.1]), np.array([0.8, 0.6]), 0.02
     with Workers(1) as pool, SampleStore(tmp_path / "samples.sqlite") as store:
         points = np.array([theta, theta + h * way, theta - h * way])
-        here, *ends = sampler.Sampler(case, store, pool).bandwidths(points)
+        here, *ends = sampler.Sampler(case, store, pool).values(points)
     numeric = (ends[0].value - ends[1].value) / (2.0 * h)
     assert np.array(here.gradient) @ way == pytest.approx(numeric, rel=1e-3)
 

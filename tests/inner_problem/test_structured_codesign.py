@@ -22,10 +22,10 @@ from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
 from ccd_casadi.inner_problem.structured_robustness import (
-    judged_corners,
-    judged_widely,
+    certify_corners,
+    certify_lattice,
     tolerance_prices,
-    worst_members,
+    worst_case,
 )
 from ccd_casadi.inner_problem.structured_search import ENOUGH, prepared, with_range
 from ccd_casadi.sampling.sampler import Sampler
@@ -80,7 +80,7 @@ def test_the_price_of_a_tolerance_is_what_another_solve_finds(anchored: CoDesign
             damping=(1.0 - 0.4 * damping, 1.0 + 0.5 * damping),
             gain=0.05 * gain,
         )
-        return with_structured(anchored, uncertainty=own, members=())
+        return with_structured(anchored, uncertainty=own, scenarios=())
 
     here = structured_value(wider(), theta)
     prices = tolerance_prices(wider(), theta, here.design)
@@ -102,7 +102,7 @@ def test_a_theta_has_one_value_whoever_asks(anchored: CoDesignProblem, tmp_path:
 
     def asked(order: list[int], workers: int, name: str) -> list[tuple]:
         with Workers(workers) as pool, SampleStore(tmp_path / name) as store:
-            found = Sampler(anchored, store, pool).bandwidths(thetas[order])
+            found = Sampler(anchored, store, pool).values(thetas[order])
         return [(s.theta, s.bandwidth, s.gradient, s.kappa) for s in found]
 
     first = asked([0, 1], 1, "a.sqlite")
@@ -147,14 +147,14 @@ def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) 
     """The judge on two hundred plants between and beside those that were designed for."""
     theta = anchored.start
     made = structured_value(anchored, theta).design
-    worst, missing = worst_members(anchored, theta, made)
+    worst, missing = worst_case(anchored, theta, made)
     assert not missing
     assert made.controller is not None
-    judged, plants = judged_widely(anchored, theta, made.controller, worst)
+    judged, plants = certify_lattice(anchored, theta, made.controller, worst)
     assert judged.passed
     assert plants > 200
     wild = replace(made.controller, C=1.2 * made.controller.C)
-    assert not judged_corners(anchored, theta, wild).passed
+    assert not certify_corners(anchored, theta, wild).passed
 
 
 def test_the_range_of_frequencies_is_that_of_the_start() -> None:
@@ -201,15 +201,15 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def raced(case: CoDesignProblem, *_: object) -> tuple[CoDesignProblem, SimpleNamespace]:
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
-        return with_structured(case, anchors=((case.inner.S_max,),)), design
+        return with_structured(case, warm_starts=((case.inner.S_max,),)), design
 
     monkeypatch.setattr(outer_structured, "prepared", raced)
     case = quick(PID)
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
             asked = replace(case, inner=replace(case.inner, S_max=bound))
-            found, words = outer_structured.seeded_and_prepared(store, asked, 0, True)
-            assert (structured_of(found).anchors, words) == (
+            found, words = outer_structured.with_initial_search(store, asked, 0, True)
+            assert (structured_of(found).warm_starts, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip
 
@@ -226,8 +226,8 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
 
     monkeypatch.setattr(structured_bandwidth, "searched", counted)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
-        alone = Sampler(with_structured(anchored, anchors=()), store, pool)
-        first = alone.bandwidths(np.array(anchored.start))[0]
+        alone = Sampler(with_structured(anchored, warm_starts=()), store, pool)
+        first = alone.values(np.array(anchored.start))[0]
         best = pieces_from(alone, first, 1e-3, 0.1)
     assert best.value >= first.value * (1.0 - 1e-6)
     assert sum(starts is not None for starts in searches) == 1

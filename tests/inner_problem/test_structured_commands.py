@@ -35,7 +35,7 @@ from ccd_casadi.limitations.basis import Basis
 from ccd_casadi.limitations.of_problem import limits_of_problem
 from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.robustness import main as robustness_main
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
@@ -232,7 +232,7 @@ def test_responses_against_differences(folder: Path) -> None:
     """dω_b*/dS_max, and dJ*/dp at a θ whose bounds hold it, by two other designs."""
     run = read_run(folder / "run")
     made = structured_value(run.problem, run.theta)
-    sample = BandwidthSample(
+    sample = InnerSample(
         run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1
     )
     found = structured_responses(run.problem, sample, made)

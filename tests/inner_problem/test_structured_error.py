@@ -17,14 +17,14 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
-from ccd_casadi.codesign.outer_structured import seeded_and_prepared
+from ccd_casadi.codesign.outer_structured import with_initial_search
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 from surrogates.retrain import main as retrain
@@ -47,9 +47,9 @@ def least(sampling: Sampling | None = None, **changes: object) -> CoDesignProble
 
 def anchored(case: CoDesignProblem, folder: Path) -> CoDesignProblem:
     with SampleStore(folder / "anchors.sqlite") as store:
-        found, words = seeded_and_prepared(store, case, 0, True)
+        found, words = with_initial_search(store, case, 0, True)
         assert not words
-        assert seeded_and_prepared(store, case, 0, True) == (found, "")
+        assert with_initial_search(store, case, 0, True) == (found, "")
     return found
 
 
@@ -61,7 +61,7 @@ def test_the_gradient_is_the_slope_of_the_least_error(
 ) -> None:
     case = anchored(least(sampling), tmp_path)
     assert isinstance(case.controller, StructuredProblem)
-    assert case.controller.error_anchors
+    assert case.controller.error_warm_starts
     theta, h = np.array([61.0, 59.0]), 0.05
     value = structured_value(case, theta)
     assert value.feasible
@@ -103,7 +103,7 @@ def test_too_much_bandwidth_is_said(tmp_path: Path) -> None:
 
 def test_j_counts_the_error_where_a_sample_has_one() -> None:
     case = least()
-    sample = BandwidthSample((60.0, 61.0), 50.0, (0.0, 0.0), np.nan, np.nan, (), "", 0.0, 1)
+    sample = InnerSample((60.0, 61.0), 50.0, (0.0, 0.0), np.nan, np.nan, (), "", 0.0, 1)
     assert sample.value == 50.0
     assert objective_of(case, replace(sample, error=2e-7)) == pytest.approx(0.01 * 121.0 + 0.2)
 

@@ -7,9 +7,9 @@ import pytest
 
 from ccd_casadi.fixed_structure.certificate import sampled as judged
 from ccd_casadi.lti.closed_loop import closed_loop, responses_of
-from ccd_casadi.lti.grid import around, climbed, frequency_grid, local_maxima
+from ccd_casadi.lti.grid import frequency_grid, local_maxima, refine_peak, root_flanks
 from ccd_casadi.lti.hold import Sampling, in_w, sampled, transfer, tustin
-from ccd_casadi.lti.loop import Loop, over
+from ccd_casadi.lti.loop import Loop, at_instants
 from ccd_casadi.lti.state_space import StateSpace
 
 OMEGA = np.geomspace(0.1, 50.0, 40)
@@ -71,7 +71,7 @@ def test_zeros_and_series() -> None:
 
 def test_a_held_loop_equals_the_continuous_one_at_its_instants() -> None:
     loop = closed_loop(system(7, 3, 1, 1), system(8, 2, 1, 1))
-    coarse, fine = over(loop, 0.4), over(loop, 0.1)
+    coarse, fine = at_instants(loop, 0.4), at_instants(loop, 0.1)
     A = np.linalg.matrix_power(fine.A, 4)
     np.testing.assert_allclose(coarse.A, A, atol=1e-12)
     steps = sum(np.linalg.matrix_power(fine.A, i) for i in range(4))
@@ -80,7 +80,7 @@ def test_a_held_loop_equals_the_continuous_one_at_its_instants() -> None:
 
 def test_a_grid_holds_its_resonances_and_a_climb_ends_on_top() -> None:
     roots = np.array([-0.01 + 3.0j, -0.01 - 3.0j])
-    grid = frequency_grid(0.1, 10.0, 30, around(roots), np.array([np.nan, 20.0]), apart=1e-6)
+    grid = frequency_grid(0.1, 10.0, 30, root_flanks(roots), np.array([np.nan, 20.0]), apart=1e-6)
     assert (np.diff(grid) > 1e-6 * grid[1:]).all()
     assert np.isin(3.0, grid)
     assert grid[-1] == pytest.approx(10.0)
@@ -90,6 +90,6 @@ def test_a_grid_holds_its_resonances_and_a_climb_ends_on_top() -> None:
 
     values = np.array([gain(omega) for omega in grid])
     (top,) = local_maxima(values)
-    at, height = climbed(gain, grid[top - 1], grid[top + 1])
+    at, height = refine_peak(gain, grid[top - 1], grid[top + 1])
     assert at == pytest.approx(np.sqrt(9.0 - 0.0002), rel=1e-7)
     assert height >= values.max()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.plants.cad import draw_morph
-from ccd_casadi.plants.cad.boundary import Boundary, Piece, paired
+from ccd_casadi.plants.cad.boundary import Boundary, Piece, matched
 from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
 from ccd_casadi.support.errors import MissingPackage, PlantError, require
 
@@ -102,7 +102,7 @@ def bar(length: float, names: dict[int, int]) -> Boundary:
 
 
 def test_pieces_numbered_anew_are_found_again() -> None:
-    found = paired(bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}), bar(1.2, {1: 8, 2: 7, 3: 6, 4: 5}))
+    found = matched(bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}), bar(1.2, {1: 8, 2: 7, 3: 6, 4: 5}))
     assert (found.corners, found.edges, found.faces) == ({1: 8, 2: 7}, {3: 6}, {4: 5})
     assert not found.reversed
 
@@ -110,11 +110,11 @@ def test_pieces_numbered_anew_are_found_again() -> None:
 def test_an_edge_that_runs_the_other_way_is_turned() -> None:
     one, other = (bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}) for _ in range(2))
     turned = Piece("Line", other.edges[3].rim, other.edges[3].points[::-1])
-    assert paired(one, Boundary(other.corners, {3: turned}, other.faces)).reversed == {3}
+    assert matched(one, Boundary(other.corners, {3: turned}, other.faces)).reversed == {3}
 
 
 def test_a_face_of_another_kind_is_refused() -> None:
     one, other = (bar(1.0, {1: 1, 2: 2, 3: 3, 4: 4}) for _ in range(2))
     bent = Piece("Cylinder", other.faces[4].rim, other.faces[4].points)
     with pytest.raises(PlantError, match=r"the face \(Plane\) at .* has no counterpart"):
-        paired(one, Boundary(other.corners, other.edges, {4: bent}))
+        matched(one, Boundary(other.corners, other.edges, {4: bent}))

@@ -119,7 +119,7 @@ def test_elsewhere_on_the_kink_the_beam_is_not_optimal(anchored: CoDesignProblem
     """A lighter beam, the best of its volume: on the kink, but more material would help."""
     found = kink(anchored, 0.0597)
     with Workers(1) as pool, SampleStore(Path(":memory:")) as store:
-        sample = Sampler(anchored, store, pool).bandwidths(np.array(found.theta))[0]
+        sample = Sampler(anchored, store, pool).values(np.array(found.theta))[0]
     certificate = theta_kkt(anchored, sample, envelope=found.envelope)
     assert certificate.active == ()
     assert certificate.stationarity > 0.1

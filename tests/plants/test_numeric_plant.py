@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, solve_program
-from ccd_casadi.plants.differenced import own_plant
+from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.plant import build_plant, constraint_values, hardware_cost
 from ccd_casadi.solve import main
 from ccd_casadi.support.errors import PlantError
@@ -48,7 +48,7 @@ def test_differences_are_the_exact_derivatives_up_to_the_bounds(a: float, b: flo
         low + share * (high - low) for low, high, share in zip(LOWER, UPPER, (a, b), strict=True)
     ]
     exact = build_plant(model, NAMES, {})
-    plant = own_plant(numbers_only, NAMES, {}, LOWER, UPPER)
+    plant = user_plant(numbers_only, NAMES, {}, LOWER, UPPER)
     assert "takes numbers only" in plant.notes(theta)[0]
     expected, found = exact.evaluate(theta), plant.evaluate(theta)
     width = np.subtract(UPPER, LOWER)[:, None, None]
@@ -75,7 +75,7 @@ def test_the_function_is_never_asked_outside_the_bounds() -> None:
         asked.append((float(theta["m"]), float(theta["t"])))
         return numbers_only(theta)
 
-    plant = own_plant(watched, NAMES, {}, LOWER, UPPER)
+    plant = user_plant(watched, NAMES, {}, LOWER, UPPER)
     asked.clear()
     for theta in (LOWER, UPPER):
         plant.evaluate(theta)
@@ -86,7 +86,7 @@ def test_the_function_is_never_asked_outside_the_bounds() -> None:
 
 def test_the_error_told_is_above_the_true_one_and_shows_noise() -> None:
     theta = (1.7, 3e-3)
-    plant = own_plant(numbers_only, NAMES, {}, LOWER, UPPER)
+    plant = user_plant(numbers_only, NAMES, {}, LOWER, UPPER)
     told = float(plant.notes(theta)[0].split("at most ")[1].split()[0])
     assert 1e-12 < told < 1e-4
     rng = np.random.default_rng(0)
@@ -95,12 +95,12 @@ def test_the_error_told_is_above_the_true_one_and_shows_noise() -> None:
         found = numbers_only(theta)
         return found | {"stiffness": found["stiffness"] * (1.0 + 1e-5 * rng.normal())}
 
-    words = own_plant(noisy, NAMES, {}, LOWER, UPPER).notes(theta)[0]
+    words = user_plant(noisy, NAMES, {}, LOWER, UPPER).notes(theta)[0]
     assert float(words.split("at most ")[1].split()[0]) > 1e-4
 
 
 def test_a_model_of_symbols_stays_exact_and_one_with_a_moving_ratio_is_refused() -> None:
-    assert own_plant(model, NAMES, {}, LOWER, UPPER).notes((2.0, 3e-3)) == ()
+    assert user_plant(model, NAMES, {}, LOWER, UPPER).notes((2.0, 3e-3)) == ()
 
     def moving(theta):
         found = numbers_only(theta)
@@ -108,14 +108,14 @@ def test_a_model_of_symbols_stays_exact_and_one_with_a_moving_ratio_is_refused()
         del found["damping"]
         return found | {"damping_ratio": 0.01 * theta["m"]}
 
-    plant = own_plant(moving, NAMES, {}, LOWER, UPPER)
+    plant = user_plant(moving, NAMES, {}, LOWER, UPPER)
     with pytest.raises(PlantError, match="damping_ratio changes with theta"):
         plant.evaluate((2.0, 3e-3))
 
 
 def test_ipopt_finds_the_least_cost_of_a_numeric_plant_as_of_the_exact_one() -> None:
     ends = []
-    for plant in (build_plant(model, NAMES, {}), own_plant(numbers_only, NAMES, {}, LOWER, UPPER)):
+    for plant in (build_plant(model, NAMES, {}), user_plant(numbers_only, NAMES, {}, LOWER, UPPER)):
         theta = ca.MX.sym("theta", 2)
         f, lam = plant.hardware(theta)
         program = NonlinearProgram(

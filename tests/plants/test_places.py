@@ -17,7 +17,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.plants.nodes import Between
+from ccd_casadi.plants.nodes import NodeInterpolation
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, mechanics
 from ccd_casadi.support.errors import PlantError
@@ -55,7 +55,7 @@ inside = st.tuples(st.floats(-0.25, 0.25), st.floats(-0.15, 0.15))
 @few(20)
 @given(inside, st.integers(0, 99))
 def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed: int) -> None:
-    between, point = Between(np.array(GRID)), np.array(at)
+    between, point = NodeInterpolation(np.array(GRID)), np.array(at)
     rng = np.random.default_rng(seed)
     a, b, c = rng.normal(), rng.normal(size=2), rng.normal(size=(2, 2))
 

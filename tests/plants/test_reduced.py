@@ -11,7 +11,7 @@ from ccd_casadi.case_studies.rib_stage.geometry import Geometry, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE
 from ccd_casadi.case_studies.rib_stage.model import RibStage
 from ccd_casadi.case_studies.rib_stage.plant import plant_of_stage
-from ccd_casadi.plants.plant import Mechanics, near
+from ccd_casadi.plants.plant import Mechanics, nearby_model
 from ccd_casadi.support.arrays import Array
 
 HERE = np.array([1.2e-3, 3.3e-3, 5e-3, 5e-3, 14e-3, 74e-3])
@@ -82,7 +82,7 @@ def test_a_plant_evaluates_it_in_its_own_order_of_parameters() -> None:
     names = ("H", "h", "t_o", "t_i", "t_c", "x_i")
     plant, place = plant_of_stage(BARE, names), [4, 0, 1, 2, 3, 5]
     there = HERE[place] + 0.1 * STEP[place]
-    told, true = near(plant, [HERE[place]], HERE[place])(there), plant.evaluate(there)
+    told, true = nearby_model(plant, [HERE[place]], HERE[place])(there), plant.evaluate(there)
     np.testing.assert_allclose(frequencies(told), frequencies(true), rtol=1e-3)
     np.testing.assert_allclose(
         told.derivatives[2], true.derivatives[2], atol=0.1 * np.abs(true.derivatives[2]).max()

@@ -27,7 +27,7 @@ def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> 
     for name, pool in (("serial", Workers(1)), ("dask", Cluster(shared.address))):
         with SampleStore(tmp_path / name) as store, pool as workers:
             sampler = Sampler(problem(), store, workers)
-            bandwidths = sampler.bandwidths(THETAS)
+            bandwidths = sampler.values(THETAS)
             quantities = sampler.quantities(X)
         bits = [(sample.values.tobytes(), sample.gradients.tobytes()) for sample in quantities]
         found.append((bandwidths, bits, sampler.syntheses, table(tmp_path / name)))

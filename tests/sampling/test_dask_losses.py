@@ -64,7 +64,7 @@ class Counted(SampleStore):
 
 def serial(path: Path, thetas: np.ndarray) -> dict[str, list[tuple[Any, ...]]]:
     with SampleStore(path) as store:
-        Sampler(problem(), store, Workers(1)).bandwidths(thetas)
+        Sampler(problem(), store, Workers(1)).values(thetas)
     return table(path)
 
 
@@ -97,7 +97,7 @@ def test_killed_workers_lose_no_sample_and_double_none(nannies: Processes, tmp_p
             sampler = Sampler(problem(), store, cluster)
             while killer.is_alive():
                 batches.append(box.uniform(55.0, 70.0, (20, 2)))
-                found = sampler.bandwidths(batches[-1])
+                found = sampler.values(batches[-1])
                 assert [sample.theta for sample in found] == [tuple(t) for t in batches[-1]]
         finally:
             finished.set()

@@ -128,7 +128,7 @@ if __name__ == "__main__":
     problem = problem_of(load_case({str(TWO_MASS)!r}))
     with SampleStore(sys.argv[1]) as store, Workers(int(sys.argv[2])) as workers:
         sampler = Sampler(problem, store, workers)
-        sampler.bandwidths(np.random.default_rng(0).uniform(55.0, 70.0, (40, 2)))
+        sampler.values(np.random.default_rng(0).uniform(55.0, 70.0, (40, 2)))
         print(sampler.syntheses)
 """
 

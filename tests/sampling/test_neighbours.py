@@ -30,7 +30,7 @@ def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
         case, _, key, theta = task
         sections, z = case.controller, (theta[0] - 55.0) / 15.0
         assert isinstance(sections, StructuredProblem)
-        known = {*sections.anchors, *sections.error_anchors}
+        known = {*sections.warm_starts, *sections.error_warm_starts}
         kappa = GOOD if GOOD in known or z < cliff else POOR
         value, slope = 250.0 + 10.0 * z, 10.0
         if kappa == GOOD:
@@ -48,7 +48,7 @@ def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
 
 
 def two_branches(**changes: object) -> CoDesignProblem:
-    sections = replace(StructuredProblem(anchors=(POOR,)), **changes)  # type: ignore[arg-type]
+    sections = replace(StructuredProblem(warm_starts=(POOR,)), **changes)  # type: ignore[arg-type]
     return problem(controller=sections, w1=0.0, w2=-1.0 if "minimise" not in changes else 1e6)
 
 
@@ -59,7 +59,7 @@ def test_a_cliff_is_passed_by_its_controller(cliff: float) -> None:
     with pytest.MonkeyPatch.context() as patch, SampleStore(":memory:") as store:
         patch.setattr(module, "inner_unit", branches(cliff, asked))
         sampler = Sampler(two_branches(), store, Workers(1))
-        best = pieces_from(sampler, sampler.bandwidths(np.array([55.0, 60.0]))[0], 1e-9)
+        best = pieces_from(sampler, sampler.values(np.array([55.0, 60.0]))[0], 1e-9)
     assert best.theta[0] == pytest.approx(55.0 + 15.0 * SLOPE / 80.0, abs=0.02)
     assert best.kappa == GOOD
     assert len(asked) < 60
@@ -77,8 +77,8 @@ def test_what_falls_short_of_its_neighbours_is_climbed_from_them(
     for _ in range(2):
         with SampleStore(tmp_path / "s.sqlite") as store:
             sampler = Sampler(two_branches(**changes), store, Workers(1))
-            sampler.bandwidths(thetas)
-            sampler.bandwidths(thetas[3] + 0.1)
+            sampler.values(thetas)
+            sampler.values(thetas[3] + 0.1)
             runs.append((list(sampler.solved.values()), sampler.syntheses))
     at = {round((one.theta[0] - 55.0) / 15.0, 3): one.kappa for one in runs[0][0]}
     assert {kappa for z, kappa in at.items() if 0.35 < z < 0.65} == {GOOD}
@@ -94,8 +94,8 @@ def test_a_controller_given_for_a_theta_counts_where_it_is_better(
     with SampleStore(":memory:") as store:
         sampler = Sampler(two_branches(), store, Workers(1))
         theta = (60.0, 60.0)
-        poor = sampler.bandwidths(np.array(theta))[0]
-        assert sampler.climbed(theta, POOR) == poor
-        good = sampler.climbed(theta, GOOD)
+        poor = sampler.values(np.array(theta))[0]
+        assert sampler.value_from(theta, POOR) == poor
+        good = sampler.value_from(theta, GOOD)
     assert (poor.kappa, good.kappa) == (POOR, GOOD)
     assert sampler.latest([poor]) == [good]

@@ -42,7 +42,7 @@ def sampled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Sa
     path = tmp_path_factory.mktemp("sampled") / "s.sqlite"
     with SampleStore(path) as store:
         sampler = Sampler(problem(), store, Workers(1))
-        sampler.bandwidths(THETAS)
+        sampler.values(THETAS)
         sampler.quantities(X)
         yield path, sampler
 
@@ -61,13 +61,13 @@ def test_rows_do_not_depend_on_the_number_of_workers(
     with Workers(2) as workers:
         with SampleStore(tmp_path / "s.sqlite") as store:
             sampler = Sampler(problem(), store, workers)
-            bandwidths = sampler.bandwidths(THETAS)
+            bandwidths = sampler.values(THETAS)
             quantities = sampler.quantities(X)
             assert sampler.syntheses == first.syntheses
         with SampleStore(tmp_path / "other.sqlite") as store:
             shuffled = Sampler(problem(), store, workers).quantities(X[order])
     assert [sample.x for sample in shuffled] == [tuple(x) for x in X[order]]
-    assert bandwidths == first.bandwidths(THETAS)
+    assert bandwidths == first.values(THETAS)
     for ours, theirs in zip(quantities, first.quantities(X), strict=True):
         assert ours.x == theirs.x
         assert ours.values.tobytes() == theirs.values.tobytes()
@@ -87,24 +87,24 @@ def test_nothing_is_computed_twice(
     with SampleStore(path) as store:
         sampler = Sampler(problem(), store, Workers(1))
         assert sampler.syntheses == 0
-        turned = sampler.bandwidths(THETAS[::-1])
-        sampler.bandwidths(THETAS[[0, 0, 2]])
+        turned = sampler.values(THETAS[::-1])
+        sampler.values(THETAS[[0, 0, 2]])
         sampler.quantities(np.vstack([X, X]))
         assert sampler.syntheses == spent, "what was found counts as what was computed"
         with pytest.raises(AssertionError, match="known already"):
-            sampler.bandwidths([[61.0, 61.0]])
+            sampler.values([[61.0, 61.0]])
     assert [sample.theta for sample in turned] == [tuple(row) for row in THETAS[::-1]]
-    assert turned[::-1] == first.bandwidths(THETAS)
+    assert turned[::-1] == first.values(THETAS)
 
 
 def test_a_sample_says_what_the_inner_problem_found(sampled: tuple[Path, Sampler]) -> None:
     _, sampler = sampled
-    light = sampler.bandwidths(THETAS[:1])[0]
+    light = sampler.values(THETAS[:1])[0]
     assert light.feasible
     assert light.bandwidth / HZ == pytest.approx(72.0452, abs=1e-3)
     assert light.omega_S / HZ == pytest.approx(1800.0, rel=1e-9)
     assert set(light.active) == {"S_max", "omega_S upper"}
-    above = sampler.bandwidths([[55.0 + 1e-3, 55.0]])[0]
+    above = sampler.values([[55.0 + 1e-3, 55.0]])[0]
     slope = (above.bandwidth - light.bandwidth) / 1e-3
     assert light.gradient[0] == pytest.approx(slope, rel=1e-3)
 
@@ -129,7 +129,7 @@ def test_an_infeasible_theta_is_a_sample_too(tmp_path: Path) -> None:
     hard = problem(inner=replace(INNER, S_max=1.05))
     with SampleStore(tmp_path / "s.sqlite") as store:
         for _ in range(2):  # computed, then read
-            (sample,) = Sampler(hard, store, Workers(1)).bandwidths(THETAS[:1])
+            (sample,) = Sampler(hard, store, Workers(1)).values(THETAS[:1])
             assert not sample.feasible
             assert math.isnan(sample.bandwidth)
             assert all(map(math.isnan, sample.gradient))
@@ -155,9 +155,9 @@ def test_the_nearest_is_the_infeasible_theta_that_falls_short_least(
     for order in ([0, 1, 2, 3], [1, 3, 0, 2], [2, 3, 1, 0]):
         with SampleStore(tmp_path / f"{order}.sqlite") as store:
             sampler = Sampler(problem(), store, Workers(1))
-            sampler.bandwidths(THETAS[[2]])
+            sampler.values(THETAS[[2]])
             assert sampler.nearest is None, "a feasible one does not count"
-            sampler.bandwidths(THETAS[order])
+            sampler.values(THETAS[order])
             assert sampler.nearest is not None
             assert sampler.nearest.theta == tuple(THETAS[1])
 
@@ -179,7 +179,7 @@ def test_theta_is_all_but_the_last_two_however_many_there_are(
 def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, violated: bool
 ) -> None:
-    monkeypatch.setattr(module, "unmet", lambda *_: ("least mass",) * violated)
+    monkeypatch.setattr(module, "violated", lambda *_: ("least mass",) * violated)
     monkeypatch.setattr(module, "objective", lambda problem, _, v: 200.0 + problem.w2 * v)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(w1=2.0, w2=-3.0), store, Workers(1))
@@ -210,7 +210,7 @@ def test_a_trace_tells_bandwidths_where_j_counts_an_error(
     monkeypatch.setattr(module, "objective", lambda problem, _, v: 200.0 + problem.w2 * v)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(w1=2.0, w2=1e9), store, Workers(1))
-        sampler.bandwidths(THETAS[:1])
+        sampler.values(THETAS[:1])
     assert sampler.trace[0].bandwidth == 300.0
     assert sampler.trace[0].objective == pytest.approx(202.0)
 

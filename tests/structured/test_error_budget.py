@@ -25,7 +25,7 @@ from ccd_casadi.budget.loops import Process, noise_of_a_period, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space, state_spaces
-from ccd_casadi.lti.hold import parts
+from ccd_casadi.lti.hold import delay_parts
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -158,7 +158,7 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
     made, _, _ = built(sampling)
     assert made.sampling is not None
     T, steps = sampling.period, 20
-    whole, rest = parts(T, made.sampling.delay)
+    whole, rest = delay_parts(T, made.sampling.delay)
     for source in (SHAPED[0], SHAPED[1]):
         model = process(made, source)
         moved = model.A + np.eye(len(model.A))

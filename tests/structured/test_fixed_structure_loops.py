@@ -28,7 +28,7 @@ from ccd_casadi.fixed_structure.figures import (
     hessians,
     to_theta,
 )
-from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
+from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import Brackets
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
@@ -236,7 +236,7 @@ def test_stability_is_that_of_the_closed_loops_characteristic_polynomial() -> No
     problem = problem_for([plant()], structure, BOUNDS)
     kappa = at_random(problem, np.exp(rng.uniform(-4.0, 0.5, 200)), rng)
     member = problem.plants
-    verdicts = stable(closed_loops(member, structure, kappa))[:, 0]
+    verdicts = all_stable(closed_loops(member, structure, kappa))[:, 0]
     for one, verdict in zip(kappa, verdicts, strict=True):
         zeros, poles = roots(structure, one)
         s0 = np.array([1.3j])

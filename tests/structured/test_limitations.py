@@ -17,15 +17,15 @@ from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.gap import main
 from ccd_casadi.inner_problem.problem import best_choice, scaled_plant
 from ccd_casadi.limitations.basis import Basis
-from ccd_casadi.limitations.bound import inside, outside
-from ccd_casadi.limitations.certificate import forbids, support
+from ccd_casadi.limitations.bound import lower_bound, upper_bound
+from ccd_casadi.limitations.certificate import rules_out, support
 from ccd_casadi.limitations.limits import limits_of, magnitude
 from ccd_casadi.limitations.of_problem import limits_of_problem
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import handed_out
+from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights
 
@@ -46,9 +46,9 @@ def test_a_zero_in_the_right_half_plane_gives_poissons_bound() -> None:
     zero, S_max = 20.0, 1.8
     limits = limits_of(lag(zero), Bounds(S_max, 0.9, 1e-3), None)
     exact = HZ * bandwidth_limit_hz(Zero(zero / HZ, -1.0, 1.0), S_max)
-    most = outside(limits)
+    most = upper_bound(limits)
     assert exact * (1.0 - 1e-9) <= most <= 1.05 * exact
-    assert 0.9 * exact <= inside(limits, most) <= exact * (1.0 + 2e-3)
+    assert 0.9 * exact <= lower_bound(limits, most) <= exact * (1.0 + 2e-3)
 
 
 @given(finite, finite, st.floats(0.01, 2.5), st.floats(0.01, 2.5), st.integers(0, 2**20))
@@ -130,21 +130,21 @@ def test_axes_that_are_apart_are_bounded_as_if_alone(sampling: Sampling | None) 
 def test_no_multiplier_forbids_what_a_controller_does() -> None:
     """Random h, and the best h of a larger ω_b, at an ω_b that a T was found for."""
     limits = limits_of(lag(20.0), Bounds(1.8, 0.9, 1e-3, shape=1.1), None)
-    most, rng = outside(limits), np.random.default_rng(3)
-    reached = inside(limits, most)
+    most, rng = upper_bound(limits), np.random.default_rng(3)
+    reached = lower_bound(limits, most)
     assert 0.0 < reached < most
     start = np.geomspace(1e-2, 1e3, 200)
     basis = Basis((10.0,) * 12, (), 100.0, 1, limits.beyond)
     for _ in range(30):
-        assert not forbids(limits, basis, rng.normal(size=12), 0.99 * reached, start)
+        assert not rules_out(limits, basis, rng.normal(size=12), 0.99 * reached, start)
 
 
 def test_case_study_1_is_bracketed() -> None:
     """Continuous and as it runs: the bracket's width is measured as 4 and 5 %; 15 % is asked."""
     problem = problem_of(load_case(ROOT / "runs" / "two_mass_built.toml"))
     (limits,) = limits_of_problem(problem, (55.0, 55.0))
-    most = outside(limits)
-    reached = inside(limits, most)
+    most = upper_bound(limits)
+    reached = lower_bound(limits, most)
     assert 52.0 * HZ < reached < most < 1.15 * reached  # sections reach 52.0
 
 
@@ -161,7 +161,7 @@ def test_more_delay_never_gives_more() -> None:
     plant = lag(40.0)
     bounds = Bounds(1.8, 0.9, 1e-3, shape=1.1)
     reached = [
-        outside(limits_of(plant, bounds, sampling))
+        upper_bound(limits_of(plant, bounds, sampling))
         for sampling in (None, Sampling(200.0), Sampling(200.0, 10_000.0))
     ]
     assert reached[0] * 1.01 >= reached[1] >= reached[2] * 0.99
@@ -177,7 +177,7 @@ def test_no_climb_of_sections_exceeds_the_bound(seed: int) -> None:
         uncertain.plant(uncertain.nominal).plant_si(), asked.bounds, asked.sampling,
         integrator=asked.structure.integrator,
     )  # fmt: skip
-    assert made.bandwidth <= outside(limits) < np.inf
+    assert made.bandwidth <= upper_bound(limits) < np.inf
 
 
 @pytest.mark.parametrize("seed", [0, 8])
@@ -194,9 +194,9 @@ def test_no_h_infinity_design_exceeds_the_bound(seed: int) -> None:
     made = synthesise(
         plant, weights, omega_low=omega_low, gamma_backoff=problem.inner.gamma_backoff
     )
-    controller = handed_out(plant, made, omega_low).controller
+    controller = recertified_in_si(plant, made, omega_low).controller
     loose = Bounds(50.0, 1.0, omega_low, weighted_level=1e9, weights=weights)
     loop = judged([plant], controller, loose, None, False)[0]
     level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
     bounds = Bounds(loop.S_peak * (1.0 + 1e-6), 1.0, omega_low, None, level, weights)
-    assert loop.crossing <= outside(limits_of(plant.plant_si(), bounds, None)) < np.inf
+    assert loop.crossing <= upper_bound(limits_of(plant.plant_si(), bounds, None)) < np.inf

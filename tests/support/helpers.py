@@ -17,7 +17,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.lti.state_space import StateSpace
@@ -40,7 +40,7 @@ PAPER = Weights(
     M_S=2.0, A_S=1e-4, omega_S=800.0 * HZ, c_K=1e4, omega_K=100.0 * HZ, M_K=2e7,
     A_l=1.0, A_u=1e-2, omega_T=40.0 * HZ,
 )  # fmt: skip
-INNER = InnerProblem(
+INNER = InnerBounds(
     S_max=1.75,
     S_low=0.03,
     omega_low=OMEGA_LOW,

@@ -22,7 +22,7 @@ from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.synthesis.closed_loop import handed_out, measure
+from ccd_casadi.synthesis.closed_loop import measure, recertified_in_si
 from ccd_casadi.synthesis.synthesis import Design, Outcome, figures_from_row, synthesise
 
 
@@ -56,9 +56,9 @@ def test_what_is_measured_in_si_is_what_was_synthesised(made: tuple[ScaledPlant,
 
 def test_a_design_that_its_numbers_carry_is_handed_out_as_it_is(made) -> None:  # type: ignore[no-untyped-def]
     plant, design = made
-    assert handed_out(plant, design, OMEGA_LOW) is design
+    assert recertified_in_si(plant, design, OMEGA_LOW) is design
     failed = replace(design, figures=replace(design.figures, outcome=Outcome.NORM_EXCEEDED))
-    assert handed_out(plant, failed, OMEGA_LOW) is failed
+    assert recertified_in_si(plant, failed, OMEGA_LOW) is failed
 
 
 @pytest.mark.parametrize("factor", [1.0 + 1e-5, 1.0 - 1e-5])
@@ -67,11 +67,11 @@ def test_a_design_with_other_figures_in_si_is_lost(made, factor: float) -> None:
     plant, design = made
     figures = design.figures
     off = replace(figures, bandwidth=factor * figures.bandwidth)
-    lost = handed_out(plant, replace(design, figures=off), OMEGA_LOW)
+    lost = recertified_in_si(plant, replace(design, figures=off), OMEGA_LOW)
     assert lost.figures.outcome is Outcome.LOST_IN_ROUNDING
     assert not lost.figures.certified
     off = replace(figures, gamma=(1.0 - 1e-5) * figures.gamma)
-    lost = handed_out(plant, replace(design, figures=off), OMEGA_LOW)
+    lost = recertified_in_si(plant, replace(design, figures=off), OMEGA_LOW)
     assert lost.figures.outcome is Outcome.LOST_IN_ROUNDING
 
 
@@ -93,7 +93,7 @@ def test_a_loop_that_hangs_on_last_digits_is_lost() -> None:
         moved = hanging.A.copy()
         moved[n, n] *= 1.0 + (last - 12) * 2.0**-52
         as_given = replace(design, controller=replace_A(hanging, moved))
-        outcomes.add(handed_out(plant, as_given, OMEGA_LOW).figures.outcome)
+        outcomes.add(recertified_in_si(plant, as_given, OMEGA_LOW).figures.outcome)
         if Outcome.LOST_IN_ROUNDING in outcomes:
             break
     assert Outcome.LOST_IN_ROUNDING in outcomes

@@ -17,7 +17,6 @@ from ccd_casadi.case_studies.rib_stage.truncation import Mode, ModeCount, ModeSe
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.memory import give_back
 from ccd_casadi.support.threads import side_by_side
 
 APART = 1e-9  # relative: a mode with less of z is not moved by it
@@ -147,7 +146,6 @@ def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> 
     found, here = modes_at(stage, theta), np.array(theta)
     u, du, dK = _displacements(stage, found, here, points_of(stage), derivatives)
     lam = np.array([(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible])
-    give_back()
     return assembled(stage, lam, u, du, dK)
 
 

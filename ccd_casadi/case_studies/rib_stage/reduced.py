@@ -46,7 +46,6 @@ from ccd_casadi.case_studies.rib_stage.symmetry import AS, mirror_signs, swap_di
 from ccd_casadi.case_studies.rib_stage.truncation import TWENTY
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.memory import give_back
 from ccd_casadi.support.threads import side_by_side
 
 KNOWN = 1e-4  # of its length: what of a mode's move is beside the basis and not worth a vector
@@ -136,7 +135,6 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> tuple[Basis, ...]:
 
         # That of the tilts takes longest.
         made = tuple(side_by_side(grown, range(len(SQUARE_GROUPS))[::-1])[::-1])
-        give_back()
     _bases[stage] = known, made
     return made
 

@@ -71,7 +71,7 @@ def edge_points(gmsh: Any, tag: int, shares: Array) -> Array:
     return np.reshape(gmsh.model.getValue(1, tag, low + shares * (high - low)), (-1, 3))
 
 
-def paired(old: Boundary, new: Boundary) -> Pairing:
+def matched(old: Boundary, new: Boundary) -> Pairing:
     """Which piece of `new` each piece of `old` is. Raises PlantError where they do not agree."""
     for word in ("corners", "edges", "faces"):
         before, now = len(getattr(old, word)), len(getattr(new, word))

@@ -25,7 +25,7 @@ UNSEEN = 5  # θ that measure the fit
 MOST_ERROR = 1e-3  # of the mesh size
 ROUNDING = 1e-12  # m: a coefficient below is none
 # θ by name -> the solid (build123d, in mm, or a STEP file) and a point in mm on each named face
-Drawing = Callable[[Mapping[str, float]], tuple[Any, Mapping[str, Sequence[float]]]]
+SolidDrawing = Callable[[Mapping[str, float]], tuple[Any, Mapping[str, Sequence[float]]]]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Morph:
 
 
 def draw_morph(
-    drawing: Drawing,
+    drawing: SolidDrawing,
     bounds: Mapping[str, tuple[float, float]],
     file: str | Path,
     *,

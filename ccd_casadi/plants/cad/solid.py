@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ccd_casadi.plants.cad.boundary import Boundary, boundary_of, edge_points, paired
+from ccd_casadi.plants.cad.boundary import Boundary, boundary_of, edge_points, matched
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, require
 
@@ -124,7 +124,7 @@ def moved_points(gmsh: Any, mesh: SolidMesh) -> Array:
 
     Raises PlantError where its boundary has other pieces, or where an element turns inside out.
     """
-    same = paired(mesh.boundary, boundary_of(gmsh))
+    same = matched(mesh.boundary, boundary_of(gmsh))
     old, new = mesh.points, mesh.points.copy()
     for tag, node in mesh.corners.items():
         new[node] = gmsh.model.getValue(0, same.corners[tag], [])

@@ -14,13 +14,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import BoxLook
+from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.outer import End, Outer, Place
-from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from surrogates import design
 
@@ -33,14 +33,14 @@ PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too l
 TRIES = 4
 
 
-def look_over_box(outer: Outer, end: End, points: int, seed: int) -> BoxLook:
+def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
     """Look at `points` θ over the box for a J lower than that of an end.
 
     What the run has solved itself counts among the points; where these are dear no more than `FEW`
     are made up.
     """
     problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
-    if not outer.look_is_cheap:
+    if not outer.global_check_is_cheap:
         points = min(points, FEW)
     samples = _spread(outer.sampler, points, seed) if points else []
     able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
@@ -50,25 +50,25 @@ def look_over_box(outer: Outer, end: End, points: int, seed: int) -> BoxLook:
     stationary = np.isfinite(J) and end.kkt.stationarity <= outer.kkt_level
     known = [Place(end.x, J, bool(stationary))]
 
-    def solve_from(starts: Sequence[BandwidthSample]) -> None:
+    def solve_from(starts: Sequence[InnerSample]) -> None:
         nonlocal best_x, best, begun
         begun += len(starts)
         for sample in starts:
-            place = outer.solved_from(sample, known)
+            place = outer.local_solve(sample, known)
             if place is not None:
                 known.append(place)
                 if place.objective < best - margin:
                     best_x, best = place.x, place.objective
 
     lowest, others = _starts(problem, able, values, here)
-    starts = [*lowest, *others] if outer.look_is_cheap else lowest
+    starts = [*lowest, *others] if outer.global_check_is_cheap else lowest
     solve_from(starts[: -(-points // POINTS_A_START)])
     ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
-        found = outer.sampler.bandwidths(ends, "search from the ends of each parameter")
-        least = np.inf if outer.look_is_cheap else best
+        found = outer.sampler.values(ends, "search from the ends of each parameter")
+        least = np.inf if outer.global_check_is_cheap else best
         solve_from([sample for sample in found if objective_of(problem, sample) < least])
-    return BoxLook(
+    return GlobalCheck(
         points=len(samples),
         feasible=len(able),
         better=int((values < J - margin).sum()),
@@ -89,7 +89,7 @@ def _ends(problem: CoDesignProblem, theta: Array) -> Array:
         for end in (lower[i], upper[i])
         if abs(end - theta[i]) > SAME * (upper[i] - lower[i])
     ]
-    allowed = [x for x in found if not unmet(problem, x)]
+    allowed = [x for x in found if not violated(problem, x)]
     return np.array(allowed).reshape(-1, len(theta))
 
 
@@ -99,32 +99,32 @@ def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
     found = []
     for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, lower.size)):
         theta = np.clip(outer.theta_of(x) + step * (upper - lower), lower, upper)
-        sample = outer.sampler.bandwidths(theta, "perturbed starts")[0]
-        place = outer.solved_from(sample, (), 1e-13) if sample.feasible else None
+        sample = outer.sampler.values(theta, "perturbed starts")[0]
+        place = outer.local_solve(sample, (), 1e-13) if sample.feasible else None
         if place is not None:
             found.append(place.x)
     return found
 
 
-def _spread(sampler: Sampler, points: int, seed: int) -> list[BandwidthSample]:
+def _spread(sampler: Sampler, points: int, seed: int) -> list[InnerSample]:
     """The inner problems that the run has solved, and as many more as make up `points`."""
     lower, upper = box(sampler.problem)
-    known: list[BandwidthSample] = []
+    known: list[InnerSample] = []
     for sample in sampler.solved.values():
         away = [np.abs((np.array(sample.theta) - one.theta) / (upper - lower)) for one in known]
         if all(far.max() > CLUSTER for far in away):
             known.append(sample)
     if len(known) < points:
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
-        more = [theta for theta in spread if not unmet(sampler.problem, theta)]
+        more = [theta for theta in spread if not violated(sampler.problem, theta)]
         if more:
-            known = [*known, *sampler.bandwidths(np.array(more), "global check")]
+            known = [*known, *sampler.values(np.array(more), "global check")]
     return known
 
 
 def _starts(
-    problem: CoDesignProblem, samples: Sequence[BandwidthSample], values: Array, theta: Array
-) -> tuple[list[BandwidthSample], list[BandwidthSample]]:
+    problem: CoDesignProblem, samples: Sequence[InnerSample], values: Array, theta: Array
+) -> tuple[list[InnerSample], list[InnerSample]]:
     """Samples with a lower J than their n_θ + 1 nearest neighbours, and the rest; away from θ, the
     best first."""
     if not samples:
@@ -132,8 +132,8 @@ def _starts(
     lower, upper = box(problem)
     unit = (np.array([sample.theta for sample in samples]) - lower) / (upper - lower)
     here = (theta - lower) / (upper - lower)
-    lowest: list[BandwidthSample] = []
-    others: list[BandwidthSample] = []
+    lowest: list[InnerSample] = []
+    others: list[InnerSample] = []
     for i in np.argsort(values):
         away = np.abs(unit - unit[i]).max(axis=1)
         near = np.argsort(away)[1 : lower.size + 2]
