@@ -19,7 +19,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import counted, metres, with_unit
+from ccd_casadi.support.units import counted, metres, small_share, with_unit
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -188,7 +188,7 @@ def predicted(
         )
         return VerdictLine(State.FAILED, words, figures)
     if left_out is None:
-        words = f"{what} predicted to {100 * error:.2g} %"
+        words = f"{what} predicted, error {small_share(error)}"
         if extrapolates:
             words += f"; the surrogate extrapolates there: {extrapolates[0]}"
             return VerdictLine(State.WARNED, words, figures)

@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, number, small_share, with_unit
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
@@ -175,7 +175,7 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
         return ""
     if r.get("verdict", {}).get("predicted", {}).get("left_out") is not None:
         return "a sample of the surrogate"  # which repeats it
-    return f"predicted {guess} (error {100.0 * r['verification_error']:.2g} %)"
+    return f"predicted {guess} (error {small_share(r['verification_error'])})"
 
 
 def sensitivity_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:

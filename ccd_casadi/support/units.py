@@ -57,6 +57,15 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def small_share(share: float) -> str:
+    """A relative error in per cent; what is below rounding to an engineer is not written out.
+
+    >>> small_share(0.0123), small_share(1.9e-9)
+    ('1.2 %', 'under 0.0001 %')
+    """
+    return f"{100.0 * share:.2g} %" if share >= 1e-6 else "under 0.0001 %"
+
+
 def number(value: Any, digits: int = 5) -> str:
     """A number to `digits` significant digits; a dash where there is none.
 
