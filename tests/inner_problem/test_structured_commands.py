@@ -232,9 +232,7 @@ def test_responses_against_differences(folder: Path) -> None:
     """dω_b*/dS_max, and dJ*/dp at a θ whose bounds hold it, by two other designs."""
     run = read_run(folder / "run")
     made = structured_value(run.problem, run.theta)
-    sample = InnerSample(
-        run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1
-    )
+    sample = InnerSample(run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1)
     found = structured_responses(run.problem, sample, made)
     by_name = {item.parameter: item for item in found.responses}
     h = 1e-3
