@@ -136,17 +136,17 @@ def prove(
     period = None if sampling is None else sampling.period * unit
     delay = 0.0 if sampling is None else sampling.delay * unit
     own = structure.in_units(kappa, 1.0 / unit, 1.0)
-    parts = ((structure, own),) if isinstance(structure, Structure) else (
-        tuple(structure.split(own))
-    )  # fmt: skip
+    parts = (
+        ((structure, own),) if isinstance(structure, Structure) else (tuple(structure.split(own)))
+    )
     families = []
     for option in range(len(models)):
         plant = modal_sum(uncertain, option, unit)
         if plant is None:
             return Proof(ProofOutcome.NOT_MODAL, slack, names)
-        families.append(LoopFamily(
-            plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay
-        ))  # fmt: skip
+        families.append(
+            LoopFamily(plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay)
+        )
     share, enough = (most_boxes or MOST_BOXES) // len(models), None
     if many and most_boxes is None:
         share, enough = min(share, MOST_OF_MANY), ENOUGH_OF_MANY

@@ -131,9 +131,9 @@ class LineProblem(LoopProblem):
     def _open(self, kappa: Array) -> Iterator[tuple[MeasuredResponse, np.ndarray]]:
         """L on the followed lines of every response."""
         plants, structure = self.plants, self.structure
-        parts = [(structure, kappa)] if isinstance(structure, Structure) else [
-            *structure.split(kappa)
-        ]  # fmt: skip
+        parts = (
+            [(structure, kappa)] if isinstance(structure, Structure) else [*structure.split(kappa)]
+        )
         for measured in self.responses:
             whole = measured.followed
             s = 1j * plants.variable(HZ * whole.hz / plants.omega_0)
@@ -181,8 +181,7 @@ def line_problem(
     box = structure.bounds((slowest, fastest), gains)
     v = plants.variable(HZ * every / omega_0)
     starts = (0, *np.cumsum([len(one) for one in hz]).tolist())
-    return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts,
-                       effort)  # fmt: skip
+    return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts, effort)
 
 
 def _plants(
@@ -222,8 +221,7 @@ def _(
     plants, starts, P = problem.plants, problem.starts, problem.plants.count
     v, lines = problem.v, problem.starts[-1]
     crossing = plants.variable(np.exp(tau + problem.leads))
-    inside = all(v[a] < crossing.min() and crossing.max() < v[b - 1]
-                 for a, b in pairwise(starts))  # fmt: skip
+    inside = all(v[a] < crossing.min() and crossing.max() < v[b - 1] for a, b in pairwise(starts))
     if not inside or not problem.stable(kappa):
         return Assessment(False, np.zeros(0), None, None)
     loop = problem.loop(kappa, tau)
