@@ -147,8 +147,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     first, until = made[0][0], max(shown_until(m) for each in made for m in each)
     end = c.Level(1e3 * first.duration, "setpoint ends", vertical=True)
     peaks = [max(m.peak_error for m in each) for each in made]
-    kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False)
-            if way[2] < 1e3 * peaks[0]]  # fmt: skip
+    kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False) if way[2] < 1e3 * peaks[0]]
     top = max(peak for _, _, peak, _ in kept)
     time = np.linspace(0.0, until, DRAWN)
     ms = 1e3 * time

@@ -219,11 +219,11 @@ def _history(
     heading = "Prediction against truth"
     outcome, result = solution.outcome, solution.result
     if not outcome.iterates:
-        words = (
-            "There are no rounds to show: "
-            + ("IPOPT worked on the true quantities, nothing was predicted."
-               if result["formulation"] == "direct" else (result["reason"] or "none was run."))
-        )  # fmt: skip
+        words = "There are no rounds to show: " + (
+            "IPOPT worked on the true quantities, nothing was predicted."
+            if result["formulation"] == "direct"
+            else (result["reason"] or "none was run.")
+        )
         return c.Chapter(heading, (c.Words(words),))
     blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
