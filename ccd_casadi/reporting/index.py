@@ -54,6 +54,8 @@ def write_index(folder: Path) -> None:
         result["status"] = str(result["status"])
     except (OSError, ValueError, KeyError):
         return
+    if result.get("formulation") == "tune":  # its page stands alone
+        return
     pages = _pages(folder)
     for place in pages:
         text = place.read_text(encoding="utf-8")
