@@ -15,7 +15,6 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import plants_of_rows
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
@@ -99,7 +98,7 @@ def _looked_at(
     found = assess(problem, scaled, tau, each=True)
     out = np.full(len(plants), -np.inf)
     if found.peaks is not None:
-        np.maximum.at(out, plants_of_rows(problem, found.peaks), found.peaks.value - problem.margin)
+        np.maximum.at(out, problem.plants_of(found.peaks), found.peaks.value - problem.margin)
     grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
     value = np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
     return value, problem, found.peaks
@@ -172,7 +171,7 @@ def _towards_corners(
     _, problem, peaks = _looked_at(plants, *loop)
     if peaks is None:
         return []
-    of = plants_of_rows(problem, peaks)
+    of = problem.plants_of(peaks)
     chosen = [
         own[np.argsort(-peaks.value[own])[:LARGEST]]
         for own in (np.flatnonzero(of == row) for row in range(len(heads)))

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_value import LeastValue, least_value
+from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
