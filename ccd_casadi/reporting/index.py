@@ -54,7 +54,9 @@ def write_index(folder: Path) -> None:
         result["status"] = str(result["status"])
     except (OSError, ValueError, KeyError):
         return
-    if result.get("formulation") == "tune":  # its page stands alone
+    if (
+        result["status"] != "infeasible" and "objective" not in result
+    ):  # of `tune`, whose page is one
         return
     pages = _pages(folder)
     for place in pages:

@@ -123,9 +123,10 @@ def force_step(view: LoopView) -> c.Figure:
     times = np.geomspace(0.02 / (HZ * view.bandwidth_hz), SETTLED / slow, STEPS)
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
-    y = 1e6 * np.array([step[1] for step in steps])
-    curves, bands = of_plants(1e3 * t, y)
-    panel = c.Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
+    y = np.array([step[1] for step in steps])
+    unit, factor = display_unit("m", float(np.abs(y).max()))
+    curves, bands = of_plants(1e3 * t, factor * y)
+    panel = c.Panel("time (ms)", f"y after a step of 1 N ({unit})", curves, bands, log_x=True)
     on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
     words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
     lines = c.Lines(((panel,),), "A step of force", (3.2,))

@@ -247,7 +247,7 @@ def provenance(case: Case, result: Mapping[str, Any]) -> c.Chapter:
     body = (
         c.Heading("Seed and versions"),
         c.Table(("what", "version"), tuple((a, str(b)) for a, b in rows)),
-        c.Heading("The resolved case file"),
-        c.Source(case_to_toml(case)),
+        c.Heading("The case with its defaults"),
+        c.Source(case_to_toml(case).replace(f"{case.path.resolve().parent}/", "")),
     )
     return c.Chapter("Provenance", body, own_page=True)
