@@ -81,7 +81,7 @@ class OtherDamping:
         if not self.other:
             return f"a loop is unstable {where}"
         found = [
-            f"{name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
+            f"{'S' if name == 'S_max' else name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
             for name, share in self.other.items()
             if share - max(1.0, self.own[name]) > MATTERS
         ]

@@ -74,8 +74,8 @@ class Background:
         self._submit(self._thread, lambda _: known.renew(), None, then, print_failure)
 
     def _submit(
-        self, pool: Executor, work: Callable[[Any], Any], task: Any, then: Then, failed: Failed,
-    ) -> Future:  # fmt: skip
+        self, pool: Executor, work: Callable[[Any], Any], task: Any, then: Then, failed: Failed
+    ) -> Future:
         def done(future: Future) -> None:
             if self._closed or future.cancelled():
                 return

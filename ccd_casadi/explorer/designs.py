@@ -206,7 +206,7 @@ def without_controller(
         cost=hardware_cost(plant_of(problem), knobs.theta),
         active=(),
         seconds=0.0,
-    )  # fmt: skip
+    )
 
 
 def judged(
