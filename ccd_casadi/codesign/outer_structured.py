@@ -48,9 +48,11 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import (
     certify_lattice,
+    checked_whole,
     fresh_yield,
     proof_of,
     tolerance_prices,
+    worse_elsewhere,
     worst_case,
 )
 from ccd_casadi.inner_problem.structured_search import (
@@ -158,7 +160,7 @@ def printer(label: str, quiet: bool) -> Callable[[str], None]:
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
 WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
-LOOKS, APART = 5, 100  # for plants that an end does not keep, each elsewhere in the box
+LOOKS, APART = 5, 101  # for plants that an end does not keep, each elsewhere in the box
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -240,11 +242,11 @@ class StructuredOuter(ThetaOuter):
         judge the answer."""
         end = cast(StructuredEnd, end)
         problem, theta, scenarios = end.sampler.problem, end.best.theta, end.scenarios
-        tell = printer("at the end", end.sampler.quiet)
-        for look in range(1, LOOKS + 1 if end.feasible and not scenarios else 1):
-            scenarios = worst_case(problem, theta, end.found.design, APART + look, tell)[1]
-            if scenarios:
-                break
+        if end.feasible and not scenarios:
+            turns, tell = range(APART, APART + LOOKS), printer("at the end", end.sampler.quiet)
+            scenarios = worse_elsewhere(
+                problem, theta, end.found.design, turns, end.sampler.workers, tell
+            )
         if not scenarios:
             return None
         anchored = with_warm_start(problem, end.found.design.kappa, ())
@@ -260,17 +262,17 @@ class StructuredOuter(ThetaOuter):
         beside = partial(objectives_beside, problem, best)
         known = is_expensive(problem) and problem.figure is BANDWIDTH
         kkt = theta_kkt(problem, best, sampler, end.found.envelope, beside if known else None)
-        wide, checked = certify_lattice(
-            problem, best.theta, made.controller, worst, sampler.workers
-        )
-        proof = proof_of(problem, best.theta, made, sampler.workers)
+        found = checked_whole(
+            problem, best.theta, made, worst, sampler.workers,
+            (known_gap.__name__, known_gap, problem, best.theta),
+        )  # fmt: skip
+        (wide, checked), proof = found[certify_lattice.__name__], found[proof_of.__name__]
         drawn = (
             None if proof.conclusive else fresh_yield(problem, best.theta, made, sampler.workers)
         )
         with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
-            gap = known_gap(problem, best.theta)
             told = None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, made.controller, best.value)
@@ -296,7 +298,7 @@ class StructuredOuter(ThetaOuter):
             rounds=rounds,
             costs=costs,
             prices=tolerance_prices(problem, best.theta, made),
-            gap=gap,
+            gap=found[known_gap.__name__],
             told=told,
         )
 

@@ -198,7 +198,7 @@ def without_controller(
         modal=modal_plant(elements.system, problem.suspension),
         plant=scaled_system(problem, elements.system),
         weights=problem.weights,
-        figures=figures_from_row(failed_row(), 0.0, 0.0, 1.0),
+        figures=figures_from_row(failed_row(), problem.weights.at(0.0, 0.0), 1.0),
         controller=None,
         how=how,
         standing=Standing.REFUSED,

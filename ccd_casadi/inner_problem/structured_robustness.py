@@ -99,6 +99,28 @@ def violations(
     return heads[0], tuple(found)
 
 
+def worse_elsewhere(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    turns: range,
+    workers: Pool,
+    progress: Progress,
+) -> tuple[Scenario, ...]:
+    """What the first of several searches for the worst plants finds that exceeds a bound; as many
+    at a time as there are workers."""
+    for first in turns[:: workers.count]:
+        own = range(first, min(first + workers.count, turns.stop))
+        tasks = [(turn, worst_case, problem, theta, made, turn) for turn in own]
+        found = dict(workers.map_unordered(looked, tasks))
+        largest = max(worst.value for worst, _ in found.values())
+        progress(f"{100.0 * np.exp(largest):.6g} % of a bound at most, searched from elsewhere")
+        for turn in own:
+            if found[turn][1]:
+                return found[turn][1]
+    return ()
+
+
 def certify_lattice(
     problem: CoDesignProblem,
     theta: Sequence[float],
@@ -160,10 +182,30 @@ def proof_of(
     )  # fmt: skip
 
 
-def looked(task: tuple[Any, ...]) -> tuple[str, Any]:
-    """What a function says of a design, by the function's name: for a worker process."""
-    look, *design = task
-    return look.__name__, look(*design)
+def looked(task: tuple[Any, ...]) -> tuple[Any, Any]:
+    """What a function says of a design, by the task's first entry: for a worker process."""
+    key, look, *design = task
+    return key, look(*design)
+
+
+def checked_whole(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    worst: Excess,
+    workers: Pool,
+    *others: tuple[Any, ...],
+) -> dict[Any, Any]:
+    """`certify_lattice` and `proof_of` by name, and `others` (tasks of `looked`), at one time.
+
+    Of several options, whose proofs are spread over the workers, one after the other.
+    """
+    own = {certify_lattice: (made.controller, worst), proof_of: (made,)}
+    tasks = [(look.__name__, look, problem, theta, *design) for look, design in own.items()]
+    if structured_of(problem).uncertainty.options:
+        found = dict(looked((*task, workers)) for task in tasks)
+        return found | dict(workers.map_unordered(looked, others))
+    return dict(workers.map_unordered(looked, [*others, *reversed(tasks)]))
 
 
 def tolerance_prices(

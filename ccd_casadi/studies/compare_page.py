@@ -53,12 +53,8 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         if lines_of(method.figures)
     ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
-    chapters += [
-        Chapter(
-            "The case",
-            (Words(f"{versions}; seed {answer['seed']}."), Source(case_to_toml(comparison.case))),
-        )
-    ]
+    with_seed = Words(f"{versions}; seed {answer['seed']}.")
+    chapters.append(Chapter("The case", (with_seed, Source(case_to_toml(comparison.case)))))
     ours = [method.figures for method in comparison.methods if method.solution]
     verified = all(figures["status"] == "verified" for figures in ours)
     warned = any(worst_state(figures) is not State.PASSED for figures in ours)
@@ -129,10 +125,8 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
     nested = comparison.method("nested").solution
     if nested is not None:
         process = bandwidth_process(nested.outcome.surrogates)
-    if (
-        nested is not None and nested.verified is not None
-    ):  # its samples may be of its own warm starts
-        problem = nested.verified.problem
+        if nested.verified is not None:  # its samples may be of its own warm starts
+            problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, process, truths)
     walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]

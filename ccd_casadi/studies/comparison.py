@@ -154,11 +154,8 @@ def _descents(given: _Setting) -> list[Descent]:
         for start in starts
         for step in base.steps
     ]
-    found = []
-    with Progress(len(tasks), "steepest descent", quiet=given.quiet) as progress:
-        for descent in given.workers.map_unordered(_descend, tasks):
-            found.append(descent)
-            progress.advance()
+    bar = Progress(len(tasks), "steepest descent", quiet=given.quiet)
+    found = bar.over(given.workers.map_unordered(_descend, tasks))
     return sorted(found, key=lambda d: (d.gradient, d.start, d.first_step))
 
 
