@@ -58,7 +58,8 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     head = Head(
         f"Comparison: {comparison.case.path.name}",
         "bad" if not verified else "warn" if warned else "good",
-        "verified" if verified else "not verified", "",
+        "verified" if verified else "not verified",
+        "With warnings: see the verdicts below." if verified and warned else "",
         f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
         " ".join(found["sentences"][1:2]), decision=found["sentences"][0],
     )  # fmt: skip
