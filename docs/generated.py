@@ -30,9 +30,12 @@ def result() -> str:
     from ccd_casadi.support.package_text import package_text
 
     schema = json.loads(package_text("templates/result.schema.json"))
-    rows = [f"| `{key}` | {_holds(own, schema)} | {'yes' * (key in schema['required'])} |"
-            for key, own in schema["properties"].items()]  # fmt: skip
-    return "\n".join(["| key | holds | always |", "|---|---|---|", *rows])
+    of_design = schema["else"]["required"]
+    rows = []
+    for key, own in schema["properties"].items():
+        when = "always" if key in schema["required"] else "of a design" * (key in of_design)
+        rows.append(f"| `{key}` | {own['description']} | {_holds(own, schema)} | {when} |")
+    return "\n".join(["| key | meaning | holds | given |", "|---|---|---|---|", *rows])
 
 
 def files() -> str:
