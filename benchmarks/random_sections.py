@@ -42,7 +42,8 @@ from sections_judge import Case, figures
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
-from ccd_casadi.fixed_structure.design import RESTORING, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.sections_design import RESTORING
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import FIRST, Curve, LoopProblem
