@@ -85,7 +85,7 @@ class Proof:
         """One line."""
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
-            return f"{self.passed[0]} is passed by a factor of {self.passed[1]:.4g} at {at}"
+            return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"
         if not self.stable:
             return f"between these plants nothing is proven: {self.outcome.value}"
         worst = max(self.levels.values(), default=0.0)

@@ -176,7 +176,7 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
     evaluate.keep = mass  # CasADi holds no reference to it
     notes = (
         f"the stage is the mesh of {file} moved with theta, {len(morph.tets)} tetrahedra, within "
-        f"{morph.error:.1e} m of the drawing where that was looked at; its first "
+        f"{morph.error:.1e} m of the drawing where that was checked; its first "
         f"{stage.modes} flexible modes",
     )
     return Plant(
