@@ -128,7 +128,7 @@ def with_initial_search(
 def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
     """A multi-start search at the θ of a sample, from its controller too, with all its optima,
     counted; from the store if it is there."""
-    problem, theta = with_warm_start(sampler.problem, np.array(best.kappa), ()), best.theta
+    problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
 
     def multistart() -> StructuredValue:
         made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
@@ -249,7 +249,7 @@ class StructuredOuter(ThetaOuter):
             )
         if not scenarios:
             return None
-        anchored = with_warm_start(problem, end.found.design.kappa, ())
+        anchored = with_warm_start(problem, end.found.design.kappa)
         return StructuredOuter(with_scenarios(end.sampler.of(anchored), scenarios))
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
@@ -322,8 +322,12 @@ def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSam
     if problem.figure is BANDWIDTH:
         sampler, best, _ = joint_search(sampler, theta, printer("on the way", sampler.quiet))
         problem = sampler.problem
-        if best.feasible and (is_expensive(problem) or _stationary(sampler, best)):
+        if best.feasible and is_expensive(problem):
             return sampler, best
+        if best.feasible:  # optimal to first order, by the gradients of several sides of it
+            kkt = theta_kkt(problem, best, envelope=value_with_design(sampler, best).envelope)
+            if kkt.stationarity <= VerifiedStructured.kkt_level:
+                return sampler, best
         theta = np.array(best.theta)
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
@@ -333,10 +337,3 @@ def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSam
     if theta_kkt(problem, best).stationarity > STATIONARY:
         best = pieces_from(sampler, best, LEVEL)
     return sampler, best
-
-
-def _stationary(sampler: Sampler, best: InnerSample) -> bool:
-    """Whether a sample is optimal to first order, by the gradients of several sides of it."""
-    envelope = value_with_design(sampler, best).envelope
-    kkt = theta_kkt(sampler.problem, best, envelope=envelope)
-    return kkt.stationarity <= VerifiedStructured.kkt_level

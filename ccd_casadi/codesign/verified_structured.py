@@ -50,9 +50,7 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
     model = tuple(map(float, uncertain_plant(problem, theta).nominal))
 
     def climbed(easier: StructuredProblem) -> float:
-        value = structured_value(
-            with_warm_start(replace(problem, controller=easier), kappa, ()), theta
-        )
+        value = structured_value(with_warm_start(replace(problem, controller=easier), kappa), theta)
         return value.bandwidth if value.feasible else float("nan")
 
     return Costs(

@@ -15,7 +15,7 @@ from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.race import SAME, Runner, distinct, run_race
+from ccd_casadi.fixed_structure.race import SAME, distinct, run_race
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
     DesignSearch,
@@ -93,7 +93,9 @@ def synthesise_sections(
     runners = run_race(problem, pool, search.tell, workers, known=known, last=only_initial)
     for _ in range(0 if only_initial else REDRAWS):
         best = runners[0].merit
-        fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)
+        count = max(starts // 2, 1)
+        fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
+        fresh = _nearest(problem, stabilising(problem, fresh), count)
         runners = run_race(problem, fresh, search.tell, workers, runners)
         if runners[0].merit < best + SAME:
             break
@@ -120,14 +122,6 @@ def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
             return np.concatenate([near, fastest, far[chosen]])
         low, high = 0.03 * low, low
     return np.zeros((0, len(problem.structure.names)))
-
-
-def _redrawn(
-    problem: Problem, runners: Sequence[Runner], count: int, rng: np.random.Generator
-) -> Array:
-    """Those of the best ends with one section drawn anew that are stable and miss least."""
-    fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
-    return _nearest(problem, stabilising(problem, fresh), count)
 
 
 def _nearest(problem: Problem, kappa: Array, count: int) -> Array:

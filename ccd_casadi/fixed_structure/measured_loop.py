@@ -24,7 +24,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.bounds import Bounds, LoopPeaks, ShapeEnd
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.kernels.limits import HALF_POWER
 from ccd_casadi.lti.hold import tustin
@@ -42,10 +42,10 @@ BETWEEN = np.linspace(0.0, 1.0, 9)  # places on a chord
 
 
 @dataclass(frozen=True)
-class MeasuredFigures:
-    """A loop on its lines. Frequencies in rad/s, KS in N/m, GS in m/N; NaN where not stable.
+class MeasuredFigures(LoopPeaks):
+    """A loop on its lines; NaN where it is not stable.
 
-    Of several channels the largest singular values. `right_half_plane`: Z. `sure`: whether the
+    `right_half_plane`: Z. `sure`: whether the
     assumptions that the data can show hold. `S_between` bounds |S| on and between the lines by r,
     infinite where I + L may be singular on the curve; `bandwidth` is the largest that the shape
     allows on the lines.
@@ -55,16 +55,7 @@ class MeasuredFigures:
     sure: bool
     right_half_plane: int
     words: str
-    S_peak: float = np.nan
-    S_peak_frequency: float = np.nan
     S_between: float = np.nan
-    S_low: float = np.nan
-    bandwidth: float = np.nan
-    KS: float = np.nan
-    T: float = np.nan
-    GS: float = np.nan
-    weighted_KS: float = np.nan
-    weighted_T: float = np.nan
 
 
 def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
@@ -151,7 +142,7 @@ def judge_all(
     unstable = max(one.right_half_plane for one in each)
     if not stable:
         return MeasuredFigures(False, sure, unstable, words)
-    names = [field.name for field in fields(MeasuredFigures)][4:]
+    names = [*(field.name for field in fields(LoopPeaks)), "S_between"]
     worst = {name: max(getattr(one, name) for one in each) for name in names}
     worst["bandwidth"] = min(one.bandwidth for one in each)
     worst["S_peak_frequency"] = max(each, key=lambda one: one.S_peak).S_peak_frequency

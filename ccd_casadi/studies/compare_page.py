@@ -39,14 +39,11 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     if best is not None:
         loops = _loops(comparison, best)
         chapters.append(Chapter("Sensitivity, baseline against co-design", (loops,)))
-        chapters += stage_chapters(
-            problem,
-            {
-                LABELS[name]: tuple(comparison.method(name).figures["theta"].values())
-                for name in ("sequential", best)
-                if comparison.method(name).figures.get("theta")
-            },
-        )
+        thetas = {
+            name: comparison.method(name).figures.get("theta") for name in ("sequential", best)
+        }
+        stages = {LABELS[name]: tuple(theta.values()) for name, theta in thetas.items() if theta}
+        chapters += stage_chapters(problem, stages)
     chapters += [
         Chapter(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
         for method in comparison.methods
