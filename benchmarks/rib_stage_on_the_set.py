@@ -145,7 +145,9 @@ def sentences(stages: Sequence[Stage]) -> list[str]:
             "sequential stage."
         )
     if nominal and (before := min(stages, key=lambda stage: stage.nominal_J)) is ranked[-1]:
-        found.append(f"{before.label.capitalize()} has the best J nominally and the worst on the set.")
+        found.append(
+            f"{before.label.capitalize()} has the best J nominally and the worst on the set."
+        )
     corners = [stage for stage in stages if stage.excess > OPEN]
     if corners:
         names = ", ".join(stage.label for stage in corners)
