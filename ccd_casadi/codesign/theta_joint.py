@@ -106,7 +106,7 @@ def joint_search(
         make = partial(proposed, problem, models, best, reach)
         found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
-            tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
+            tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         promised = found.gain > SETTLED * abs(J) and reach > LEAST
         if not (scenarios or promised):
             best = finished(asked, best)
