@@ -81,11 +81,17 @@ class Proposal:
 
 
 def joint_search(
-    sampler: Sampler, theta: Array, tell: Callable[[str], None] | None = None
+    sampler: Sampler,
+    theta: Array,
+    tell: Callable[[str], None] | None = None,
+    ends: Sequence[tuple[Array, float]] | None = None,
 ) -> tuple[Sampler, InnerSample, bool]:
     """From θ towards where the joint search promises no more on the worst plants: the sampler of
     the problem that has these and the controller there as its warm start, its true sample, and
-    whether no more is promised."""
+    whether no more is promised.
+
+    With `ends` of other searches (θ, J) it ends near one that it does not improve on, and leaves
+    the last digits to a polish."""
     problem, first = sampler.problem, sampler.values(theta, "polishing")[0]
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
@@ -101,6 +107,8 @@ def joint_search(
             asked = with_scenarios(asked, scenarios)
             problem = asked.problem
         best, J = JointModel(problem, models, best, reach).adapted()
+        if _arrived(problem, best, J, ends or ()):
+            return sampler, first, False
         if not np.isfinite(J):
             break
         make = partial(proposed, problem, models, best, reach)
@@ -109,6 +117,9 @@ def joint_search(
             tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
         promised = found.gain > SETTLED * abs(J) and reach > LEAST
         if not (scenarios or promised):
+            if ends is not None:
+                settled = True
+                break
             best = finished(asked, best)
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
@@ -131,13 +142,24 @@ def joint_search(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = best if settled else finished(asked, best)
+    best = best if settled or ends is not None else finished(asked, best)
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
     if asked is not sampler or objective_of(problem, last) < objective_of(problem, first):
         return asked, last, settled
     return sampler, first, True
+
+
+def _arrived(
+    problem: CoDesignProblem, best: JointPoint, J: float, ends: Sequence[tuple[Array, float]]
+) -> bool:
+    """Whether a place is that of a known end, and not better."""
+    width = np.subtract(problem.upper, problem.lower)
+    return any(
+        np.abs((best.theta - theta) / width).max() < CLOSE and J > end - SETTLED * abs(end)
+        for theta, end in ends
+    )
 
 
 def finished(sampler: Sampler, start: JointPoint) -> JointPoint:
