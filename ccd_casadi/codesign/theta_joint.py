@@ -157,7 +157,7 @@ def _arrived(
     """Whether a place is that of a known end, and not better."""
     width = np.subtract(problem.upper, problem.lower)
     return any(
-        np.abs((best.theta - theta) / width).max() < CLOSE and J > end - SETTLED * abs(end)
+        np.abs((best.theta - theta) / width).max() < CLOSE and end - SETTLED * abs(end) < J
         for theta, end in ends
     )
 
