@@ -7,11 +7,11 @@ A package offers a plant of its own as an entry point of the group "ccd_casadi.p
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from ccd_casadi.plants.plant import Plant
+from ccd_casadi.plants.two_mass import two_mass_plant
 
 GROUP = "ccd_casadi.plants"
 
@@ -32,14 +32,23 @@ class Model:
     sound: bool = False
 
 
-# Builder, and the rest of a Model. Finite elements and files of many formats take a sixth of a
-# second to import, which a case that names neither does not wait for.
-OWN: dict[str, tuple[str, dict[str, Any]]] = {
-    "two_mass": ("two_mass.two_mass_plant", {"theta": ("m1", "m2"), "sound": True}),
-    "modal_table": ("imported.plant.modal_table", {"data": "table"}),
-    "sampled_matrices": ("imported.plant.sampled_matrices", {"data": "folder"}),
-    "cad_stage": ("cad.plant.cad_stage", {"data": "morph"}),
-}
+OWN = ("two_mass", "modal_table", "sampled_matrices", "cad_stage")
+
+
+def _own(name: str) -> Model:
+    """Finite elements and files of many formats take a sixth of a second to import, which a case
+    that names neither does not wait for."""
+    if name == "two_mass":
+        return Model(two_mass_plant, theta=("m1", "m2"), sound=True)
+    if name == "cad_stage":
+        from ccd_casadi.plants.cad.plant import cad_stage
+
+        return Model(cad_stage, data="morph")
+    from ccd_casadi.plants.imported.plant import modal_table, sampled_matrices
+
+    if name == "modal_table":
+        return Model(modal_table, data="table")
+    return Model(sampled_matrices, data="folder")
 
 
 def data_option(name: str | None) -> str:
@@ -61,10 +70,8 @@ def model_names() -> list[str]:
 @cache
 def model_named(name: str | None) -> Model | None:
     """The model of that name; None where there is none."""
-    if name in OWN:
-        path, rest = OWN[name]
-        module, _, builder = path.rpartition(".")
-        return Model(getattr(import_module(f"{__package__}.{module}"), builder), **rest)
+    if name is not None and name in OWN:
+        return _own(name)
     if name is None or name not in _offered():
         return None
     found = _offered()[name].load()
