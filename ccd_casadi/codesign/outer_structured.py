@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,6 +18,7 @@ from typing import cast
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter
@@ -28,6 +29,8 @@ from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
@@ -71,6 +74,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
+from ccd_casadi.support.threads import alongside
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,7 @@ def printer(label: str, quiet: bool) -> Callable[[str], None]:
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
 WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
-LOOKS, APART = 5, 100  # for plants that an end does not keep, each elsewhere in the box
+LOOKS, APART = 2, 100  # for plants that an end does not keep, each elsewhere in the box
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -257,23 +261,22 @@ class StructuredOuter(ThetaOuter):
         multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        beside = partial(objectives_beside, problem, best)
         known = is_expensive(problem) and problem.figure is BANDWIDTH
-        kkt = theta_kkt(problem, best, sampler, end.found.envelope, beside if known else None)
-        wide, checked = certify_lattice(
-            problem, best.theta, made.controller, worst, sampler.workers
-        )
-        proof = proof_of(problem, best.theta, made, sampler.workers)
-        drawn = (
-            None if proof.conclusive else fresh_yield(problem, best.theta, made, sampler.workers)
-        )
-        with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+        beside = partial(objectives_beside, problem, best) if known else None
+        certificate = partial(theta_kkt, problem, best, sampler, end.found.envelope, beside)
+        kkt = None if known else certificate()  # which spreads values over the workers itself
+        judge = partial(judged, problem, best.theta, made, worst, sampler.workers)
+        with alongside(judge) as result, Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+            kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
-            told = None
+            prices = tolerance_prices(problem, best.theta, made)
+            survival = survived(problem, loops, made.bandwidth)[0] if made.certified else None
+            damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, made.controller, best.value)
+            wide, checked, proof, drawn = result()
             bar.advance()
         return VerifiedStructured(
             problem=problem,
@@ -284,8 +287,8 @@ class StructuredOuter(ThetaOuter):
             kkt=kkt,
             inner_gap=float(max(_gap(problem, best, multistart), 0.0)),
             feasible=made.certified and not violated(problem, best.theta),
-            survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
-            damping=other_damping(problem, loops),
+            survival=survival,
+            damping=damping,
             design=made,
             multistart=multistart,
             wide=wide,
@@ -295,7 +298,7 @@ class StructuredOuter(ThetaOuter):
             worst=worst,
             rounds=rounds,
             costs=costs,
-            prices=tolerance_prices(problem, best.theta, made),
+            prices=prices,
             gap=gap,
             told=told,
         )
@@ -303,6 +306,22 @@ class StructuredOuter(ThetaOuter):
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.values(x, "the run's own design")[0]
         return structured_responses(self.problem, sample, value_with_design(self.sampler, sample))
+
+
+def judged(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    worst: Excess,
+    workers: Pool,
+) -> tuple[SetCertificate, int, Proof, Yield | None]:
+    """The lattice's certificate and how many plants it saw, the proof, and fresh plants where the
+    whole box is not proven."""
+    assert made.controller is not None
+    wide, checked = certify_lattice(problem, theta, made.controller, worst, workers)
+    proof = proof_of(problem, theta, made, workers)
+    drawn = None if proof.conclusive else fresh_yield(problem, theta, made, workers)
+    return wide, checked, proof, drawn
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:
