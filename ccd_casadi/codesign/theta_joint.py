@@ -93,9 +93,10 @@ def joint_search(
         return sampler, first, True
     best, known = JointPoint(first.theta, first.kappa, first.bandwidth), [first.theta]
     reach, settled, asked = REACH, False, sampler
-    models = nearby(problem, known, best.theta)
     for turn in range(TURNS):
-        asked, best, J = on_worse_plants(asked, models, best, turn, tell)
+        models = nearby(problem, known, best.theta)
+        within = LOOSE if turn else WITHIN
+        asked, best, J = on_worse_plants(asked, models, best, turn, within, tell)
         problem = asked.problem
         if not np.isfinite(J):
             break
@@ -104,10 +105,11 @@ def joint_search(
         if tell is not None:
             tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
-            best = finished(asked, models, best)
+            asked, best, _ = on_worse_plants(asked, models, best, TURNS + turn, WITHIN, tell)
+            best, problem = finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
-            scenarios = violations(problem, own, kappa, omega_b, LOOKS * TURNS + turn, tell)[1]
+            scenarios = violations(problem, own, kappa, omega_b, 2 * LOOKS * TURNS + turn, tell)[1]
             settled = not scenarios
             if settled:
                 break
@@ -138,12 +140,13 @@ def on_worse_plants(
     models: Sequence[Evaluate],
     best: JointPoint,
     turn: int,
+    within: float,
     tell: Callable[[str], None] | None,
 ) -> tuple[Sampler, JointPoint, float]:
     """The sampler of the problem with the plants on which the controller exceeds a bound, the
     controller adapted to them until no worse plant is found, and J there."""
     for look in range(LOOKS):
-        problem, within = sampler.problem, LOOSE if turn else WITHIN
+        problem = sampler.problem
         uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
         scenarios = violations(
             problem, uncertain, np.array(best.kappa), best.bandwidth, LOOKS * turn + look, tell,
