@@ -28,7 +28,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, structured_answer
     from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
     from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-    from ccd_casadi.inner_problem.structured_robustness import worst_case
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.process_pool import Workers
 
@@ -45,8 +44,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     point = break_frequencies(options)
     answer = {MixedSensitivityProblem: mixed_answer, StructuredProblem: structured_answer}
     with Workers(options.workers) as workers:
-        if isinstance(problem.controller, StructuredProblem):
-            workers.begin(worst_case.__module__)  # which imports little more than searches need
         how = InnerOptions(options.seed, workers, PROGRESS, point, options.begin_at)
         try:
             found = answer[type(problem.controller)](problem, theta, how)

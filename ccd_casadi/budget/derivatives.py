@@ -120,9 +120,9 @@ def _moved(loop: Loop, plant: Disturbed, source: Source, change: Change) -> Proc
 def _stepped(system: StateSpace, change: StateSpace | None) -> StateSpace:
     if change is None:
         return system
-    return StateSpace(*(
-        getattr(system, name) + 1j * STEP * getattr(change, name) for name in "ABCD"
-    ))  # fmt: skip
+    return StateSpace(
+        *(getattr(system, name) + 1j * STEP * getattr(change, name) for name in "ABCD")
+    )
 
 
 def _of_table(

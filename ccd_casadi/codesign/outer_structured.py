@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,7 +29,7 @@ from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
-from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
+from ccd_casadi.fixed_structure import SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import violated
@@ -50,10 +50,10 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import (
-    certify_lattice,
+    checked_whole,
     fresh_yield,
-    proof_of,
     tolerance_prices,
+    worse_elsewhere,
     worst_case,
 )
 from ccd_casadi.inner_problem.structured_search import (
@@ -162,7 +162,8 @@ def printer(label: str, quiet: bool) -> Callable[[str], None]:
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
 WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
-LOOKS, APART = 2, 100  # for plants that an end does not keep, each elsewhere in the box
+LOOKS, APART = 5, 101  # for plants that an end does not keep, each elsewhere in the box
+LOOKS_OF_ELEMENTS = 2  # of these, and in this process, which knows the elements
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -244,11 +245,11 @@ class StructuredOuter(ThetaOuter):
         judge the answer."""
         end = cast(StructuredEnd, end)
         problem, theta, scenarios = end.sampler.problem, end.best.theta, end.scenarios
-        tell = printer("at the end", end.sampler.quiet)
-        for look in range(1, LOOKS + 1 if end.feasible and not scenarios else 1):
-            scenarios = worst_case(problem, theta, end.found.design, APART + look, tell)[1]
-            if scenarios:
-                break
+        if end.feasible and not scenarios:
+            few, tell = is_expensive(problem), printer("at the end", end.sampler.quiet)
+            turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
+            workers = Workers(1) if few else end.sampler.workers
+            scenarios = worse_elsewhere(problem, theta, end.found.design, turns, workers, tell)
         if not scenarios:
             return None
         anchored = with_warm_start(problem, end.found.design.kappa, ())
@@ -265,8 +266,14 @@ class StructuredOuter(ThetaOuter):
         beside = partial(objectives_beside, problem, best) if known else None
         certificate = partial(theta_kkt, problem, best, sampler, end.found.envelope, beside)
         kkt = None if known else certificate()  # which spreads values over the workers itself
-        judge = partial(judged, problem, best.theta, made, worst, sampler.workers)
-        with alongside(judge) as result, Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+
+        def judged() -> tuple[SetCertificate, int, Proof, Yield | None]:
+            whole = checked_whole(problem, best.theta, made, worst, sampler.workers)
+            if whole[-1].conclusive:
+                return *whole, None
+            return *whole, fresh_yield(problem, best.theta, made, sampler.workers)
+
+        with alongside(judged) as result, Progress(1, "what limits it", quiet=sampler.quiet) as bar:
             kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
@@ -306,22 +313,6 @@ class StructuredOuter(ThetaOuter):
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.values(x, "the run's own design")[0]
         return structured_responses(self.problem, sample, value_with_design(self.sampler, sample))
-
-
-def judged(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    made: SectionsDesign,
-    worst: Excess,
-    workers: Pool,
-) -> tuple[SetCertificate, int, Proof, Yield | None]:
-    """The lattice's certificate and how many plants it saw, the proof, and fresh plants where the
-    whole box is not proven."""
-    assert made.controller is not None
-    wide, checked = certify_lattice(problem, theta, made.controller, worst, workers)
-    proof = proof_of(problem, theta, made, workers)
-    drawn = None if proof.conclusive else fresh_yield(problem, theta, made, workers)
-    return wide, checked, proof, drawn
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:

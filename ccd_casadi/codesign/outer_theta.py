@@ -33,12 +33,10 @@ class ThetaOuter(Outer, ABC):
     def global_check_is_cheap(self) -> bool:
         return False
 
-    def solve_on_surrogates(
-        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
+    def solve_lifted(
+        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """Nested; what is lifted are the exact gradients, as x is θ."""
-        if isinstance(formulation, Nested):
-            return solve_nested(self.sampler, formulation, seed=seed, given=given)
         options = Nested(
             "sobol", formulation.points or 6 * len(self.problem.names), formulation.starts,
             formulation.tolerance, formulation.max_refinements, formulation.kernel,

@@ -333,9 +333,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         violation = max(found.violation, float((own.constraints + INSIDE).max(initial=0.0)))
         return Iterate(x, cost / self.unit - worth, slope, violation, (problem, found))
 
-    def ended(
-        self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]
-    ) -> bool:  # fmt: skip
+    def ended(self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]) -> bool:
         """Where the last trials gain little of what all have."""
         self.merits.append(here.value + PENALTY * here.violation)
         gained = self.merits[0] - self.merits[-1]

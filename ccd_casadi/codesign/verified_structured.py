@@ -152,8 +152,7 @@ class VerifiedStructured(Verified):
             found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
         if self.told is not None:
             time, drawn = self.told
-            found |= {"move_time": time,
-                      "move_time_fresh": None if drawn is None else drawn.entry}  # fmt: skip
+            found |= {"move_time": time, "move_time_fresh": None if drawn is None else drawn.entry}
         if structured.weighted_level is None:
             words = "KS and T are not bounded: the case gives no controller.weighted_level"
             found["notes"] = [*plant_of(self.problem).notes(self.theta), words]

@@ -70,6 +70,7 @@ class Explorer:
         dark = arguments.get("dark", [b"0"])[0] == b"1"
         tab = arguments.get("tab", [b""])[0].decode("ascii", "replace")
         kept = self._kept.setdefault(tab, Kept()) if tab else Kept()
+        document.config.notify_connection_status = False  # the page says it, and what to do
         document.title = f"Explorer: {self.session.case.path.name}"
         document.template = Template(TEMPLATE.read_text(encoding="utf-8"))
         document.template_variables.update(

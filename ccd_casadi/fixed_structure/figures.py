@@ -14,13 +14,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
-from ccd_casadi.fixed_structure.loop_problem import (
-    Assessment,
-    Constraints,
-    Curve,
-    LoopProblem,
-    plant_of_row,
-)
+from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Curve, LoopProblem
 from ccd_casadi.fixed_structure.peak_search import (
     closed_on_peaks,
     frequency_grid,
@@ -116,7 +110,7 @@ def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
     plants, v = problem.plants, found.v
     out = np.zeros((len(v), plants.plants[0].dA.shape[0]))
     *_, x, y, right = evaluate_rows(problem, kappa, 0.0, found.curve, found.plant, v)
-    which = plant_of_row(problem, found.plant)
+    which = problem.plants_of(found)
     for i in np.unique(which):
         own = np.flatnonzero(which == i)
         out[own] = plants.form_to_theta(int(i), v[own], x[own], y[own]).real

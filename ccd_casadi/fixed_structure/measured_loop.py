@@ -131,7 +131,7 @@ def judge(
         GS=float(gain(G @ np.linalg.inv(eye + k @ G)).max()),
         weighted_KS=weighted_KS,
         weighted_T=weighted_T,
-    )  # fmt: skip
+    )
 
 
 def judge_all(

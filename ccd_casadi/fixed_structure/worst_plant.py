@@ -15,7 +15,6 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import plants_of_rows
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
@@ -102,7 +101,7 @@ def _looked_at(
     found = assess(problem, scaled, tau, each=True)
     out = np.full(len(plants), -np.inf)
     if found.peaks is not None:
-        np.maximum.at(out, plants_of_rows(problem, found.peaks), found.peaks.value - problem.margin)
+        np.maximum.at(out, problem.plants_of(found.peaks), found.peaks.value - problem.margin)
     grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
     value = np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
     return value, problem, found.peaks
@@ -165,7 +164,7 @@ def _climbed(
         option, point = points[i]
         key: tuple[int, ...] = (option, -i)
         if peaks is not None and -np.inf < value[i] < UNSTABLE:
-            rows = np.flatnonzero(plants_of_rows(problem, peaks) == i)
+            rows = np.flatnonzero(problem.plants_of(peaks) == i)
             row = rows[np.argmax(peaks.value[rows])]
             key = (option, int(peaks.curve[row]), round(float(np.log(peaks.v[row])) / PEAK))
         found.setdefault(key, Excess(option, point, float(value[i])))
@@ -194,7 +193,7 @@ def _towards_corners(
     _, problem, peaks = _looked_at(plants, *loop)
     if peaks is None:
         return []
-    of = plants_of_rows(problem, peaks)
+    of = problem.plants_of(peaks)
     chosen = [
         own[np.argsort(-peaks.value[own])[:LARGEST]]
         for own in (np.flatnonzero(of == row) for row in range(len(heads)))

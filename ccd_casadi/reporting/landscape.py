@@ -134,7 +134,7 @@ def caption_landscape(land: Landscape, best_hz: float) -> str:
     if land.outside.any():
         words += (
             f" Pale: outside the last trust region ({100.0 * land.outside.mean():.0f} % of the "
-            "grid), where the last surrogate was not asked to be right; believe the dots there."
+            "grid), where the last surrogate was not checked; believe the dots there."
         )
     if land.forbidden is not None and land.forbidden.any():
         words += f" Hatched: a constraint on θ forbids {100.0 * land.forbidden.mean():.0f} %."

@@ -123,9 +123,10 @@ def force_step(view: LoopView) -> c.Figure:
     times = np.geomspace(0.02 / (HZ * view.bandwidth_hz), SETTLED / slow, STEPS)
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
-    y = 1e6 * np.array([step[1] for step in steps])
-    curves, bands = of_plants(1e3 * t, y)
-    panel = c.Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
+    y = np.array([step[1] for step in steps])
+    unit, factor = display_unit("m", float(np.abs(y).max()))
+    curves, bands = of_plants(1e3 * t, factor * y)
+    panel = c.Panel("time (ms)", f"y after a step of 1 N ({unit})", curves, bands, log_x=True)
     on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
     words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
@@ -146,8 +147,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     first, until = made[0][0], max(shown_until(m) for each in made for m in each)
     end = c.Level(1e3 * first.duration, "setpoint ends", vertical=True)
     peaks = [max(m.peak_error for m in each) for each in made]
-    kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False)
-            if way[2] < 1e3 * peaks[0]]  # fmt: skip
+    kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False) if way[2] < 1e3 * peaks[0]]
     top = max(peak for _, _, peak, _ in kept)
     time = np.linspace(0.0, until, DRAWN)
     ms = 1e3 * time

@@ -35,7 +35,7 @@ def measure(
     row[Figure.LIMITED_BY_BOUND] = 0.0
     loop = (plant.A, plant.B, plant.C, *_scaled(plant, controller), weights.scaled(w0))
     judge(*loop, weights.delta, gamma, omega_low / w0, row)
-    return figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    return figures_from_row(row, weights, w0)
 
 
 def recertified_in_si(plant: ScaledPlant, made: Design, omega_low: float) -> Design:

@@ -96,6 +96,7 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     started.send_signal(signal.SIGKILL)
     page.get_by_role("alert").wait_for(state="visible")
     assert "does not answer" in page.get_by_role("alert").inner_text()
+    assert page.get_by_text("Reconnection").count() == 0  # it does not come back
     with SampleStore(Path(tmp_path) / "samples.sqlite") as store:
         assert tuple(theta) in {sample.theta for sample in store.select()}
 
