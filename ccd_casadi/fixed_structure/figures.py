@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import (
+    Assessment,
+    Constraints,
+    Curve,
+    LoopProblem,
+    Places,
+)
 from ccd_casadi.fixed_structure.peak_search import (
     closed_on_peaks,
     frequency_grid,
@@ -78,12 +84,12 @@ def assess(
         curve.append(np.full(len(row[-1]), end_curve))
         at.append(np.repeat(place[numbers], P))
     i, j, c, k = np.nonzero(regular[..., None, None] & (value > -within))
-    count = sum(map(len, curve))
-    parts = ((*curve, curves[c]), (*row, i + k * P), (*at, v[i, j]))
-    found = constraints(problem, kappa, tau, *(np.concatenate(part) for part in parts))
-    return Assessment(True, poles, found.only(slice(count)), found.only(slice(count, None)))
+    peaks_at = (np.concatenate(part) for part in (curve, row, at))
+    near = Places(curves[c], i + k * P, v[i, j])
+    return Assessment(True, poles, constraints(problem, kappa, tau, *peaks_at), near)
 
 
+@singledispatch
 def constraints(
     problem: LoopProblem, kappa: Array, tau: float, curve: np.ndarray, row: np.ndarray, v: Array
 ) -> Constraints:

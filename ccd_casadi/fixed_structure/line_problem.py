@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Constraints,
     Curve,
     LoopProblem,
+    Places,
 )
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import winding
@@ -239,7 +240,8 @@ def _(
     parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
     curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)
     peaks = Constraints(curve, row, at, found + problem.margin, to_kappa, to_tau)
-    return Assessment(True, np.zeros(0), peaks, peaks.only(np.zeros(0, np.int64)))
+    none = np.zeros(0, np.int64)
+    return Assessment(True, np.zeros(0), peaks, Places(none, none, np.zeros(0)))
 
 
 def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarray, ...]:
