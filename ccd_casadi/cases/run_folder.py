@@ -152,7 +152,7 @@ def _read_structured(
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
-    problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa, ())
+    problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa)
     figures = measure(
         scaled_plant(problem, theta), controller, problem.weights, gamma=UNBOUNDED,
         omega_low=problem.inner.omega_low,

@@ -21,21 +21,19 @@ import numpy as np
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End, is_expensive
-from ccd_casadi.codesign.outer_theta import ThetaOuter
+from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.fixed_structure import SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
-from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import (
     StructuredValue,
@@ -130,7 +128,7 @@ def with_initial_search(
 def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
     """A multi-start search at the θ of a sample, from its controller too, with all its optima,
     counted; from the store if it is there."""
-    problem, theta = with_warm_start(sampler.problem, np.array(best.kappa), ()), best.theta
+    problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
 
     def multistart() -> StructuredValue:
         made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
@@ -252,7 +250,7 @@ class StructuredOuter(ThetaOuter):
             scenarios = worse_elsewhere(problem, theta, end.found.design, turns, workers, tell)
         if not scenarios:
             return None
-        anchored = with_warm_start(problem, end.found.design.kappa, ())
+        anchored = with_warm_start(problem, end.found.design.kappa)
         return StructuredOuter(with_scenarios(end.sampler.of(anchored), scenarios))
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
@@ -330,8 +328,12 @@ def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSam
     if problem.figure is BANDWIDTH:
         sampler, best, _ = joint_search(sampler, theta, printer("on the way", sampler.quiet))
         problem = sampler.problem
-        if best.feasible and (is_expensive(problem) or _stationary(sampler, best)):
+        if best.feasible and is_expensive(problem):
             return sampler, best
+        if best.feasible:  # optimal to first order, by the gradients of several sides of it
+            kkt = theta_kkt(problem, best, envelope=value_with_design(sampler, best).envelope)
+            if kkt.stationarity <= VerifiedStructured.kkt_level:
+                return sampler, best
         theta = np.array(best.theta)
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
@@ -341,10 +343,3 @@ def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSam
     if theta_kkt(problem, best).stationarity > STATIONARY:
         best = pieces_from(sampler, best, LEVEL)
     return sampler, best
-
-
-def _stationary(sampler: Sampler, best: InnerSample) -> bool:
-    """Whether a sample is optimal to first order, by the gradients of several sides of it."""
-    envelope = value_with_design(sampler, best).envelope
-    kkt = theta_kkt(sampler.problem, best, envelope=envelope)
-    return kkt.stationarity <= VerifiedStructured.kkt_level

@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.decoupling import in_units_of
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
 from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
@@ -249,7 +249,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         middle = (self.middle - lower) / self.width
         loops = self.first_loops = self.loops(middle)
         self.merits: list[float] = []  # before every trial
-        self.loops_beside = lru_cache(1)(self._loops_beside)  # a step that fails is followed by one
+        # A step that fails is followed by one from the same place.
+        self.loops_beside = lru_cache(1)(self._loops_beside)
+        self.all_rows = lru_cache(2)(self._all_rows)
         self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
         kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
         self.start = np.concatenate([middle, kappa, [self.tau]])
@@ -340,12 +342,16 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         late = self.merits[-LAST:][0] - self.merits[-1]
         return len(self.merits) > LAST and gained > self.enough and late < FADED * gained
 
+    def _all_rows(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> Constraints:
+        _, kappa, tau = self.parts(here.x)
+        return all_rows(here.data[0], kappa, tau, here.data[1])
+
     def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""
         z, kappa, tau = self.parts(here.x)
         problem, assessment = here.data
         assert assessment.peaks is not None
-        found, count, peaks = all_rows(assessment), len(z), len(assessment.peaks.v)
+        found, count, peaks = self.all_rows(here), len(z), len(assessment.peaks.v)
         steep = np.abs(found.to_kappa).sum(1) + np.abs(found.to_tau)
         kept = np.flatnonzero(found.value + FAR * radius * np.maximum(steep, 1.0) > 0.0)
         found = found.only(kept)

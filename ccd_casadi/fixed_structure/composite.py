@@ -14,9 +14,15 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of, is_decoupled
-from ccd_casadi.fixed_structure.figures import assess, hessians, to_theta
+from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem, Problem
+from ccd_casadi.fixed_structure.loop_problem import (
+    Assessment,
+    Constraints,
+    LoopProblem,
+    Places,
+    Problem,
+)
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -168,18 +174,35 @@ def _(
     seen = [one.stable for one in found]
     if not (any(seen) if each else all(seen)):
         return Assessment(False, poles, None, None)
-    sides = []
-    for side in ("peaks", "near"):
-        rows = []
-        for number, (part, one) in enumerate(zip(problem.parts, found, strict=True)):
-            own = getattr(one, side)
-            if own is None:
-                continue
+    peaks, near = [], []
+    for number, (part, one) in enumerate(zip(problem.parts, found, strict=True)):
+        own, start = one.peaks, problem.rows_of(number)[0]
+        if own is not None and one.near is not None:
             wide = own.to_kappa @ part.spread(len(kappa))
-            start = problem.rows_of(number)[0]
-            rows.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
-        sides.append(Constraints(*(np.concatenate(column) for column in zip(*rows, strict=True))))
-    return Assessment(True, poles, sides[0], sides[1])
+            peaks.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
+            near.append((one.near.curve, one.near.plant + start, one.near.v))
+    columns = (map(np.concatenate, zip(*rows, strict=True)) for rows in (peaks, near))
+    return Assessment(True, poles, Constraints(*next(columns)), Places(*next(columns)))
+
+
+@constraints.register
+def _(
+    problem: CompositeProblem,
+    kappa: Array,
+    tau: float,
+    curve: np.ndarray,
+    row: np.ndarray,
+    v: Array,
+) -> Constraints:
+    value, to_kappa, to_tau = np.zeros(len(v)), np.zeros((len(v), len(kappa))), np.zeros(len(v))
+    found = Constraints(curve, row, v, value, to_kappa, to_tau)
+    for part, at, own in problem.split(found):
+        inside = constraints(
+            part.problem, kappa[part.place], tau + part.lead, own.curve, own.plant, own.v
+        )
+        value[at], to_tau[at] = inside.value, inside.to_tau
+        to_kappa[at] = inside.to_kappa @ part.spread(len(kappa))
+    return found
 
 
 @to_theta.register

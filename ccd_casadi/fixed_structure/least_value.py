@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
+from ccd_casadi.budget.derivatives import Change, variance_slopes
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
@@ -107,8 +107,9 @@ class RmsError:
                 total, value=total.value + found.value, gradient=total.gradient + found.gradient
             )  # fmt: skip
         assert total is not None
-        value, slope = rms_error_slope(total)
-        return value - 0.5 * float(np.log(len(self.plants))), slope
+        variance = total.value[0]
+        value = 0.5 * float(np.log(variance / len(self.plants)))
+        return value, 0.5 * total.gradient[0] / variance
 
 
 @dataclass(frozen=True)

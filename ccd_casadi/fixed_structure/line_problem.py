@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Constraints,
     Curve,
     LoopProblem,
+    Places,
 )
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import winding
@@ -226,8 +227,7 @@ def _(
     codes = np.array(problem.curves, np.int64)
     every = np.arange(lines)
     value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT)[:, 0]
-    short = np.array([problem.ends_at_crossing(curve) for curve in problem.curves])
-    value = np.where(short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
+    value = np.where(problem.short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
     i, c, k = np.nonzero(value > RELEVANT)
     at_low = np.flatnonzero(np.isfinite(problem.limits[Curve.S_LOW]))
     low = (at_low[:, None] * P + np.arange(lines, P)).ravel()
@@ -240,7 +240,8 @@ def _(
     parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
     curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)
     peaks = Constraints(curve, row, at, found + problem.margin, to_kappa, to_tau)
-    return Assessment(True, np.zeros(0), peaks, peaks.only(np.zeros(0, np.int64)))
+    none = np.zeros(0, np.int64)
+    return Assessment(True, np.zeros(0), peaks, Places(none, none, np.zeros(0)))
 
 
 def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarray, ...]:

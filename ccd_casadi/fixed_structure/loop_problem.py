@@ -13,6 +13,7 @@ rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u a
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -85,10 +86,11 @@ class LoopProblem:
             found.append(Curve.GS)
         return tuple(found)
 
-    def ends_at_crossing(self, curve: Curve) -> bool:
-        """Whether a curve is bounded on ω <= ω_b only."""
-        short = self.bounds.shape_ends is ShapeEnd.CROSSING
-        return curve is Curve.LEVEL or (curve is Curve.SHAPE and short)
+    @cached_property
+    def short(self) -> np.ndarray:
+        """Which of the curves are bounded on ω <= ω_b only."""
+        ends = self.bounds.shape_ends is ShapeEnd.CROSSING
+        return np.isin(self.curves, [Curve.LEVEL, *[Curve.SHAPE] * ends])
 
     @property
     def first(self) -> int:
@@ -214,17 +216,26 @@ class Constraints:
         return Constraints(*(part[chosen] for part in parts))
 
 
+class Places(NamedTuple):
+    """Curve, plant and v (over ω₀) of constraints."""
+
+    curve: np.ndarray
+    plant: np.ndarray
+    v: Array
+
+
 @dataclass(frozen=True)
 class Assessment:
     """One controller on all plants: stable or not, and where it is, its constraints.
 
-    `peaks` are exact; `near` lie on the base grid and tell how curves go between the peaks.
+    `peaks` are exact; `near` lie on the base grid and tell how curves go between the peaks: only
+    steps from here need their derivatives.
     """
 
     stable: bool
     poles: np.ndarray
     peaks: Constraints | None
-    near: Constraints | None
+    near: Places | None
 
     @property
     def violation(self) -> float:

@@ -176,8 +176,8 @@ class Structure:
             """The next section behind what there is: u of it is y of the one before."""
             nonlocal A, B, C, D
             k, n = len(b), A.shape[1]
-            a_, b_ = _stack(a, count), _stack([[x] for x in b], count)
-            c_, d_ = _stack([c], count), _stack([[d]], count)
+            a_, b_ = _stack(a, values), _stack([[x] for x in b], values)
+            c_, d_ = _stack([c], values), _stack([[d]], values)
             joint = np.zeros((count, n + k, n + k), values.dtype)
             joint[:, :n, :n], joint[:, n:, n:], joint[:, n:, :n] = A, a_, b_ @ C
             A, B = joint, np.concatenate([B, b_ @ D], axis=1)
@@ -211,7 +211,10 @@ def _pair(omega: float, zeta: float) -> list[complex]:
     return [slow, omega**2 / slow]
 
 
-def _stack(entries: list, count: int) -> Array:
-    """(N, p, m) of entries that are numbers or (N,)."""
-    rows = [[np.broadcast_to(x, count) for x in row] for row in entries]
-    return np.moveaxis(np.array(rows), -1, 0)
+def _stack(entries: list, like: Array) -> Array:
+    """(N, p, m) of entries that are numbers or (N,), of the type of `like` (n, N)."""
+    out = np.empty((like.shape[1], len(entries), len(entries[0])), like.dtype)
+    for i, row in enumerate(entries):
+        for j, entry in enumerate(row):
+            out[:, i, j] = entry
+    return out

@@ -30,7 +30,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_channels,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import worst_case
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -148,28 +147,29 @@ def _warm_starts(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
     return (own, *others)[:MOST_WARM_STARTS]
 
 
-def with_warm_start(
-    problem: CoDesignProblem, kappa: Array, scenarios: Sequence[Scenario]
-) -> CoDesignProblem:
-    """The problem with one more warm start, first, of what it minimises, and more plants."""
+def with_warm_start(problem: CoDesignProblem, kappa: Sequence[float] | Array) -> CoDesignProblem:
+    """The problem with one more warm start, first, of what it minimises."""
     structured = structured_of(problem)
     structured = structured.with_warm_start(tuple(map(float, kappa)), MOST_WARM_STARTS + 1)
-    return replace(
-        problem, controller=replace(structured, scenarios=(*structured.scenarios, *scenarios))
-    )
+    return replace(problem, controller=structured)
 
 
-def least_value_at(
+def least_from(
     problem: CoDesignProblem,
     theta: Sequence[float],
     made: SectionsDesign,
     progress: Progress | None = None,
-) -> tuple[CoDesignProblem, LeastValue]:
-    """The problem with the plants that were found worse on the way, and the design on all of them,
-    which is the first of its warm starts of least error.
+) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:
+    """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
+    one of the least of another figure, not certified where it has to be slower than is allowed.
 
-    `made` is its certified design of largest bandwidth.
+    The problem has the plants then that were found worse on the way, and that design as the first
+    of its warm starts.
     """
+    if problem.figure is not BANDWIDTH and made.certified:
+        made = too_slow(problem, made)
+    if problem.figure is BANDWIDTH or not made.certified:
+        return problem, made, None
     wider = problem
     for turn in range(ROUNDS_OF_ERROR):
         problem, structured = wider, structured_of(wider)
@@ -182,20 +182,4 @@ def least_value_at(
         wider = _wider(problem, theta, found.design, turn, progress)[1] or problem
         if wider is problem:
             break
-    return with_warm_start(problem, found.design.kappa, ()), found
-
-
-def least_from(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    made: SectionsDesign,
-    progress: Progress | None = None,
-) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:
-    """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
-    one of the least of another figure, not certified where it has to be slower than is allowed."""
-    if problem.figure is not BANDWIDTH and made.certified:
-        made = too_slow(problem, made)
-    if problem.figure is BANDWIDTH or not made.certified:
-        return problem, made, None
-    problem, found = least_value_at(problem, theta, made, progress)
-    return problem, found.design, found
+    return with_warm_start(problem, found.design.kappa), found.design, found

@@ -16,10 +16,10 @@ from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
-from ccd_casadi.inner_problem.design_loops import free_loops
-from ccd_casadi.inner_problem.move_figures import motion_of
+from ccd_casadi.inner_problem.design_loops import design_loops
+from ccd_casadi.inner_problem.move_figures import FREE, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
@@ -52,11 +52,11 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
         ahead: Array | None = motion.forward
     else:
         profile, window = setpoint(LIMITS), WINDOW
-        modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
+        modal = modal_plant(mechanics(plant_of(problem), theta), FREE)
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
         other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
-    free = free_loops(problem, theta, view.loop.controller)
+    free = design_loops(replace(problem, suspension=FREE), theta, view.loop.controller)
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
