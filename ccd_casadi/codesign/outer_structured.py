@@ -20,19 +20,17 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End, is_expensive
-from ccd_casadi.codesign.outer_theta import ThetaOuter
+from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
-from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import (
     StructuredValue,

@@ -12,9 +12,9 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
-from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
+from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
