@@ -94,7 +94,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     inform(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
-    say(one_line(f"not verified: {_shortfall(finished, found)}"), sys.stderr)
+    say(one_line(f"not verified: {_shortfall(found)}"), sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 
@@ -124,7 +124,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
 
 
-def _shortfall(run: "FinishedRun", found: "Deployment") -> str:
+def _shortfall(found: "Deployment") -> str:
     """What is not kept, and at which rate it would be."""
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"

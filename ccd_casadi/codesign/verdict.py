@@ -105,7 +105,7 @@ def optimal(
         return VerdictLine(State.FAILED, f"{words}; {known}", figures)
     words = (
         f"locally optimal to first order at a kink of J: KKT residual {residual:.1e} over theta "
-        f"and the controller together ({kink.one_gradient:.2g} with the gradient of one side); "
+        f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
         f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
@@ -124,9 +124,10 @@ def _sides(kink: Kink) -> str:
     if len(found) == 2 and known == 2:
         words = f"{found[0]:.2g} and {found[1]:.2g} times its gradient"
         return f"rises on both sides of the direction that no bound holds ({words})"
+    where = "both sides" if known == len(found) else f"the {known} known sides of {len(found)}"
     return (
-        f"grows by at least {kink.least_slope:.2g} of its gradient on {known} of {len(found)} "
-        f"sides of {len(kink.slopes)} directions"
+        f"rises on {where} of {counted(len(kink.slopes), 'direction')}, by at least "
+        f"{kink.least_slope:.2g} of its gradient"
     )
 
 

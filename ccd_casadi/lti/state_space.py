@@ -132,9 +132,8 @@ class StateSpace:
     def in_units(self, rate: float, gain: float) -> "StateSpace":
         """The system with its time in 1/`rate` and its output in `gain`: A/rate, B/rate, C/gain."""
         return StateSpace(
-            self.A / rate, self.B / rate, self.C / gain, self.D / gain,
-            period=self.period * rate,
-        )  # fmt: skip
+            self.A / rate, self.B / rate, self.C / gain, self.D / gain, period=self.period * rate
+        )
 
 
 def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
