@@ -9,8 +9,7 @@ from functools import cached_property
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import kkt_certificate, newton_step
 from ccd_casadi.codesign.peak_constraints import other_peaks
-from ccd_casadi.inner_problem.constraints import violated
-from ccd_casadi.inner_problem.objective import objective_terms
+from ccd_casadi.inner_problem.objective import objective_terms, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler

@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.codesign.verdict import LEAST_SHIFT
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.inner_problem.constraints import violated
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,

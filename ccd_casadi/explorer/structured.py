@@ -14,7 +14,7 @@ from ccd_casadi.explorer.designs import How, Look, Standing, elements_at, withou
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.fixed_structure import SetCertificate
 from ccd_casadi.fixed_structure.sections_design import Progress
-from ccd_casadi.inner_problem.constraints import violated
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners

@@ -1,7 +1,7 @@
 """The largest bandwidth of a fixed structure on a set of plants: starts, search, certificate.
 
 The best end of a multi-start search whose controller passes the judge (`certificate`) is the
-design.
+design; its bandwidth has gradients to the hardware by the envelope theorem.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,17 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
+from ccd_casadi.fixed_structure.optimality import Envelope, envelope_of, optimality
 from ccd_casadi.fixed_structure.race import SAME, distinct, run_race
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
     DesignSearch,
     Progress,
     SectionsDesign,
+    in_problem_units,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
 from ccd_casadi.fixed_structure.structure import Structure
@@ -29,6 +32,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
+LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 REDRAWS = 2  # searches at most from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
@@ -129,3 +133,37 @@ def _nearest(problem: Problem, kappa: Array, count: int) -> Array:
     tau = float(np.log(0.1))
     misses = [assess(problem, one, tau).violation for one in kappa]
     return kappa[np.argsort(misses)[:count]]
+
+
+def bandwidth_envelope(
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
+    design: SectionsDesign,
+    sampling: Sampling | None = None,
+) -> Envelope | None:
+    """The gradients of ω_b*(θ) in rad/s at a design that is optimal on these plants.
+
+    None where a loop is unstable or the point is not stationary to 1e-3. Plants carry dA, dB, dC.
+    """
+    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
+    kappa = in_problem_units(problem, design.kappa)
+    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
+    point = _at_the_bounds(problem, kappa, tau)
+    if not point.assessment.stable:
+        return None
+    found = optimality(problem, point)
+    envelope = envelope_of(problem, kappa, found)
+    return None if envelope is None else envelope.times(design.bandwidth)
+
+
+def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:
+    """The point with the largest ω_b of this κ; the judge's is lower, by its own grid."""
+    assessment = assess(problem, kappa, tau)
+    peaks = assessment.peaks
+    if peaks is not None:
+        rising = peaks.to_tau > 0.0
+        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=np.inf))
+        if abs(room) < LOWER_AT_MOST:
+            tau += room
+            assessment = assess(problem, kappa, tau)
+    return Point(kappa, tau, assessment)

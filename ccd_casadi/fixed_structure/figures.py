@@ -64,8 +64,7 @@ def assess(
     v, regular = frequency_grid(problem, problem.roots(kappa), poles)
     P, curves, loop = len(v), np.array(problem.curves, np.int64), problem.loop(kappa, tau)
     crossing = plants.variable(np.exp(tau + problem.leads))  # by number
-    short = np.array([problem.ends_at_crossing(curve) for curve in problem.curves])
-    end = np.where(short[:, None], crossing, np.inf)
+    end = np.where(problem.short[:, None], crossing, np.inf)
     every = np.arange(P)
     value = levels(np.tile(curves, (P, 1)), every, v, loop, min(depth, -within))
     value = np.where(v[..., None, None] <= end, value, -np.inf)
@@ -74,7 +73,7 @@ def assess(
     top, closed = closed_on_peaks(loop, peaks)
     # An open end at ω_b is the crossing; one at the lowest frequency is a row of its own.
     low_end = peaks.start < 0.1 * crossing[peaks.row // P]
-    whole = closed | ~np.isin(peaks.curve, curves[short]) | low_end
+    whole = closed | ~np.isin(peaks.curve, curves[problem.short]) | low_end
     sought = np.arange(len(whole)) >= len(whole) - len(hidden.row)
     whole = np.where(sought, closed, whole)
     curve, row, at = [peaks.curve[whole]], [peaks.row[whole]], [top[whole]]

@@ -227,8 +227,7 @@ def _(
     codes = np.array(problem.curves, np.int64)
     every = np.arange(lines)
     value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT)[:, 0]
-    short = np.array([problem.ends_at_crossing(curve) for curve in problem.curves])
-    value = np.where(short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
+    value = np.where(problem.short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
     i, c, k = np.nonzero(value > RELEVANT)
     at_low = np.flatnonzero(np.isfinite(problem.limits[Curve.S_LOW]))
     low = (at_low[:, None] * P + np.arange(lines, P)).ravel()

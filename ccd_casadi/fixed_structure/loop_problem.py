@@ -86,10 +86,11 @@ class LoopProblem:
             found.append(Curve.GS)
         return tuple(found)
 
-    def ends_at_crossing(self, curve: Curve) -> bool:
-        """Whether a curve is bounded on ω <= ω_b only."""
-        short = self.bounds.shape_ends is ShapeEnd.CROSSING
-        return curve is Curve.LEVEL or (curve is Curve.SHAPE and short)
+    @cached_property
+    def short(self) -> np.ndarray:
+        """Which of the curves are bounded on ω <= ω_b only."""
+        ends = self.bounds.shape_ends is ShapeEnd.CROSSING
+        return np.isin(self.curves, [Curve.LEVEL, *[Curve.SHAPE] * ends])
 
     @property
     def first(self) -> int:

@@ -12,9 +12,9 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
-from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
+from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
@@ -194,18 +194,16 @@ def checked_whole(
     made: SectionsDesign,
     worst: Excess,
     workers: Pool,
-    *others: tuple[Any, ...],
-) -> dict[Any, Any]:
-    """`certify_lattice` and `proof_of` by name, and `others` (tasks of `looked`), at one time.
-
-    Of several options, whose proofs are spread over the workers, one after the other.
-    """
+) -> tuple[SetCertificate, int, Proof]:
+    """`certify_lattice` and `proof_of` at one time; of several options, whose proofs are spread
+    over the workers, one after the other."""
     own = {certify_lattice: (made.controller, worst), proof_of: (made,)}
     tasks = [(look.__name__, look, problem, theta, *design) for look, design in own.items()]
     if structured_of(problem).uncertainty.options:
         found = dict(looked((*task, workers)) for task in tasks)
-        return found | dict(workers.map_unordered(looked, others))
-    return dict(workers.map_unordered(looked, [*others, *reversed(tasks)]))
+    else:
+        found = dict(workers.map_unordered(looked, tasks[::-1]))
+    return (*found[certify_lattice.__name__], found[proof_of.__name__])
 
 
 def tolerance_prices(

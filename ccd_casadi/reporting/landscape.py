@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.drawing.content import Landscape
-from ccd_casadi.inner_problem.constraints import violated
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, sample_key
 from ccd_casadi.sampling.store import SampleStore

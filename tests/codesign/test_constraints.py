@@ -12,7 +12,7 @@ from ccd_casadi.codesign.direct import Direct, TrueDesign
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.inner_problem.constraints import ACTIVE, MET, binding, constraint_shares, violated
+from ccd_casadi.inner_problem.objective import ACTIVE, MET, binding, constraint_shares, violated
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities

@@ -18,9 +18,8 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
-from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.certificate import judged
-from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.design import bandwidth_envelope, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve
