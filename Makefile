@@ -45,6 +45,7 @@ test-processors: setup-test
 
 lint: setup-test
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check ccd_casadi surrogates
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 

@@ -26,7 +26,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_search import least_value_at, prepared
+from ccd_casadi.inner_problem.structured_search import least_from, prepared
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -169,8 +169,7 @@ def main() -> None:
                         ready, controller=replace(ready.controller, bandwidth_least=least)
                     )  # fmt: skip
                     began = time.process_time()
-                    ready, found = least_value_at(ready, theta, raced)
-                    made = found.design
+                    ready, made, _ = least_from(ready, theta, raced)
                     told(f"{label}, least RMS at {least / HZ:.1f} Hz and more",
                          made.bandwidth / HZ, made.controller, ready, began)  # fmt: skip
 

@@ -27,7 +27,6 @@ from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.least_value import RmsError
 from ccd_casadi.fixed_structure.local_search import LoopModel, descend
-from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space
 
@@ -96,7 +95,7 @@ def of_beam(draws: int) -> list[list[str]]:
     H = np.diag(np.append(np.ones(len(problem.box[0])), 0.0))
     ends = [descend(model, s, H, problem.margin)[0] for s in starts[:3]]
     best = min(ends, key=lambda e: e.value + 20.0 * max(e.violation, 0.0))
-    K = state_space(structure, structure.in_units(best.x[:-1], w0, force))
+    K = structure.state_space(structure.in_units(best.x[:-1], w0, force))
     floor = optimal(nominal)
     unseen = beams(draws, 1)
     rows = []

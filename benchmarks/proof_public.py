@@ -26,7 +26,6 @@ from ccd_casadi.fixed_structure.affine import Affine, inverse, root, variable
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import divide
 from ccd_casadi.fixed_structure.boxes import Boxes, axis_of
-from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.enclosure import Enclosures, LoopFamily
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.lti.loop import Loop
@@ -79,7 +78,7 @@ def of_drive(most: int, draws: int) -> None:
         kappa = drive_design.read(structure, kept[name])
         soft = drive_design.SOFTER_HZ
         model = drive.plants([0.0], [1.0], soft)[0]
-        K = controller_of(structure, kappa)
+        K = structure.state_space(kappa)
         assert Loop(model, K, drive_design.SAMPLING).stable
         unit = 2.0 * drive.RATE_HZ
         omega = np.concatenate([drive.VCM["hz"], drive.PZT["hz"]]) * HZ

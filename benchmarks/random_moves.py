@@ -21,7 +21,6 @@ from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.fixed_structure import Structure
-from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
@@ -94,7 +93,7 @@ def drawn(rng: np.random.Generator) -> MoveCase:
 
 def judged(case: MoveCase, which: int, count: int) -> np.ndarray:
     """The error (count,) of plant `which`, sample by sample."""
-    G, K = case.goal().plants[which].plant_si(), state_space(STRUCTURE, case.kappa)
+    G, K = case.goal().plants[which].plant_si(), STRUCTURE.state_space(case.kappa)
     T, tau, n = case.hold.period, case.hold.delay, len(G.A)
     motion, profile = case.at(case.theta), case.at(case.theta).cycle.profile
 
@@ -133,7 +132,7 @@ def compared(case: MoveCase, which: int) -> tuple[float, float, float, float]:
     """Samples between both settling times, largest difference over the window, exact and smooth
     time."""
     goal, motion = case.goal(), case.at(case.theta)
-    loop = Loop(goal.plants[which].plant_si(), state_space(STRUCTURE, case.kappa), case.hold)
+    loop = Loop(goal.plants[which].plant_si(), STRUCTURE.state_space(case.kappa), case.hold)
     profile = motion.cycle.profile
     move = simulate(loop, profile, axis=0, forces=motion.forward, window=motion.motion.window,
                     bandwidth_hz=10.0 / profile.duration)  # fmt: skip

@@ -42,11 +42,11 @@ from sections_judge import Case, figures
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
-from ccd_casadi.fixed_structure.design import RESTORING, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import FIRST, Curve, LoopProblem
-from ccd_casadi.fixed_structure.sections_design import MARGIN, designed
+from ccd_casadi.fixed_structure.sections_design import MARGIN, RESTORING, DesignSearch
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.plants.modal import Suspension
@@ -211,7 +211,7 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     if point.assessment.violation > MARGIN:
         end = ascend(problem, point, iterations=RESTORED, penalty=RESTORING, radius=0.05)
         point, looked = at_its_bandwidth(problem, end.point), looked + end.evaluations
-    return asked, designed(problem, plants, asked.sampling, point, (), 1, looked, seed, 0.0)
+    return asked, DesignSearch(problem, plants, asked.sampling, seed).designed(point, (), 1, looked)
 
 
 def at_its_bandwidth(problem: LoopProblem, point: Point) -> Point:

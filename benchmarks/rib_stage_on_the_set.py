@@ -145,7 +145,9 @@ def sentences(stages: Sequence[Stage]) -> list[str]:
             "sequential stage."
         )
     if nominal and (before := min(stages, key=lambda stage: stage.nominal_J)) is ranked[-1]:
-        found.append(f"{before.label.capitalize()}, the best nominal one, has the worst.")
+        found.append(
+            f"{before.label.capitalize()} has the best J nominally and the worst on the set."
+        )
     corners = [stage for stage in stages if stage.excess > OPEN]
     if corners:
         names = ", ".join(stage.label for stage in corners)
@@ -180,7 +182,7 @@ def _left(stages: Sequence[Stage], first: Stage) -> str:
     return (
         f"The lightest stage that is no slower than the sequential one on the set is {best.label}, "
         f"{best.mass:.3f} kg and {best.set_hz:.1f} Hz: {_words(*own)}, where {_words(*asked)} was "
-        f"published. What is left of that gain when the stage has to run: {words}."
+        f"published. What remains of that gain on the set: {words}."
     )
 
 

@@ -14,7 +14,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from ccd_casadi.fixed_structure import Structure
-from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.loop import Loop
 
 ROW = "+-3 %, damping x 0.5 to 2, 10 kHz, 100 us, least_damping 0.05"
@@ -30,7 +29,7 @@ def main() -> None:
         ("case1", "#1f6fb4", "shape up to S_max"),
     ):
         row = rows[part][ROW]
-        K, ω_b = state_space(Structure(), np.array(row["kappa"])), row["judged_bandwidth_hz"]
+        K, ω_b = Structure().state_space(np.array(row["kappa"])), row["judged_bandwidth_hz"]
         S = [
             np.abs(Loop(plant.plant_si(), K, study.SAMPLED).sensitivity(study.HZ * hz)[:, 0, 0])
             for plant in uncertain.plants(uncertain.corners())

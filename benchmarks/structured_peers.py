@@ -27,7 +27,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
 from ccd_casadi.fixed_structure.race import started
-from ccd_casadi.fixed_structure.sections_design import designed
+from ccd_casadi.fixed_structure.sections_design import DesignSearch
 from ccd_casadi.plants.scaling import ScaledPlant
 
 STARTS = 12
@@ -106,7 +106,7 @@ def peer(asked: Case, plants: list[ScaledPlant], seconds: float) -> tuple[float,
         used += 1
         end = by_slsqp(problem, started(problem, kappa), began + seconds)
         if end is not None:
-            made = designed(problem, plants, asked.sampling, end, (), 1, 0, 0, 0.0)
+            made = DesignSearch(problem, plants, asked.sampling).designed(end, (), 1, 0)
             if made.certified:
                 best = max(best, made.bandwidth / (2.0 * np.pi))
     return best, used, time.process_time() - began

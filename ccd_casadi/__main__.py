@@ -48,35 +48,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     if named in COMMANDS:
         return int(import_module(COMMANDS[named][0]).main(words[1:]))
     raise_on_ctrl_c()
-    if not words or words in (["--help"], ["-h"], ["help"]):
-        print(overview(Path()))
-        return ExitCode.DONE
-    if words == ["--version"]:
-        import ccd_casadi
+    match words:
+        case [] | ["--help" | "-h" | "help"]:
+            print(overview(Path()))
+        case ["--version"]:
+            import ccd_casadi
 
-        print(f"ccd-casadi {ccd_casadi.__version__}")
-        return ExitCode.DONE
-    if words == ["keys"]:
-        print(_schema().keys_page(), end="")
-        return ExitCode.DONE
-    if words == ["schema"]:
-        print(json.dumps(_schema().case_schema(), indent=1))
-        return ExitCode.DONE
-    if words == ["schema", "--result"]:
-        print(package_text("templates/result.schema.json"), end="")
-        return ExitCode.DONE
-    if words[0] == "new" and len(words) == 2 and not words[1].startswith("-"):
-        return new(Path(words[1]))
-    if words[0] == "new":
-        wrong = f"ccd new NAME: {OWN['new']}"
-    elif words[0] in OWN:
-        wrong = f"ccd {words[0]}: {OWN[words[0]]}"
-    else:
-        wrong = f"{words[0]!r} is not a command; there are {', '.join((*COMMANDS, *OWN))}"
-    if words[0] in OWN and words[1:] in (["--help"], ["-h"]):
-        print(wrong)
-        return ExitCode.DONE
-    say(one_line(wrong), sys.stderr)
+            print(f"ccd-casadi {ccd_casadi.__version__}")
+        case ["keys"]:
+            print(_schema().keys_page(), end="")
+        case ["schema"]:
+            print(json.dumps(_schema().case_schema(), indent=1))
+        case ["schema", "--result"]:
+            print(package_text("templates/result.schema.json"), end="")
+        case ["new", name] if not name.startswith("-"):
+            return new(Path(name))
+        case [word, *more] if word in OWN:
+            about = f"ccd {word}{' NAME' if word == 'new' else ''}: {OWN[word]}"
+            if more not in (["--help"], ["-h"]):
+                return _refuse(about)
+            print(about)
+        case _:
+            there = ", ".join((*COMMANDS, *OWN))
+            return _refuse(f"{words[0]!r} is not a command; there are {there}")
+    return ExitCode.DONE
+
+
+def _refuse(words: str) -> int:
+    say(one_line(words), sys.stderr)
     return ExitCode.BAD_INPUT
 
 
@@ -88,9 +87,8 @@ def new(folder: Path) -> int:
     """Write a plant and a case to begin with into a folder; one that is there already is kept."""
     there = [name for name in TEMPLATE if (folder / name).exists()]
     if there:
-        words = f"{folder}: {' and '.join(there)} would be overwritten; choose another name"
-        say(one_line(words), sys.stderr)
-        return ExitCode.BAD_INPUT
+        words = f"{' and '.join(there)} would be overwritten"
+        return _refuse(f"{folder}: {words}; choose another name")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in TEMPLATE:
@@ -98,9 +96,7 @@ def new(folder: Path) -> int:
         schema = json.dumps(_schema().case_schema(), indent=1)
         (folder / SCHEMA).write_text(f"{schema}\n", encoding="utf-8")
     except OSError as error:
-        words = f"{folder}: cannot be written: {error.strerror}; choose another name"
-        say(one_line(words), sys.stderr)
-        return ExitCode.BAD_INPUT
+        return _refuse(f"{folder}: cannot be written: {error.strerror}; choose another name")
     case = folder / "case.toml"
     print(f"{folder / 'plant.py'}: the stage\n{case}: what is wanted")
     print(f"{folder / SCHEMA}: its keys, for an editor\nnext: ccd check {case}")
@@ -112,18 +108,15 @@ def overview(folder: Path) -> str:
     lines = ["ccd WORD ..., each with --help:"]
     lines += [f"  {word:12} {does}" for word, (_, does) in COMMANDS.items()]
     lines += [f"  {word:12} {does}" for word, does in OWN.items()]
-    cases = [path for path in _toml(folder) if _is_case(path)]
-    runs = [path.parent for path in sorted(folder.glob("*/result.json"))]
-    runs += [path.parent for path in sorted(folder.glob("*/*/result.json"))]
+    near = [*sorted(folder.glob("*/result.json")), *sorted(folder.glob("*/*/result.json"))]
+    runs = [path.parent for path in near]
+    files = [*sorted(folder.glob("*.toml")), *sorted(folder.glob("*/*.toml"))]
+    cases = [path for path in files if _is_case(path)]
     lines += ["", "cases here", *(f"  ccd solve {path}" for path in cases)] if cases else []
     lines += ["", "finished runs", *(f"  ccd robustness {path}" for path in runs)] if runs else []
     if not cases:
         lines += ["", "no case file here; begin with: ccd new my_stage"]
     return "\n".join(lines)
-
-
-def _toml(folder: Path) -> list[Path]:
-    return [*sorted(folder.glob("*.toml")), *sorted(folder.glob("*/*.toml"))]
 
 
 def _is_case(path: Path) -> bool:

@@ -1,7 +1,6 @@
 """`python -m ccd_casadi.check CASE.toml`: the plant over its box before anything is designed."""
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -45,7 +44,7 @@ def text(found: dict[str, Any]) -> str:
     ]
     lines += [
         f"constraint    {item['name']}: {item['value']:.4g} at the start, "
-        + ("met (0 or less)" if item["met"] else "NOT met (it is where it is 0 or less)")
+        + ("met (0 or less)" if item["met"] else "NOT met (required: 0 or less)")
         for item in found["constraints"]
     ]
     lines += [
@@ -66,7 +65,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity
     from ccd_casadi.cases.plant_report import plant_report
-    from ccd_casadi.support.json_files import json_values, write_json
+    from ccd_casadi.support.json_files import json_text, json_values, write_json
 
     case = load_case(options.case)
     problem = problem_of(case)
@@ -79,7 +78,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     found = json_values(plant_report(case, problem, facts, findings))
     if options.out is not None:
         write_json(run_folder(options.case, options.out) / "check.json", found)
-    say(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
+    say(json_text(found) if options.json else text(found))
     if not options.json:
         inform(f"next          {program('ccd_casadi.solve')} {options.case}")
     return ExitCode.DONE

@@ -56,7 +56,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
     from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
-    from ccd_casadi.support.json_files import json_values, write_json
+    from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.versions import versions
     from ccd_casadi.support.worker_process import Runner
     from ccd_casadi.synthesis.backends.mixed import RICCATI, TITLES, synthesise_with, verdicts
@@ -91,7 +91,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             "backends": backends,
             "versions": versions(),
         }
-        write_json(folder / "cross_check.json", json_values(answer))
+        write_json(folder / "cross_check.json", answer)
     own = next(item for item in found if item.backend == RICCATI)
     return ExitCode.DONE if own.holds else ExitCode.NOT_VERIFIED
 

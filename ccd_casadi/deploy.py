@@ -41,7 +41,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     if status != "verified" and not options.unverified:
         reason = finished.result.get("reason") or "no reason is given"
         words = f"the run is {status}: {reason}"
-        remedy = "solve it better, or give --unverified to look at it all the same"
+        remedy = "solve it again, or give --unverified to deploy it nevertheless"
         say(one_line(f"{options.run}: {words}; {remedy}"), sys.stderr)
         return ExitCode.NOT_VERIFIED
     folder = run_folder(options.run, options.out or options.run / "deploy")
@@ -94,7 +94,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     inform(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
-    say(one_line(f"not verified: {_shortfall(finished, found)}"), sys.stderr)
+    say(one_line(f"not verified: {_shortfall(found)}"), sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 
@@ -124,7 +124,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
 
 
-def _shortfall(run: "FinishedRun", found: "Deployment") -> str:
+def _shortfall(found: "Deployment") -> str:
     """What is not kept, and at which rate it would be."""
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"

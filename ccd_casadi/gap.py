@@ -1,8 +1,6 @@
 """`python -m ccd_casadi.gap CASE.toml [--theta m1=60,m2=60]`: what no controller can reach."""
 
 import argparse
-import json
-import sys
 from collections.abc import Sequence
 from time import perf_counter
 from typing import Any
@@ -17,7 +15,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.limitations.of_problem import gap_of
-    from ccd_casadi.support.json_files import json_values
+    from ccd_casadi.support.json_files import json_text
     from ccd_casadi.support.versions import versions
 
     began, bandwidth = perf_counter(), None
@@ -37,8 +35,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         "seconds": perf_counter() - began,
         "versions": versions(),
     }
-    json.dump(json_values(answer), sys.stdout, indent=2, allow_nan=False)
-    print()
+    print(json_text(answer))
     return ExitCode.DONE
 
 

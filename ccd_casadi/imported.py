@@ -15,10 +15,10 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 
 def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
-    from ccd_casadi.plants.imported.matrices import read_rows, reduced_table
+    from ccd_casadi.plants.imported.matrices import read_index, reduced_table
     from ccd_casadi.plants.imported.results import results_table
 
-    columns = read_rows(folder / "index.csv")[0]
+    columns = next(iter(read_index(folder).values()))
     if "results" in columns:
         return results_table(folder)
     if "mass" not in columns:

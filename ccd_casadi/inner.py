@@ -1,7 +1,6 @@
 """`python -m ccd_casadi.inner CASE.toml --theta m1=60,m2=60`: the true inner loop at one θ."""
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -28,7 +27,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, structured_answer
     from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
     from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-    from ccd_casadi.inner_problem.structured_robustness import worst_case
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.process_pool import Workers
 
@@ -45,8 +43,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     point = break_frequencies(options)
     answer = {MixedSensitivityProblem: mixed_answer, StructuredProblem: structured_answer}
     with Workers(options.workers) as workers:
-        if isinstance(problem.controller, StructuredProblem):
-            workers.begin(worst_case.__module__)  # which imports little more than searches need
         how = InnerOptions(options.seed, workers, PROGRESS, point, options.begin_at)
         try:
             found = answer[type(problem.controller)](problem, theta, how)
@@ -79,7 +75,7 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -
 def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> ExitCode:
     """Print the answer, after controller.json is written: the folder may be refused."""
     from ccd_casadi.codesign.design_entries import figures_dict
-    from ccd_casadi.support.json_files import json_values, write_json
+    from ccd_casadi.support.json_files import json_text, write_json
     from ccd_casadi.support.versions import versions
 
     if options.out is not None and found.controller is not None:
@@ -92,10 +88,9 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
         "seed": options.seed,
         "formulation": "inner",
         "versions": versions(),
-        "sweep": [json_values(figures_dict(row)) for row in found.rows],
+        "sweep": [figures_dict(row) for row in found.rows],
     }
-    json.dump(json_values(answer), sys.stdout, indent=2, allow_nan=False)
-    print()
+    print(json_text(answer))
     return ExitCode.of(found.status)
 
 

@@ -10,7 +10,7 @@ from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, positive, real
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.terminal import inform
+from ccd_casadi.support.terminal import inform, plain
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -62,7 +62,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         finished = with_verdict_line(finished, folder, "survives", survival_line(finished, found))
     page = robustness_page(finished, found, options.seed, index_of(folder), own=own)
     publish(folder, folder / "robustness.html", page)
-    inform("\n".join(filter(None, (page.head.decision, *conclusion(finished, found)))))
+    inform(plain("\n".join(filter(None, (page.head.decision, *conclusion(finished, found))))))
     inform(f"page          {folder / 'robustness.html'}")
     return ExitCode.DONE
 

@@ -17,7 +17,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.studies.baselines import case_to_compare
     from ccd_casadi.studies.worth import worth, worth_words
-    from ccd_casadi.support.json_files import json_values, write_json
+    from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.versions import versions
 
     case, problem = case_to_compare(options.case, "worth")
@@ -28,8 +28,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         SampleStore(folder / "samples.sqlite") as store,
     ):
         found = worth(case, Sampler(problem, store, workers, quiet=options.quiet), options.seed)
-    answer = found | {"seed": options.seed, "versions": versions()}
-    write_json(folder / "worth.json", json_values(answer))
+    write_json(folder / "worth.json", found | {"seed": options.seed, "versions": versions()})
     inform("\n".join([*worth_words(found), f"file          {folder / 'worth.json'}"]))
     return ExitCode.DONE
 

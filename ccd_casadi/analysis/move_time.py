@@ -26,7 +26,7 @@ import numpy as np
 
 from ccd_casadi.analysis.motor import STEP, MotionAt
 from ccd_casadi.analysis.move import driven_states, forward_force
-from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
 from ccd_casadi.lti.hold import Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
@@ -124,7 +124,7 @@ class MoveTime:
         found = self._crossings(kappa)
         if not all(each.stable for each in found):
             return np.inf, np.full(len(kappa), np.nan)
-        stepped = state_spaces(self.structure, kappa + 1j * STEP * np.eye(len(kappa)))
+        stepped = self.structure.state_spaces(kappa + 1j * STEP * np.eye(len(kappa)))
         moved = [
             tustin(StateSpace(*(part[i] for part in stepped)), self.hold.period)
             for i in range(len(kappa))
@@ -143,7 +143,7 @@ class MoveTime:
         found, motion, step = self._crossings(np.asarray(kappa, float)), self.motion, 1j * STEP
         T, tau = self.hold.period, self.hold.delay
         value, weights, by_duration = self._together(found)
-        K = tustin(state_space(self.structure, kappa), T)
+        K = tustin(self.structure.state_space(kappa), T)
         gradient = by_duration * motion.slopes(lambda cycle: cycle.profile.durations.sum())
         signals = [
             forward_force(item.profile, motion.forward + step * slope, self._time, T)
@@ -183,7 +183,7 @@ class MoveTime:
 
     def _crossings(self, kappa: Array) -> list[_Crossing]:
         T, motion = self.hold.period, self.motion
-        K = tustin(state_space(self.structure, kappa), T)
+        K = tustin(self.structure.state_space(kappa), T)
         r, f = forward_force(motion.cycle.profile, motion.forward, self._time, T)
         return [_Crossing(G, K, r, f, motion.motion.window, T) for G in self._sampled]
 

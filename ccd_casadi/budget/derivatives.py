@@ -65,11 +65,6 @@ def variance_slopes(
     return VarianceSlopes(value, gradient)
 
 
-def rms_error_slope(found: VarianceSlopes) -> tuple[float, Array]:
-    """ln of the RMS error, and its derivatives."""
-    return 0.5 * float(np.log(found.value[0])), 0.5 * found.gradient[0] / found.value[0]
-
-
 def of_filter(
     loop: Loop, source: Source, window: float | None, changes: Sequence[Change]
 ) -> tuple[Array, Array]:
@@ -83,8 +78,12 @@ def of_filter(
     steps = [(d.A.imag / STEP, d.noise.imag / STEP) for d in moved]
     C, F, V = model.C, model.F, model.V
 
+    after = P @ (model.A.T + np.eye(len(model.A))) if model.sampled else P
+
     def slopes(weight: Array) -> Array:
-        return weighted_slopes(model.A, P, weight, steps, sampled=model.sampled)
+        """d tr(W P) at a fixed symmetric W (n, n)."""
+        X = covariance(model.A.T, weight, sampled=model.sampled)
+        return np.array([2.0 * np.sum(X * (dA @ after).T) + np.sum(X * dQ) for dA, dQ in steps])
 
     def outputs(name: str, after: Array) -> Array:
         """2 tr(dC after) for outputs C or F."""
@@ -120,9 +119,9 @@ def _moved(loop: Loop, plant: Disturbed, source: Source, change: Change) -> Proc
 def _stepped(system: StateSpace, change: StateSpace | None) -> StateSpace:
     if change is None:
         return system
-    return StateSpace(*(
-        getattr(system, name) + 1j * STEP * getattr(change, name) for name in "ABCD"
-    ))  # fmt: skip
+    return StateSpace(
+        *(getattr(system, name) + 1j * STEP * getattr(change, name) for name in "ABCD")
+    )
 
 
 def _of_table(
@@ -198,12 +197,3 @@ def covariance(A: Array, Q: Array, *, sampled: bool) -> Array:
         A, Q = inverse @ A, 2.0 * inverse @ Q @ inverse.T
     P = solve_continuous_lyapunov(A, -Q)
     return np.asarray(0.5 * (P + P.T))
-
-
-def weighted_slopes(
-    A: Array, P: Array, weight: Array, changes: list[tuple[Array, Array]], *, sampled: bool
-) -> Array:
-    """d tr(W P) for changes (dA, dQ) at a fixed symmetric W (n, n)."""
-    X = covariance(A.T, weight, sampled=sampled)
-    after = P @ (A.T + np.eye(len(A))) if sampled else P
-    return np.array([2.0 * np.sum(X * (dA @ after).T) + np.sum(X * dQ) for dA, dQ in changes])

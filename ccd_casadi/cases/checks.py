@@ -41,13 +41,19 @@ class Check:
         return self.test(value)
 
 
-def _with(schema: Mapping[str, Any]) -> Callable[[Test], Check]:
-    return lambda test: Check(test, schema)
+def _good(schema: Mapping[str, Any], good: Callable[[Any], bool], remedy: str) -> Check:
+    """A check whose message is the value and the remedy."""
+    return Check(lambda value: None if good(value) else f"is {short_repr(value)}; {remedy}", schema)
 
 
 def _list(items: Mapping[str, Any], least: int = 0, most: int | None = None) -> dict[str, Any]:
     schema: dict[str, Any] = {"type": "array", "items": items, "minItems": least}
     return schema if most is None else schema | {"maxItems": most}
+
+
+def _several(value: Any) -> Any:
+    """A list as it is, another value as the only one of a list."""
+    return value if isinstance(value, list | tuple) else [value]
 
 
 def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
@@ -86,79 +92,44 @@ def signed(remedy: str) -> Check:
 
 
 def count(least: int) -> Check:
-    def check(value: Any) -> str | None:
-        good = isinstance(value, int) and not isinstance(value, bool) and value >= least
-        if good and not too_large(value):
-            return None
-        return f"is {short_repr(value)}; give a whole number of at least {least}"
-
-    return Check(check, {"type": "integer", "minimum": least})
+    """A whole number, which `true` is not."""
+    return _good(
+        {"type": "integer", "minimum": least},
+        lambda value: type(value) is int and least <= value and not too_large(value),
+        f"give a whole number of at least {least}",
+    )
 
 
 def choice(*names: str) -> Check:
-    def check(value: Any) -> str | None:
-        if value in names:
-            return None
-        return f"is {short_repr(value)}; choose one of {', '.join(names)}"
-
-    return Check(check, {"enum": list(names)})
+    """One of some texts."""
+    return _good({"enum": list(names)}, names.__contains__, f"choose one of {', '.join(names)}")
 
 
-@_with({"type": "string"})
-def text(value: Any) -> str | None:
-    return None if isinstance(value, str) else f"is {short_repr(value)}; give a text in quotes"
-
-
-@_with({"type": "boolean"})
-def flag(value: Any) -> str | None:
-    return None if isinstance(value, bool) else f"is {short_repr(value)}; give true or false"
-
-
-@_with(
-    {
-        "anyOf": [
-            {"type": "number", "exclusiveMinimum": 0.0},
-            _list({"type": "number", "exclusiveMinimum": 0.0}, 1),
-        ]
-    }
+text = _good({"type": "string"}, lambda v: isinstance(v, str), "give a text in quotes")
+flag = _good({"type": "boolean"}, lambda v: isinstance(v, bool), "give true or false")
+table = _good(
+    {"type": "object"},
+    lambda value: (
+        isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
+    ),
+    "write tables of that name",
 )
-def one_or_more(value: Any) -> str | None:
-    several = value if isinstance(value, list | tuple) else [value]
-    if several and all(POSITIVE(item) is None for item in several):
-        return None
-    return f"is {short_repr(value)}; give a number above 0, or a list of them"
-
-
-@_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
-def text_or_rows(value: Any) -> str | None:
-    first = value[0] if isinstance(value, list | tuple) and value else None
-    width = len(first) if isinstance(first, list | tuple) and first else 1
-    return text(value) if isinstance(value, str) else rows(width)(value)
-
-
-@_with({"type": "object"})
-def table(value: Any) -> str | None:
-    good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
-    return None if good else f"is {short_repr(value)}; write tables of that name"
-
-
-@_with({"anyOf": [{"type": "object"}, _list({"type": "object"})]})
-def tables(value: Any) -> str | None:
-    several = value if isinstance(value, list | tuple) else [value]
-    good = all(isinstance(item, Mapping) for item in several)
-    return None if good else f"is {short_repr(value)}; write a table, or several in double brackets"
+tables = _good(
+    {"anyOf": [{"type": "object"}, _list({"type": "object"})]},
+    lambda value: all(isinstance(item, Mapping) for item in _several(value)),
+    "write a table, or several in double brackets",
+)
 
 
 def every(item: Check, remedy: str, least: int = 0, most: int | None = None) -> Check:
     """A list of so many items that all pass a check; `remedy` says what to give."""
 
-    def check(value: Any) -> str | None:
-        good = isinstance(value, list | tuple) and all(item(each) is None for each in value)
-        if good and least <= len(value) <= (math.inf if most is None else most):
-            return None
-        return f"is {short_repr(value)}; {remedy}"
+    def good(value: Any) -> bool:
+        if not isinstance(value, list | tuple) or any(item(each) is not None for each in value):
+            return False
+        return least <= len(value) <= (math.inf if most is None else most)
 
-    return Check(check, _list(item.schema, least, most))
+    return _good(_list(item.schema, least, most), good, remedy)
 
 
 def too_large(value: Any) -> bool:
@@ -183,16 +154,18 @@ FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 DAMPING = number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True)
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
+one_or_more = _good(
+    {"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]},
+    lambda value: bool(_several(value)) and all(POSITIVE(v) is None for v in _several(value)),
+    "give a number above 0, or a list of them",
+)
 _pair = every(POSITIVE, "give two positive numbers [low, high] with low < high", 2, 2)
 points = every(count(2), "give two whole numbers of at least 2", 2, 2)
 steps = every(FRACTION, "give a list of numbers between 0 and 1, both exclusive", 1)
 factors = every(POSITIVE, "give a list of numbers above 0")
 numbers = every(ANY, "give a list of numbers", 1)
 listed = Check(numbers.test, _list(ANY.schema, 2))
-named = Check(
-    lambda value: None if value and isinstance(value, str) else "is not text",
-    {"type": "string", "minLength": 1},
-)
+named = _good({"type": "string", "minLength": 1}, lambda v: bool(v) and isinstance(v, str), "")
 files = every(named, "give a list of file names in quotes")
 names = every(Check(text.test, named.schema), "give a list of texts in quotes", 1)
 coordinate = Check(
@@ -207,24 +180,36 @@ places = every(
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
-@_with(_pair.schema)
-def interval(value: Any) -> str | None:
+def _interval(value: Any) -> str | None:
     wrong = _pair(value)
     if wrong is None and not value[0] < value[1]:
         return f"is an empty range {short_repr(value)}; give [low, high] with low < high"
     return wrong
 
 
-@_with(numbers.schema)
-def direction(value: Any) -> str | None:
+def _direction(value: Any) -> str | None:
     wrong = numbers(value)
     if wrong is not None:
         return f"{wrong}, one for each"
     return None if any(value) else f"is {short_repr(value)}; give numbers that are not all 0"
 
 
+interval, direction = Check(_interval, _pair.schema), Check(_direction, numbers.schema)
+
+
 def rows(width: int) -> Check:
     return every(every(ANY, "", width, width), f"give a list of rows of {width} numbers")
+
+
+def _text_or_rows(value: Any) -> str | None:
+    first = value[0] if isinstance(value, list | tuple) and value else None
+    width = len(first) if isinstance(first, list | tuple) and first else 1
+    return None if isinstance(value, str) else rows(width)(value)
+
+
+text_or_rows = Check(
+    _text_or_rows, {"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]}
+)
 
 
 def closest(name: str, known: Collection[str]) -> str:

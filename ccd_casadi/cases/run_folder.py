@@ -17,7 +17,6 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
-from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
@@ -148,12 +147,12 @@ def _read_structured(
     problem = _with_directions(problem, read_json(path).get("sections"), path)
     structure = structure_of(problem)
     kappa = np.array(sections_kappa(folder, structure))
-    controller = controller_of(structure, kappa)
+    controller = structure.state_space(kappa)
     judged = certify_corners(problem, theta, controller)
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
-    problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa, ())
+    problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa)
     figures = measure(
         scaled_plant(problem, theta), controller, problem.weights, gamma=UNBOUNDED,
         omega_low=problem.inner.omega_low,

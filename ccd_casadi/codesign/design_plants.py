@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.codesign.direct import acceptable, polish
+from ccd_casadi.codesign.direct import polish
 from ccd_casadi.codesign.formulation import FormulationResult, Terms
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.search import conclude_at
@@ -47,9 +47,9 @@ def widen(sampler: Sampler, x: Array) -> tuple[Array, float]:
             break
         share = min(1.0, held + step)
         narrower = replace(problem, robust=problem.robust.scaled(share))
-        found, made = polish(sampler.of(narrower, traced=share == 1.0), x)
-        if acceptable(narrower, found, made):
-            x, held, step = found, share, 2.0 * step
+        found = polish(sampler.of(narrower, traced=share == 1.0), x)
+        if found.acceptable:
+            x, held, step = found.x, share, 2.0 * step
         else:
             step *= 0.5
     return x, held

@@ -4,14 +4,14 @@ Nothing is approximated: each step is a certified synthesis with its total deriv
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import kkt_certificate, newton_step
 from ccd_casadi.codesign.peak_constraints import other_peaks
-from ccd_casadi.inner_problem.constraints import violated
-from ccd_casadi.inner_problem.objective import objective, objective_terms
+from ccd_casadi.inner_problem.objective import objective_terms, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -30,7 +30,7 @@ class Direct:
     Parameters
     ----------
     starts : int
-        The case's own and a Sobol set over the box.
+        The start of the case, and a Sobol set over the box.
     tolerance : float
         Of the inner problem.
     box_points : int
@@ -42,74 +42,81 @@ class Direct:
     box_points: int = 32
 
 
-def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities]:
+@dataclass(frozen=True)
+class TrueDesign:
+    """The true design at x = (θ, ln ω_S, ln ω_T), and by what it is held against others."""
+
+    problem: CoDesignProblem
+    x: Array
+    found: Sensitivities
+
+    @property
+    def theta(self) -> Array:
+        """θ of x."""
+        return self.x[: len(self.problem.names)]
+
+    @property
+    def acceptable(self) -> bool:
+        """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
+        met = self.problem.inner.feasible(self.found.figures)
+        return met and not violated(self.problem, self.theta)
+
+    @cached_property
+    def terms(self) -> tuple[float, float]:
+        """Those of J."""
+        return objective_terms(self.problem, self.theta, self.found.figures.bandwidth)
+
+    @property
+    def objective(self) -> float:
+        """J."""
+        return sum(self.terms)
+
+    @cached_property
+    def kkt(self) -> KktCertificate:
+        """Its first-order certificate."""
+        return kkt_certificate(self.problem, self.x, self.found)
+
+    @property
+    def residual(self) -> float:
+        """Of the optimality conditions, scaled."""
+        return max(self.kkt.stationarity, self.kkt.complementarity)
+
+    def rise(self, other: "TrueDesign") -> float:
+        """By how much another J is larger, over what J may differ by and still be the same."""
+        return (other.objective - self.objective) / (LEVEL * sum(map(abs, self.terms)))
+
+
+def polish(sampler: Sampler, x: Array) -> TrueDesign:
     """From a design nearly optimal to the nearest stationary point of the true problem.
 
-    A descent past kinks, then Newton's steps. Returns the start itself where neither finds better
-    that is certified and feasible.
+    A descent past kinks, every peak of S a constraint of its own (some ten designs where IPOPT
+    takes a hundred), then Newton's steps as long as the residual falls, where no other peak is
+    near. Returns the start itself where neither finds better that is certified and feasible.
     """
     problem, truth = sampler.problem, sampler.truth
-    design = truth.at(x)
-    if not (acceptable(problem, x, design) and _residual(problem, x, design) <= STATIONARY):
-        x, design = _past_kinks(problem, truth, x, design)
-    return _settled(problem, truth, x, design)
 
+    def at(x: Array) -> TrueDesign:
+        return TrueDesign(problem, x, truth.at(x))
 
-def _settled(
-    problem: CoDesignProblem, quantities: TrueQuantities, x: Array, design: Sensitivities
-) -> tuple[Array, Sensitivities]:
-    """Newton's steps as long as the residual falls, where no other peak is near."""
-    if not acceptable(problem, x, design):
-        return x, design
-    kkt = kkt_certificate(problem, x, design)
-    for _ in range(3):
-        if not SETTLED < kkt.stationarity <= NEWTON or other_peaks(problem, x, design, ON_EDGE):
+    here = at(x)
+    if not (here.acceptable and here.residual <= STATIONARY):
+        end = at(descend(problem, truth, x, steps=80, settled=1e-13))
+        if end.acceptable and (not here.acceptable or _improves(here, end)):
+            here = end
+    for _ in range(3 if here.acceptable else 0):
+        near = SETTLED < here.kkt.stationarity <= NEWTON
+        if not near or other_peaks(problem, here.x, here.found, ON_EDGE):
             break
-        end = newton_step(problem, quantities, x, kkt)
-        found = None if end is None else quantities.at(end)
-        if end is None or found is None or not acceptable(problem, end, found):
+        step = newton_step(problem, truth, here.x, here.kkt)
+        end = here if step is None else at(step)
+        falls = end.acceptable and end.kkt.stationarity < here.kkt.stationarity
+        if not falls or here.rise(end) > 1.0:
             break
-        after = kkt_certificate(problem, end, found)
-        rise = true_objective(problem, end, found) - true_objective(problem, x, design)
-        if after.stationarity >= kkt.stationarity or rise > _level(problem, x, design):
-            break
-        x, design, kkt = end, found, after
-    return x, design
+        here = end
+    return here
 
 
-def _past_kinks(
-    problem: CoDesignProblem, quantities: TrueQuantities, x: Array, design: Sensitivities
-) -> tuple[Array, Sensitivities]:
-    """Every peak of S a constraint of its own: some ten designs where IPOPT takes a hundred."""
-    end = descend(problem, quantities, x, steps=80, settled=1e-13)
-    found = quantities.at(end)
-    if not acceptable(problem, end, found):
-        return x, design
-    if acceptable(problem, x, design):
-        rise = true_objective(problem, end, found) - true_objective(problem, x, design)
-        level = _level(problem, x, design)
-        nearer = _residual(problem, end, found) < _residual(problem, x, design)
-        if not (rise < -level or (rise <= level and nearer)):
-            return x, design
-    return end, found
-
-
-def true_objective(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
-    """J of a true design at x = (θ, ln ω_S, ln ω_T)."""
-    return objective(problem, x[: len(problem.names)], design.figures.bandwidth)
-
-
-def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
-    """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
-    return problem.inner.feasible(design.figures) and not violated(problem, x[: len(problem.names)])
-
-
-def _residual(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
-    kkt = kkt_certificate(problem, x, design)
-    return max(kkt.stationarity, kkt.complementarity)
-
-
-def _level(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
-    """What J may differ by and still be the same."""
-    terms = objective_terms(problem, x[: len(problem.names)], design.figures.bandwidth)
-    return LEVEL * sum(map(abs, terms))
+def _improves(here: TrueDesign, end: TrueDesign) -> bool:
+    """Whether J falls, or stays and the residual falls."""
+    rise = here.rise(end)
+    return rise < -1.0 or (rise <= 1.0 and end.residual < here.residual)

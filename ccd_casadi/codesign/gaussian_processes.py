@@ -15,13 +15,7 @@ from ccd_casadi.support.progress import Progress
 from surrogates import GaussianProcess, Kernel, Quality, SurrogateFitError, condition, quality_of
 
 TAKEN = 1e-6  # relative: an error at a sample that is rounding
-# Name, unit of its errors, the number that turns the surrogate's unit into it, whether what is
-# fitted is a logarithm.
-BOUNDED = (
-    ("sensitivity_peak", "%", 100.0, True),
-    ("sensitivity_low", "%", 100.0, True),
-    ("compliance", "%", 100.0, True),
-)
+BOUNDED = ("sensitivity_peak", "sensitivity_low", "compliance")  # whose logarithms are fitted
 SAME = 1e-6  # of the box: samples that are closer are of one place
 
 
@@ -81,20 +75,13 @@ def surrogate_quality(
 ) -> tuple[Quality, ...]:
     """Judge the processes of what J counts, and of ln of each bounded figure, at a design."""
     figure = at.problem.figure
-    outputs = ((figure.key, figure.unit, figure.factor, False), *BOUNDED)
+    outputs = [(figure.key, figure.unit, figure.factor), *((name, "%", 100.0) for name in BOUNDED)]
     found = []
-    with Progress(len(processes), "judging the surrogates", quiet) as bar:
-        for process, (name, unit, factor, logarithm) in zip(processes, outputs, strict=False):
-            quality = quality_of(
-                process,
-                at.point[: process.lower.size],
-                name=name,
-                unit=unit,
-                factor=factor,
-                logarithm=logarithm,
-            )
-            found.append(quality)
-            bar.advance()
+    bar = Progress(len(processes), "judging the surrogates", quiet)
+    for process, (name, unit, factor) in zip(bar.over(processes), outputs, strict=False):
+        point = at.point[: process.lower.size]
+        found.append(quality_of(process, point, name=name, unit=unit, factor=factor,
+                                logarithm=name in BOUNDED))  # fmt: skip
     return tuple(found)
 
 

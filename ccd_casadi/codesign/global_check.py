@@ -16,8 +16,7 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.outer import End, Outer, Place
-from ccd_casadi.inner_problem.constraints import violated
-from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample

@@ -35,13 +35,8 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
-from ccd_casadi.inner_problem.structured_robustness import (
-    certify_lattice,
-    looked,
-    proof_of,
-    worst_case,
-)
-from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
+from ccd_casadi.inner_problem.structured_robustness import checked_whole, worst_case
+from ccd_casadi.inner_problem.structured_search import least_from, with_range, with_worst_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.closed_loop import equivalent_open_loop
@@ -222,7 +217,7 @@ def structured_answer(
     if begin_at is not None:
         warm_starts = (sections_kappa(begin_at, structure_of(asked)),)
         asked = replace(asked, controller=replace(structured_of(asked), warm_starts=warm_starts))
-    asked, made = prepared(asked, progress, workers, begin_at is not None)
+    asked, made, worst = with_worst_plant(asked, progress, workers, begin_at is not None)
     fastest = made.bandwidth
     asked, made, least = least_from(asked, theta, made, progress)
     if not made.certified:
@@ -237,11 +232,10 @@ def structured_answer(
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
-    looks = [(look, asked, theta, made) for look in (worst_case, proof_of)]
-    found = dict(workers.map_unordered(looked, looks))
-    (worst, _), proof = found[worst_case.__name__], found[proof_of.__name__]
+    if worst is None or least is not None:
+        worst = worst_case(asked, theta, made)[0]
+    wide, checked, proof = checked_whole(asked, theta, made, worst, workers)
     assert made.controller is not None
-    wide, checked = certify_lattice(asked, theta, made.controller, worst, workers)
     passed = wide.passed and not proof.refuted
     figures = head | {
         **design_dict(asked, theta, made),

@@ -25,8 +25,7 @@ from scipy.linalg import null_space
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import PeakConstraint, other_peaks
-from ccd_casadi.inner_problem.constraints import constraint_sizes
-from ccd_casadi.inner_problem.objective import hardware_at
+from ccd_casadi.inner_problem.objective import constraint_sizes, hardware_at
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import (

@@ -18,8 +18,7 @@ from ccd_casadi.codesign.outer_problem import (
     lifted_program,
     solve_program,
 )
-from ccd_casadi.inner_problem.constraints import constraint_shares
-from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.objective import constraint_shares, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import QuantitySample

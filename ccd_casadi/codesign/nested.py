@@ -17,8 +17,7 @@ from ccd_casadi.codesign.outer_problem import (
     nested_program,
     solve_program,
 )
-from ccd_casadi.inner_problem.constraints import violated
-from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.objective import objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample

@@ -17,7 +17,7 @@ from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.lifted import Lifted
-from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verified import Solution, Verified
@@ -114,13 +114,15 @@ class Outer(ABC):
         if isinstance(formulation, Direct):
             with self.sampler.spent.on("search"):
                 return self.solve_on_truth(formulation.starts, seed)
-        return self.solve_on_surrogates(formulation, seed, given)
+        if isinstance(formulation, Nested):
+            return solve_nested(self.sampler, formulation, seed=seed, given=given)
+        return self.solve_lifted(formulation, seed, given)
 
     @abstractmethod
-    def solve_on_surrogates(
-        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
+    def solve_lifted(
+        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
-        """A formulation on surrogates, from the samples that are given where there are any."""
+        """The lifted formulation, from the samples that are given where there are any."""
 
     def solve_on_truth(self, starts: int, seed: int) -> FormulationResult:
         """The direct formulation: local solves from the case's start and a Sobol set beside it.

@@ -13,12 +13,11 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
-from ccd_casadi.codesign.direct import acceptable, polish, true_objective
+from ccd_casadi.codesign.direct import TrueDesign, polish
 from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.kinked import SETTLED, descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
-from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
@@ -61,11 +60,9 @@ class MixedOuter(Outer):
     def bounds(self) -> tuple[Array, Array]:
         return lifted_bounds(self.problem)
 
-    def solve_on_surrogates(
-        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
+    def solve_lifted(
+        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
-        if isinstance(formulation, Nested):
-            return solve_nested(self.sampler, formulation, seed=seed, given=given)
         return solve_lifted(self.sampler, formulation, seed=seed, given=given)
 
     def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
@@ -86,30 +83,28 @@ class MixedOuter(Outer):
     def polished(self, x: Array) -> MixedEnd:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
         problem, sampler, truth = self.problem, self.sampler, self.sampler.truth
-        gap, made = np.inf, None
+        lower, upper = lifted_bounds(problem)
+        width = 1e-9 * (upper - lower)  # within rounding of a bound: onto it
         for _ in range(POLISH_ROUNDS):
             before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
             with polishing as progress, sampler.spent.on("polish"):
-                x, made = polish(sampler, x)
+                end = polish(sampler, x)
                 progress.advance()
             sampler.report(before)
-            lower, upper = lifted_bounds(problem)
-            width = 1e-9 * (upper - lower)  # within rounding of a bound: onto it
-            at_bounds = np.where(x - lower <= width, lower, x)
-            at_bounds = np.where(upper - x <= width, upper, at_bounds)
-            if acceptable(problem, at_bounds, truth.at(at_bounds)):
-                x, made = at_bounds, truth.at(at_bounds)
+            at_bounds = np.where(end.x - lower <= width, lower, end.x)
+            at_bounds = np.where(upper - end.x <= width, upper, at_bounds)
+            onto = TrueDesign(problem, at_bounds, truth.at(at_bounds))
+            end = onto if onto.acceptable else end
             with sampler.spent.on("checks"):
-                inner = sampler.values(self.theta_of(x), "verifying")[0]
-            gap = inner.bandwidth / made.figures.bandwidth - 1.0 if inner.feasible else 0.0
+                inner = sampler.values(end.theta, "verifying")[0]
+            bandwidth = end.found.figures.bandwidth
+            gap = inner.bandwidth / bandwidth - 1.0 if inner.feasible else 0.0
             if gap <= INNER_GAP:
                 break
             x = inner.joint
-        assert made is not None
-        J = true_objective(problem, x, made) if acceptable(problem, x, made) else np.inf
-        kkt = kkt_certificate(problem, x, made)
-        return MixedEnd(x, made.figures.bandwidth, J, kkt, float(gap), made)
+        J = end.objective if end.acceptable else np.inf
+        return MixedEnd(end.x, bandwidth, J, end.kkt, float(gap), end.found)
 
     def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
         if inputs < end.x.size:
@@ -127,10 +122,9 @@ class MixedOuter(Outer):
         settled = SETTLED if settled is None else settled
         end = descend(problem, truth, begin, ended=basins, settled=settled)
         for x in (end, begin):
-            made = truth.at(x)
-            if acceptable(problem, x, made):
-                stationary = kkt_certificate(problem, x, made).stationarity <= BASIN
-                return Place(x, true_objective(problem, x, made), stationary)
+            made = TrueDesign(problem, x, truth.at(x))
+            if made.acceptable:
+                return Place(x, made.objective, made.kkt.stationarity <= BASIN)
         return None
 
     def failure_reason(self, found: Solution, share: float | None) -> str:
@@ -162,7 +156,7 @@ class MixedOuter(Outer):
             hardware_cost=hardware_cost(plant_of(problem), theta),
             kkt=kkt_certificate(problem, x, end.design, sampler.truth.at),
             inner_gap=end.gap,
-            feasible=final.figures.certified and acceptable(problem, x, end.design),
+            feasible=final.figures.certified and TrueDesign(problem, x, end.design).acceptable,
             unsuspended=unsuspended,
             references=check_references(
                 problem, theta, final, workers=sampler.workers, quiet=sampler.quiet

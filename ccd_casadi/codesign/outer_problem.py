@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, violated
+from ccd_casadi.inner_problem.objective import constraint_shares, constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
 from ccd_casadi.plants.plant import constraint_values

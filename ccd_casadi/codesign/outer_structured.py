@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,21 +18,22 @@ from typing import cast
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
-from ccd_casadi.codesign.outer import End, is_expensive
-from ccd_casadi.codesign.outer_theta import ThetaOuter
+from ccd_casadi.codesign.outer import End, Place, is_expensive
+from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
+from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
-from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import (
     StructuredValue,
@@ -47,10 +48,10 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import (
-    certify_lattice,
+    checked_whole,
     fresh_yield,
-    proof_of,
     tolerance_prices,
+    worse_elsewhere,
     worst_case,
 )
 from ccd_casadi.inner_problem.structured_search import (
@@ -71,6 +72,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
+from ccd_casadi.support.threads import alongside
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def with_initial_search(
 def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
     """A multi-start search at the θ of a sample, from its controller too, with all its optima,
     counted; from the store if it is there."""
-    problem, theta = with_warm_start(sampler.problem, np.array(best.kappa), ()), best.theta
+    problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
 
     def multistart() -> StructuredValue:
         made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
@@ -158,7 +160,8 @@ def printer(label: str, quiet: bool) -> Callable[[str], None]:
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
 WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
-LOOKS, APART = 5, 100  # for plants that an end does not keep, each elsewhere in the box
+LOOKS, APART = 5, 101  # for plants that an end does not keep, each elsewhere in the box
+LOOKS_OF_ELEMENTS = 2  # of these, and in this process, which knows the elements
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -215,6 +218,22 @@ class StructuredOuter(ThetaOuter):
             outer.sampler.value_from(theta, sections_kappa(folder, structure_of(problem)))
         return outer
 
+    def local_solve(
+        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
+    ) -> Place | None:
+        """By the joint search where J counts the bandwidth, on the worse plants of its way."""
+        if self.problem.figure is not BANDWIDTH or settled is not None:
+            return super().local_solve(sample, known, settled)
+        tell = printer("local solve", self.sampler.quiet)
+        ends = [(place.x, place.objective) for place in known]
+        sampler, best, ended = joint_search(self.sampler, np.array(sample.theta), tell, ends)
+        J = objective_of(sampler.problem, best)
+        if not np.isfinite(J):
+            return None
+        if best.theta != sample.theta:
+            self.sampler.value_from(best.theta, best.kappa)  # a polish there begins with it
+        return Place(np.array(best.theta), J, ended)
+
     def polished(self, x: Array) -> StructuredEnd:
         sampler, theta = self.sampler, self.theta_of(x)
         for _ in range(TAKEN):
@@ -240,14 +259,14 @@ class StructuredOuter(ThetaOuter):
         judge the answer."""
         end = cast(StructuredEnd, end)
         problem, theta, scenarios = end.sampler.problem, end.best.theta, end.scenarios
-        tell = printer("at the end", end.sampler.quiet)
-        for look in range(1, LOOKS + 1 if end.feasible and not scenarios else 1):
-            scenarios = worst_case(problem, theta, end.found.design, APART + look, tell)[1]
-            if scenarios:
-                break
+        if end.feasible and not scenarios:
+            few, tell = is_expensive(problem), printer("at the end", end.sampler.quiet)
+            turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
+            workers = Workers(1) if few else end.sampler.workers
+            scenarios = worse_elsewhere(problem, theta, end.found.design, turns, workers, tell)
         if not scenarios:
             return None
-        anchored = with_warm_start(problem, end.found.design.kappa, ())
+        anchored = with_warm_start(problem, end.found.design.kappa)
         return StructuredOuter(with_scenarios(end.sampler.of(anchored), scenarios))
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
@@ -257,23 +276,28 @@ class StructuredOuter(ThetaOuter):
         multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        beside = partial(objectives_beside, problem, best)
         known = is_expensive(problem) and problem.figure is BANDWIDTH
-        kkt = theta_kkt(problem, best, sampler, end.found.envelope, beside if known else None)
-        wide, checked = certify_lattice(
-            problem, best.theta, made.controller, worst, sampler.workers
-        )
-        proof = proof_of(problem, best.theta, made, sampler.workers)
-        drawn = (
-            None if proof.conclusive else fresh_yield(problem, best.theta, made, sampler.workers)
-        )
-        with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+        beside = partial(objectives_beside, problem, best) if known else None
+        certificate = partial(theta_kkt, problem, best, sampler, end.found.envelope, beside)
+        kkt = None if known else certificate()  # which spreads values over the workers itself
+
+        def judged() -> tuple[SetCertificate, int, Proof, Yield | None]:
+            whole = checked_whole(problem, best.theta, made, worst, sampler.workers)
+            if whole[-1].conclusive:
+                return *whole, None
+            return *whole, fresh_yield(problem, best.theta, made, sampler.workers)
+
+        with alongside(judged) as result, Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+            kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
-            told = None
+            prices = tolerance_prices(problem, best.theta, made)
+            survival = survived(problem, loops, made.bandwidth)[0] if made.certified else None
+            damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, made.controller, best.value)
+            wide, checked, proof, drawn = result()
             bar.advance()
         return VerifiedStructured(
             problem=problem,
@@ -284,8 +308,8 @@ class StructuredOuter(ThetaOuter):
             kkt=kkt,
             inner_gap=float(max(_gap(problem, best, multistart), 0.0)),
             feasible=made.certified and not violated(problem, best.theta),
-            survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
-            damping=other_damping(problem, loops),
+            survival=survival,
+            damping=damping,
             design=made,
             multistart=multistart,
             wide=wide,
@@ -295,7 +319,7 @@ class StructuredOuter(ThetaOuter):
             worst=worst,
             rounds=rounds,
             costs=costs,
-            prices=tolerance_prices(problem, best.theta, made),
+            prices=prices,
             gap=gap,
             told=told,
         )
@@ -320,8 +344,12 @@ def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSam
     if problem.figure is BANDWIDTH:
         sampler, best, _ = joint_search(sampler, theta, printer("on the way", sampler.quiet))
         problem = sampler.problem
-        if best.feasible and (is_expensive(problem) or _stationary(sampler, best)):
+        if best.feasible and is_expensive(problem):
             return sampler, best
+        if best.feasible:  # optimal to first order, by the gradients of several sides of it
+            kkt = theta_kkt(problem, best, envelope=value_with_design(sampler, best).envelope)
+            if kkt.stationarity <= VerifiedStructured.kkt_level:
+                return sampler, best
         theta = np.array(best.theta)
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
@@ -331,10 +359,3 @@ def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSam
     if theta_kkt(problem, best).stationarity > STATIONARY:
         best = pieces_from(sampler, best, LEVEL)
     return sampler, best
-
-
-def _stationary(sampler: Sampler, best: InnerSample) -> bool:
-    """Whether a sample is optimal to first order, by the gradients of several sides of it."""
-    envelope = value_with_design(sampler, best).envelope
-    kkt = theta_kkt(sampler.problem, best, envelope=envelope)
-    return kkt.stationarity <= VerifiedStructured.kkt_level

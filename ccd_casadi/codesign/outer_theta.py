@@ -1,6 +1,7 @@
 """The outer problem over θ alone: of any kind of controller whose value has a gradient at each θ.
 
-A formulation works on v(θ) with its envelope gradients. A kind adds what only it knows: how a value
+A formulation works on v(θ) with its envelope gradients, local solves by steps that pass its kinks
+(`optim.pieces`). A kind adds what only it knows: how a value
 is held against a wider search, and how the design is judged.
 """
 
@@ -15,13 +16,19 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.theta_direct import FAR, SETTLED, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
-from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.optim.pieces import FIRST
+from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
+from ccd_casadi.inner_problem.problem import box
+from ccd_casadi.optim.pieces import FIRST, Local, descend
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+
+SETTLED = 1e-7  # of J: what steps promise less than that is not looked for
+FAR = 0.1  # of the box: the first radius where the optimum is not known to be near by
+FOLLOWED = 3  # descents at most, each with the better controllers that the one before has found
+STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 
 class ThetaOuter(Outer, ABC):
@@ -33,12 +40,10 @@ class ThetaOuter(Outer, ABC):
     def global_check_is_cheap(self) -> bool:
         return False
 
-    def solve_on_surrogates(
-        self, formulation: Nested | Lifted, seed: int, given: KnownSamples | None = None
+    def solve_lifted(
+        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
         """Nested; what is lifted are the exact gradients, as x is θ."""
-        if isinstance(formulation, Nested):
-            return solve_nested(self.sampler, formulation, seed=seed, given=given)
         options = Nested(
             "sobol", formulation.points or 6 * len(self.problem.names), formulation.starts,
             formulation.tolerance, formulation.max_refinements, formulation.kernel,
@@ -74,3 +79,42 @@ class ThetaOuter(Outer, ABC):
 
     def responses(self, x: Array) -> PostOptimal:
         raise UserError("insight has no derivatives of an optimum of this kind of controller")
+
+
+def pieces_from(
+    sampler: Sampler, best: InnerSample, settled: float, first: float = FIRST
+) -> InnerSample:
+    """From a sample to where the pieces of J promise no more, with what is known near by.
+
+    Again from the best where a better controller was found on the way for what had been known.
+    """
+    problem, asked = sampler.problem, [best]
+    lower, upper = box(problem)
+    width = upper - lower
+
+    def at(z: Array) -> Local | None:
+        theta = np.clip(lower + width * z, lower, upper)
+        asked.extend(sampler.values(theta, "local solve"))
+        return local(asked[-1])
+
+    def local(sample: InnerSample) -> Local | None:
+        J, gradient = objective_of(problem, sample), objective_gradient(problem, sample)
+        if not (np.isfinite(J) and np.isfinite(gradient).all()):
+            return None
+        return Local((np.array(sample.theta) - lower) / width, J, gradient)
+
+    def constraints(z: Array) -> tuple[Array, Array]:
+        found = hardware_at(problem, lower + width * z)
+        return found.constraints, found.slopes
+
+    steps = STEPS * len(lower)
+    for _ in range(FOLLOWED):
+        start, improvements = local(best), sampler.improvements
+        if start is None:
+            break
+        others = [found for found in map(local, sampler.solved.values()) if found is not None]
+        descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
+        best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
+        if sampler.improvements == improvements:
+            break
+    return best

@@ -11,6 +11,7 @@ that it was certified at, or is reported as not robust to it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from math import inf
 from typing import Any
@@ -54,11 +55,11 @@ class RobustCheck:
         """Whether the set is kept, and where it is worst."""
         at = f"at {100 * self.at.shift:+.2g} %, damping x {self.at.damping:.3g}"
         if self.peak == inf:
-            return f"unstable within its own robust set, {at}"
+            return f"unstable within the [robust] set, {at}"
         peak = f"peak of S {self.peak:.4g} {at}"
         if self.passed:
-            return f"its own robust set is kept ({self.plants} plants, worst {peak})"
-        return f"its own robust set is not kept: {peak}"
+            return f"the [robust] set is kept ({self.plants} plants, worst {peak})"
+        return f"the [robust] set is not kept: {peak}"
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class OtherDamping:
         if not self.other:
             return f"a loop is unstable {where}"
         found = [
-            f"{name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
+            f"{'S' if name == 'S_max' else name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
             for name, share in self.other.items()
             if share - max(1.0, self.own[name]) > MATTERS
         ]
@@ -198,12 +199,9 @@ def check_references(
     """The design's controller on every reference of the problem's plant at θ."""
     names = tuple(plant_of(problem).references)
     tasks = [(problem, tuple(theta), design, name) for name in names]
-    found = {}
-    with Progress(len(tasks), "closer models", quiet=quiet) as progress:
-        for check in (workers or Workers(1)).map_unordered(_unit, tasks):
-            found[check.name] = check
-            progress.advance()
-    return tuple(found[name] for name in names)
+    checks = (workers or Workers(1)).map_unordered(_unit, tasks)
+    bar = Progress(len(tasks), "closer models", quiet=quiet)
+    return tuple(sorted(bar.over(checks), key=lambda check: names.index(check.name)))
 
 
 def _unit(task: tuple[CoDesignProblem, tuple[float, ...], Design, str]) -> ReferenceCheck:
@@ -216,14 +214,8 @@ def check_on(
 ) -> ReferenceCheck:
     """The design's controller on one plant, given by its matrices."""
     closer = scale_plant(modal_plant(system, problem.suspension), problem.weights.M_K)
-    outcome = Outcome.CERTIFIED
-    for gamma in (design.figures.certificate.norm_bound, UNBOUNDED):
-        figures = measure(
-            closer, design.controller, design.weights, gamma=gamma,
-            omega_low=problem.inner.omega_low,
-        )  # fmt: skip
-        if gamma != UNBOUNDED:
-            outcome = figures.outcome
-        if figures.certified:
-            break
-    return ReferenceCheck(name, outcome, figures)
+    at = partial(measure, closer, design.controller, design.weights,
+                 omega_low=problem.inner.omega_low)  # fmt: skip
+    figures = at(gamma=design.figures.certificate.norm_bound)
+    outcome = figures.outcome
+    return ReferenceCheck(name, outcome, figures if figures.certified else at(gamma=UNBOUNDED))

@@ -22,7 +22,7 @@ from ccd_casadi.codesign.outer_problem import (
     unmet_constraint,
 )
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.theta_direct import FAR, pieces_from
+from ccd_casadi.codesign.outer_theta import FAR, SETTLED, pieces_from
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.inner_problem.objective import objective_of
@@ -43,7 +43,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from surrogates import design
 
-SETTLED = 1e-7  # of J: what local steps promise less than that is not looked for
 INSIDE = 1e-7  # of λ
 
 

@@ -27,8 +27,12 @@ from scipy.linalg import qr
 from scipy.optimize import nnls
 
 from ccd_casadi.fixed_structure.optimality import Envelope
-from ccd_casadi.inner_problem.constraints import constraint_sizes
-from ccd_casadi.inner_problem.objective import hardware_at, objective, objective_gradient
+from ccd_casadi.inner_problem.objective import (
+    constraint_sizes,
+    hardware_at,
+    objective,
+    objective_gradient,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import (
     STEP,

@@ -8,7 +8,7 @@ from ccd_casadi.codesign.design_entries import controller_dict, mixed_dict
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import State, VerdictLine, survives
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.inner_problem.constraints import binding
+from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array

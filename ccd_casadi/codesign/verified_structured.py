@@ -19,9 +19,9 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.constraints import binding
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
@@ -50,9 +50,7 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
     model = tuple(map(float, uncertain_plant(problem, theta).nominal))
 
     def climbed(easier: StructuredProblem) -> float:
-        value = structured_value(
-            with_warm_start(replace(problem, controller=easier), kappa, ()), theta
-        )
+        value = structured_value(with_warm_start(replace(problem, controller=easier), kappa), theta)
         return value.bandwidth if value.feasible else float("nan")
 
     return Costs(
@@ -152,8 +150,7 @@ class VerifiedStructured(Verified):
             found["varies"] = {name: ends for name, *ends in structured.uncertainty.ranges}
         if self.told is not None:
             time, drawn = self.told
-            found |= {"move_time": time,
-                      "move_time_fresh": None if drawn is None else drawn.entry}  # fmt: skip
+            found |= {"move_time": time, "move_time_fresh": None if drawn is None else drawn.entry}
         if structured.weighted_level is None:
             words = "KS and T are not bounded: the case gives no controller.weighted_level"
             found["notes"] = [*plant_of(self.problem).notes(self.theta), words]

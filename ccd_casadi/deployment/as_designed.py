@@ -11,7 +11,6 @@ from ccd_casadi.deployment.reduction import ReducedController, Reduction
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structure_of
 from ccd_casadi.support.errors import UserError
 
@@ -63,7 +62,7 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
         decoupling, parts = structure.decoupling, []
         for i, (own, values) in enumerate(structure.split(kappa)):
             u, v = decoupling.outputs[:, [i]], decoupling.inputs[:, [i]]
-            plant, K = along_directions(run.plant, u, v), state_space(own, values)
+            plant, K = along_directions(run.plant, u, v), own.state_space(values)
             parts.append((LoopChannel(decoupling.names[i], u, v, plant, K), own, values))
     found = []
     for channel, own, values in parts:

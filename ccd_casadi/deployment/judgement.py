@@ -41,7 +41,7 @@ def assess(
     figures = {at: sampled_figures(loop) for at, loop in loops.items()}
     at_rest = statics(
         plants[nominal], K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low
-    )  # fmt: skip
+    )
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:
         most = structured_of(run.problem).compliance_max

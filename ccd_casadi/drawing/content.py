@@ -5,7 +5,6 @@ Made where the figures are known, kept in `report.json` (`stored`) and painted b
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import isfinite
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE, require_shapes
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.json_files import json_values
 
 Fact = tuple[str, str, str]  # quantity, value, remark
 INDEX = "index.html"  # of a run's folder
@@ -116,19 +116,13 @@ class Table:
     rows: tuple[tuple[Any, ...], ...]
 
     def __post_init__(self) -> None:
-        rows = tuple(tuple(_cell(value) for value in row) for row in self.rows)
+        rows = tuple(tuple(json_values(row)) for row in self.rows)
         object.__setattr__(self, "rows", rows)
 
     @staticmethod
     def of(head: Sequence[str], *columns: Iterable[Any]) -> "Table":
         """From columns of equal length."""
         return Table(tuple(head), tuple(zip(*columns, strict=True)))
-
-
-def _cell(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not isfinite(value) else value
 
 
 @dataclass(frozen=True)

@@ -76,8 +76,7 @@ def scales_of(axes: "Axes", log_x: bool = False, log_y: bool = False) -> list[li
         (axes.get_xlim(), log_x, box[0], box[2]),
         (axes.get_ylim(), log_y, tall - box[1], tall - box[3]),
     )
-    return [[*map(float, limits), int(log), round(a, 3), round(b, 3)]
-            for limits, log, a, b in ends]  # fmt: skip
+    return [[*map(float, limits), int(log), round(a, 3), round(b, 3)] for limits, log, a, b in ends]
 
 
 def in_points(axes: "Axes", x: Any, y: Any) -> np.ndarray:

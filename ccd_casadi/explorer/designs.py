@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.codesign.verdict import LEAST_SHIFT
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.inner_problem.constraints import violated
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
@@ -44,7 +44,7 @@ class Standing(StrEnum):
 
     KEPT = "certified, keeps its bounds"
     MISSED = "certified, misses a bound"
-    NEAR = "not certified yet: the plant is not the model's own"
+    NEAR = "not certified yet: the plant is approximated"
     REFUSED = "not certified"
 
 
@@ -57,7 +57,7 @@ class Elements:
 
     system: Mechanics
     error: float = 0.0
-    words: str = "the model's own"
+    words: str = "exact"
 
     @property
     def exact(self) -> bool:
@@ -198,7 +198,7 @@ def without_controller(
         modal=modal_plant(elements.system, problem.suspension),
         plant=scaled_system(problem, elements.system),
         weights=problem.weights,
-        figures=figures_from_row(failed_row(), 0.0, 0.0, 1.0),
+        figures=figures_from_row(failed_row(), problem.weights.at(0.0, 0.0), 1.0),
         controller=None,
         how=how,
         standing=Standing.REFUSED,
@@ -206,7 +206,7 @@ def without_controller(
         cost=hardware_cost(plant_of(problem), knobs.theta),
         active=(),
         seconds=0.0,
-    )  # fmt: skip
+    )
 
 
 def judged(

@@ -210,9 +210,9 @@ class Page:
         run, store = self.session.run, self.session.store.path
         made_for = None if run is None else run.problem
         look = self.now.look
-        self.map.show(*landscape_of(
-            look.problem, look.theta, made_for, self._surrogate, store, self.map.axes
-        ))  # fmt: skip
+        self.map.show(
+            *landscape_of(look.problem, look.theta, made_for, self._surrogate, store, self.map.axes)
+        )
         here, new = self.map.mark(look.theta)
         here.update(**new)
 

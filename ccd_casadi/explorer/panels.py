@@ -63,7 +63,8 @@ def drawn(look: Look, c: Curves | None, sampled: AsSampled | None) -> Drawn:
     G, K = size_panels(view)
     panels = {"S": S, "KS": KS, "T": T, "L": L, "phase": phase, "K": K, "G": G}
     if not certified:  # there is no ω_b
-        panels = {name: replace(panel, levels=tuple(v for v in panel.levels if not v.vertical))
+        panels = {name: replace(panel, levels=tuple(v for v in panel.levels if not v.vertical),
+                                marks=tuple(m for m in panel.marks if not m.text.startswith("ω_b")))
                   for name, panel in panels.items()}  # fmt: skip
     loci = list(loci_of(view.open[0]).T)
     panels |= {

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from bokeh.models import ColumnDataSource
 from bokeh.models.widgets.tables import (
     CellEditor,
@@ -21,6 +20,7 @@ from ccd_casadi.explorer.designs import Look
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure
 from ccd_casadi.explorer.panels import EMPTY, Drawn
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import display_unit
 
 HEIGHT = 150
@@ -115,7 +115,9 @@ class Pins:
         }  # fmt: skip
         for i, (name, scale) in enumerate(zip(self.names, self._scales, strict=True)):
             found[f"theta_{name}"] = [scale * look.theta[i] for look in looks]
-        return found | {name: [_plain(read(look)) for look in looks] for name, *_, read in FIGURES}
+        return found | {
+            name: json_values([read(look) for look in looks]) for name, *_, read in FIGURES
+        }
 
     def _show(self) -> None:
         self.source.selected.indices = []
@@ -125,10 +127,6 @@ class Pins:
         pinned = list(zip(colours, (drawn.panels for _, drawn in self.pinned), strict=True))
         for made in self.figures:
             made.pin([(colour, panels.get(made.name, EMPTY)) for colour, panels in pinned])
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _column(name: str, title: str, form: str, width: int) -> TableColumn:

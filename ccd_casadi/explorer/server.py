@@ -9,8 +9,12 @@ from pathlib import Path
 from bokeh.document import Document
 from bokeh.events import ClientReconnected, ConnectionLost
 from bokeh.models import CustomJS
-from bokeh.server.server import Server
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import bind_sockets
 from jinja2 import Template
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop
 from tornado.web import StaticFileHandler
 
 from ccd_casadi.drawing.page import theme
@@ -49,18 +53,18 @@ class Explorer:
         token = secrets.token_urlsafe(16)
         # a page from here may not link to a file of the disk
         solved = {"path": str(session.folder.resolve())}
-        self._server = Server(
+        sockets, port = bind_sockets(HOST, 0)
+        self.url = f"http://{HOST}:{port}/{token}/"
+        application = BokehTornado(
             {"/": self._document},
             prefix=token,  # of every path, the socket's and the scripts' too
-            address=HOST,
-            port=0,
+            extra_websocket_origins=[f"{HOST}:{port}"],  # Bokeh's own is localhost by name
             use_index=False,
-            num_procs=1,
             extra_patterns=[(rf"/{SOLVED}/(solved_\d+/.+)", StaticFileHandler, solved)],
         )
-        self.url = f"http://{HOST}:{self._server.port}/{token}/"
-        # known only now; Bokeh's own default is localhost by name
-        self._server._tornado._websocket_origins = {f"{HOST}:{self._server.port}"}
+        served = HTTPServer(application)
+        served.add_sockets(sockets)
+        self._server = BaseServer(IOLoop.current(), application, served)
         if session.known is not None:
             self.background.renew(session.known, self._renewed)
 
@@ -70,6 +74,7 @@ class Explorer:
         dark = arguments.get("dark", [b"0"])[0] == b"1"
         tab = arguments.get("tab", [b""])[0].decode("ascii", "replace")
         kept = self._kept.setdefault(tab, Kept()) if tab else Kept()
+        document.config.notify_connection_status = False  # the page says it, and what to do
         document.title = f"Explorer: {self.session.case.path.name}"
         document.template = Template(TEMPLATE.read_text(encoding="utf-8"))
         document.template_variables.update(

@@ -13,9 +13,8 @@ import numpy as np
 from ccd_casadi.explorer.designs import How, Look, Standing, elements_at, without_controller
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.fixed_structure import SetCertificate
-from ccd_casadi.fixed_structure.channel_structure import controller_of
-from ccd_casadi.fixed_structure.design import Progress
-from ccd_casadi.inner_problem.constraints import violated
+from ccd_casadi.fixed_structure.sections_design import Progress
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
@@ -75,7 +74,7 @@ def designed(task: tuple[CoDesignProblem, Knobs], tell: Progress) -> Designed:
 def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) -> Look:
     """A known controller at θ, judged on the model and the corners of its plant set."""
     began = perf_counter()
-    controller = controller_of(structure_of(problem), kappa)
+    controller = structure_of(problem).state_space(kappa)
     found = certify_corners(problem, knobs.theta, controller)
     elements = elements_at(problem, knobs.theta)
     broken = violated(problem, knobs.theta)

@@ -13,7 +13,7 @@ from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ, number, with_unit
 
 
 def standing_html(
@@ -113,4 +113,9 @@ def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
 def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
     """The first flexible modes on the plant's surface; empty for a plant that has none."""
     plant = plant_of(problem)
-    return "" if plant.shapes is None else modes_html(Modes(plant.shapes(theta, SHOWN_MODES)))
+    if plant.shapes is None:
+        return ""
+    pairs = zip(problem.names, problem.units, theta, strict=True)
+    shown = ", ".join(f"{name} = {with_unit(value, unit, 4)}" for name, unit, value in pairs)
+    modes = modes_html(Modes(plant.shapes(theta, SHOWN_MODES)))
+    return f"<p>modes of the last θ solved: {escape(shown)}</p>{modes}"

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from math import log
-from typing import Protocol
+from math import log, nan
 
 from ccd_casadi.synthesis.weights import Weights
 
@@ -17,6 +16,28 @@ def kind_and_channel(name: str) -> tuple[str, str]:
     """
     kind, _, channel = name.partition(" of ")
     return kind, channel
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelPeaks:
+    """What is held against a channel's own bounds: the largest values of its row of S, uᵀS, and of
+    KS with its own M_K over frequency (rad/s), and its bandwidth; NaN where unknown."""
+
+    S_peak: float = nan
+    S_peak_frequency: float = nan
+    bandwidth: float = nan
+    weighted_KS: float = nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopPeaks(ChannelPeaks):
+    """The same of a whole loop, largest singular values: KS in N/m, GS in m/N, S at ω_low."""
+
+    S_low: float = nan
+    KS: float = nan
+    T: float = nan
+    GS: float = nan
+    weighted_T: float = nan
 
 
 class ShapeEnd(StrEnum):
@@ -116,7 +137,7 @@ class Bounds:
                 raise ValueError(f"{words}; give more than 0, at most that of the weights")
 
     def of_channel(self, number: int) -> "Bounds":
-        """What a channel keeps that nothing couples to the others, its own bandwidth for ω_b."""
+        """The bounds of a channel that is not coupled to the others, ω_b being its bandwidth."""
         if not self.channels:
             return self
         own = self.channels[number]
@@ -145,7 +166,7 @@ class Bounds:
             channels=tuple(replace(own, S_max=times(own.S_max)) for own in self.channels),
         )
 
-    def shares(self, found: "Peaks") -> dict[str, float]:
+    def shares(self, found: LoopPeaks) -> dict[str, float]:
         """Every bound's figure over the bound; above 1 where it is not met."""
         shares = {"S_max": found.S_peak / self.S_max, "S_low": found.S_low / self.S_low}
         if self.weighted_level is not None:
@@ -155,8 +176,8 @@ class Bounds:
             shares["GS"] = found.GS / self.compliance_max
         return shares
 
-    def channel_shares(self, found: Sequence["ChannelPeaks"]) -> dict[str, float]:
-        """The same of the channels' own bounds; `found` as `channels` are."""
+    def channel_shares(self, found: Sequence[ChannelPeaks]) -> dict[str, float]:
+        """The same for the bounds of the channels; `found` in the order of `channels`."""
         shares = {}
         for own, figures in zip(self.channels, found, strict=True):
             if own.S_max is not None:
@@ -164,23 +185,3 @@ class Bounds:
             if own.M_K is not None and self.weighted_level is not None:
                 shares[f"KS of {own.name}"] = figures.weighted_KS / self.weighted_level
         return shares
-
-
-class ChannelPeaks(Protocol):
-    """What is held against a channel's own bounds: the largest values over frequency."""
-
-    @property
-    def S_peak(self) -> float: ...
-    @property
-    def weighted_KS(self) -> float: ...
-
-
-class Peaks(ChannelPeaks, Protocol):
-    """What is held against bounds: the largest values over frequency, S_low at ω_low."""
-
-    @property
-    def S_low(self) -> float: ...
-    @property
-    def weighted_T(self) -> float: ...
-    @property
-    def GS(self) -> float: ...

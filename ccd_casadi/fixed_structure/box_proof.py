@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_division import Division, divided, raised
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
@@ -85,7 +85,7 @@ class Proof:
         """One line."""
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
-            return f"{self.passed[0]} is passed by a factor of {self.passed[1]:.4g} at {at}"
+            return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"
         if not self.stable:
             return f"between these plants nothing is proven: {self.outcome.value}"
         worst = max(self.levels.values(), default=0.0)
@@ -119,26 +119,21 @@ def prove(
     names = uncertain.names
     many = isinstance(structure, ChannelStructure) or len(names) > FEW_PARAMETERS
     slack = slack or (SLACK_OF_MANY if many else SLACK)
-    outputs = inputs = np.eye(1)
-    if isinstance(structure, ChannelStructure):
-        outputs, inputs = structure.decoupling.outputs, structure.decoupling.inputs
+    outputs, inputs = structure.directions
     if len(uncertain.options[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
         return Proof(ProofOutcome.NOT_SQUARE, slack, names)
     if uncertain.ranges:
         return Proof(ProofOutcome.VARIES, slack, names)
     models = [uncertain.plant(uncertain.nominal, i).plant_si()
               for i in range(len(uncertain.options))]  # fmt: skip
-    K = controller_of(structure, kappa)
+    K = structure.state_space(kappa)
     if not all(Loop(model, K, sampling).stable for model in models):
         return Proof(ProofOutcome.UNSTABLE, slack, names)
     fastest = max(float(np.abs(model.rates).max()) for model in models)
     unit = ABOVE * max(bandwidth, fastest, bounds.omega_low)
     period = None if sampling is None else sampling.period * unit
     delay = 0.0 if sampling is None else sampling.delay * unit
-    own = structure.in_units(kappa, 1.0 / unit, 1.0)
-    parts = ((structure, own),) if isinstance(structure, Structure) else (
-        tuple(structure.split(own))
-    )  # fmt: skip
+    parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
     families = []
     for option in range(len(models)):
         plant = modal_sum(uncertain, option, unit)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, matrix_balance
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds, ChannelPeaks, LoopPeaks
 from ccd_casadi.fixed_structure.certificate_curves import (
     crossing_and_bandwidth,
     frequency_grid,
@@ -38,23 +38,15 @@ REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures'
 
 
 @dataclass(frozen=True)
-class ChannelFigures:
-    """One channel's row of S, uᵀS, as `PlantFigures` has the whole; NaN without bounds of its own.
-
-    `bandwidth`: the largest ω_i that the shape allows it. `weighted_KS` is of its row of KS, with
-    its own M_K, where that is bounded.
-    """
+class ChannelFigures(ChannelPeaks):
+    """One channel's; `bandwidth`: the largest ω_i that the shape allows it."""
 
     name: str
-    S_peak: float = np.nan
-    S_peak_frequency: float = np.nan
-    bandwidth: float = np.nan
-    weighted_KS: float = np.nan
 
 
 @dataclass(frozen=True)
-class PlantFigures:
-    """One plant's loop in SI. Frequencies in rad/s; KS in N/m, GS in m/N; NaN where unstable.
+class PlantFigures(LoopPeaks):
+    """One plant's loop in SI; NaN where it is unstable.
 
     `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
     `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
@@ -65,16 +57,7 @@ class PlantFigures:
 
     stable: bool
     stability: float
-    S_peak: float = np.nan
-    S_peak_frequency: float = np.nan
-    S_low: float = np.nan
     crossing: float = np.nan
-    bandwidth: float = np.nan
-    KS: float = np.nan
-    T: float = np.nan
-    GS: float = np.nan
-    weighted_KS: float = np.nan
-    weighted_T: float = np.nan
     static_compliance: float = np.nan
     low_compliance: float = np.nan
     confirmed: bool = False
@@ -108,7 +91,7 @@ def certify(
     plants, controller : sequence of ScaledPlant, StateSpace
         All of the set; e in, u out.
     bounds, integrator : Bounds, bool
-        Of channels with bounds of their own those besides. The shape counts from 0 on, or ω_low.
+        With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
         None: a continuous loop; the plants are spread over them.
 
@@ -254,8 +237,10 @@ def _rows(
     _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, own.output)
     missing = np.full(len(grid), np.nan)
     weighted = tops.get(f"weighted KS of {own.name}", (missing, missing))[0]
-    numbers = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1)
-    return [ChannelFigures(own.name, *figures) for figures in numbers.tolist()], confirmed
+    columns = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1).tolist()
+    names = ("S_peak", "S_peak_frequency", "bandwidth", "weighted_KS")
+    found = [ChannelFigures(own.name, **dict(zip(names, row, strict=True))) for row in columns]
+    return found, confirmed
 
 
 def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:

@@ -10,7 +10,6 @@ sensors (fewer outputs than channels) it starts from random controllers that are
 
 from collections.abc import Sequence
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 
@@ -18,18 +17,18 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike, composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
-from ccd_casadi.fixed_structure.design import Progress, concluded, synthesise_sections
+from ccd_casadi.fixed_structure.design import synthesise_sections
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.race import LocalOptimum, run_race, started
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
+    DesignSearch,
+    Progress,
     SectionsDesign,
-    SectionsOutcome,
-    designed,
-    failed,
     in_problem_units,
     span_of,
+    titled,
 )
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
@@ -65,9 +64,8 @@ def synthesise(
             initial=initial, only_initial=only_initial, frequencies=frequencies, progress=progress,
             workers=workers,
         )  # fmt: skip
-    begun = perf_counter()
-    tell = progress or (lambda words: None)
     problem = composite_problem(plants, structure, bounds, sampling, frequencies, MARGIN)
+    search = DesignSearch(problem, plants, sampling, seed, progress)
     alike = [in_units_of(plant, plants[0]) for plant in plants]
     span = span_of(problem)
 
@@ -112,8 +110,7 @@ def synthesise(
                 synthesise_sections(
                     members, own, own_limits[i], sampling=sampling, starts=starts, seed=seed,
                     initial=begins, only_initial=only_initial or again, frequencies=span,
-                    workers=workers,
-                    progress=lambda words, name=name: tell(f"channel {name}: {words}"),  # type: ignore[misc]
+                    workers=workers, progress=titled(search.tell, f"channel {name}"),
                 )
             )  # fmt: skip
         return found
@@ -124,12 +121,10 @@ def synthesise(
                  if not one.certified]  # fmt: skip
         if short:
             name, one = short[0]
-            words = f"channel {name}: {one.words}"
-            return failed(problem, one.outcome, words, seed, begun)
-        return _joined(problem, plants, sampling, made, seed, begun)
-    pool = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
-    field = _stable(problem, pool)
-    evaluations, known = len(pool), len(field)
+            return search.failed(one.outcome, f"channel {name}: {one.words}")
+        return _joined(search, problem, made)
+    field = _stable(problem, search.inside(initial))
+    evaluations, known = len(initial), len(field)
     shared = len(structure.decoupling.outputs) < len(structure.structures)
     if shared and not only_initial:
         rng = np.random.default_rng(seed)
@@ -139,48 +134,37 @@ def synthesise(
         before: list[SectionsDesign] = []
         for share in TIGHTENED:
             before = channels(share, before)
-            stack = _stacked(problem, before)
+            stack = _stacked(structure, before)
             evaluations += 1
-            fresh = [] if stack is None else _stable(problem, [stack])
+            fresh = _stable(problem, search.inside([stack])) if np.isfinite(stack).all() else []
             field += fresh
             if fresh:
                 break
     if not field:
-        return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
-    runners = run_race(
-        problem, np.array(field), lambda words: tell(f"whole loop: {words}"), workers, known=known
-    )
-    return concluded(problem, plants, sampling, runners, len(field), evaluations, seed, begun, tell)
+        return search.failed()
+    tell = titled(search.tell, "whole loop")
+    runners = run_race(problem, np.array(field), tell, workers, known=known)
+    return search.concluded(runners, len(field), evaluations)
 
 
 def _joined(
-    problem: CompositeProblem,
-    plants: Sequence[ScaledPlant],
-    sampling: Sampling | None,
-    made: Sequence[SectionsDesign],
-    seed: int,
-    begun: float,
+    search: DesignSearch, problem: CompositeProblem, made: Sequence[SectionsDesign]
 ) -> SectionsDesign:
     """The channels' designs as one, with the bandwidth of the slowest."""
-    kappa = np.concatenate([made[i].kappa for i in problem.structure.free])
+    kappa = _stacked(problem.structure, made)
     inside = in_problem_units(problem, kappa)
     leads = (problem.bounds.lead(i) for i in range(len(made)))
     slowest = min(one.bandwidth / np.exp(lead) for one, lead in zip(made, leads, strict=True))
     tau = float(np.log(slowest / problem.plants.omega_0))
     point = Point(inside, tau, assess(problem, inside, tau))
     optima = (LocalOptimum(slowest, 1, tuple(map(float, kappa))),)
-    evaluations = sum(one.evaluations for one in made)
     starts = sum(one.starts for one in made)
-    return designed(problem, plants, sampling, point, optima, starts, evaluations, seed,
-                    perf_counter() - begun)  # fmt: skip
+    return search.designed(point, optima, starts, sum(one.evaluations for one in made))
 
 
-def _stacked(problem: CompositeProblem, made: Sequence[SectionsDesign]) -> Array | None:
-    """The channels' parameters in the units of the problem, None where one has found none."""
-    kappa = np.concatenate([made[i].kappa for i in problem.structure.free])
-    if not np.isfinite(kappa).all():
-        return None
-    return np.clip(in_problem_units(problem, kappa), *problem.box)
+def _stacked(structure: ChannelStructure, made: Sequence[SectionsDesign]) -> Array:
+    """The channels' parameters in SI as one κ."""
+    return np.concatenate([made[i].kappa for i in structure.free])
 
 
 def _stable(problem: CompositeProblem, pool: Sequence[Array]) -> list[Array]:

@@ -4,16 +4,15 @@ Channels may share their parameters, as tip and tilt of a square stage do: a loa
 of one what the same load to the other asks of the other.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from ccd_casadi.fixed_structure.decoupling import Decoupling
-from ccd_casadi.fixed_structure.structure import Kind, Structure, roots, state_space
+from ccd_casadi.fixed_structure.structure import Kind, Structure
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -85,10 +84,15 @@ class ChannelStructure:
         own = dict(zip(self.free, (slice(a, b) for a, b in pairwise(ends)), strict=True))
         return tuple(own[self.owner(i)] for i in range(len(self.structures)))
 
+    @property
+    def directions(self) -> tuple[Array, Array]:
+        """U (p, c) of outputs and V (m, c) of inputs of its channels."""
+        return self.decoupling.outputs, self.decoupling.inputs
+
     def split(self, kappa: Array) -> Iterator[tuple[Structure, Array]]:
-        """The structure and the parameters of each channel."""
+        """The structure and the parameters (..., n) of each channel."""
         for own, place in zip(self.structures, self.slices, strict=True):
-            yield own, kappa[place]
+            yield own, kappa[..., place]
 
     def bounds(self, frequencies: tuple[float, float], gains: tuple[float, float]) -> Array:
         """Lower and upper bounds (2, n) of κ for frequencies and gains within these."""
@@ -101,24 +105,26 @@ class ChannelStructure:
 
     def state_space(self, kappa: Array) -> StateSpace:
         """K, outputs of the plant to its inputs."""
-        system = self.diagonal(kappa)
-        U, V = self.decoupling.outputs, self.decoupling.inputs
-        return StateSpace(system.A, system.B @ U.T, V @ system.C, V @ system.D @ U.T)
+        A, B, C, D = (part[0] for part in self.state_spaces(np.asarray(kappa, float)[None]))
+        U, V = self.directions
+        return StateSpace(A, B @ U.T, V @ C, V @ D @ U.T)
 
-    def diagonal(self, kappa: Array) -> StateSpace:
-        """diag(K_1, …, K_c) alone."""
-        parts = [state_space(own, part) for own, part in self.split(np.asarray(kappa, float))]
-        A, B, C, D = (block_diag(*(getattr(part, name) for part in parts)) for name in "ABCD")
-        return StateSpace(A, B, C, D)
+    def state_spaces(self, kappa: Array) -> tuple[Array, Array, Array, Array]:
+        """diag(K_1, …, K_c) alone of many parameters κ (N, n), as `Structure` has them."""
+        parts = zip(*(own.state_spaces(part) for own, part in self.split(kappa)), strict=True)
+        A, B, C, D = map(_diagonal, parts)
+        return A, B, C, D
 
     def roots(self, kappa: Array) -> tuple[np.ndarray, np.ndarray]:
         """Zeros and poles of all channels."""
-        zeros, poles = zip(*(roots(own, part) for own, part in self.split(kappa)), strict=True)
+        zeros, poles = zip(*(own.roots(part) for own, part in self.split(kappa)), strict=True)
         return np.concatenate(zeros), np.concatenate(poles)
 
 
-def controller_of(structure: Structure | ChannelStructure, kappa: Array) -> StateSpace:
-    """K of either kind, in the units of κ."""
-    if isinstance(structure, ChannelStructure):
-        return structure.state_space(kappa)
-    return state_space(structure, kappa)
+def _diagonal(blocks: Sequence[Array]) -> Array:
+    """Blocks (N, p_i, m_i) as block-diagonal matrices (N, Σ p_i, Σ m_i)."""
+    shapes = np.array([block.shape[1:] for block in blocks])
+    out = np.zeros((len(blocks[0]), *shapes.sum(axis=0)), np.result_type(*blocks))
+    for (i, j), block in zip(np.cumsum(shapes, axis=0) - shapes, blocks, strict=True):
+        out[:, i : i + block.shape[1], j : j + block.shape[2]] = block
+    return out

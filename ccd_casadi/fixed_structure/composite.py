@@ -14,17 +14,15 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of, is_decoupled
-from ccd_casadi.fixed_structure.figures import assess, hessians, to_theta
+from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
     LoopProblem,
-    MatrixProblem,
+    Places,
     Problem,
-    plant_of_row,
 )
-from ccd_casadi.kernels.limits import Curve
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -66,7 +64,7 @@ class CompositeProblem(LoopProblem):
     @property
     def separable(self) -> bool:
         """Whether every plant falls apart, so that each channel can be designed on its own."""
-        return not any(isinstance(part.problem, MatrixProblem) for part in self.parts)
+        return all(part.channel is not None for part in self.parts)
 
     def rows_of(self, number: int) -> tuple[int, int]:
         """The range of numbers of rows of a part."""
@@ -86,6 +84,31 @@ class CompositeProblem(LoopProblem):
                                  own.to_kappa[:, part.place], own.to_tau)  # fmt: skip
             found.append((part, at, inside))
         return found
+
+    def kinds_of(self, found: Constraints) -> list[str]:
+        """As `LoopProblem` has them, of channels with bounds of their own by channel."""
+        names = super().kinds_of(found)
+        if not self.bounds.channels:
+            return names
+        for part, at, inside in self.split(found):
+            for j, row in zip(at.tolist(), inside.plant.tolist(), strict=True):
+                channel = part.channel
+                if channel is None:
+                    past = row // part.problem.plants.count - part.problem.first
+                    if past < 0:
+                        continue
+                    channel = past
+                own = self.bounds.channels[channel]
+                if {"S_MAX": own.S_max, "KS": own.M_K}.get(names[j]) is not None:
+                    names[j] += f" of {own.name}"
+        return names
+
+    def plants_of(self, found: Constraints) -> np.ndarray:
+        """Of all."""
+        out = np.zeros(len(found.v), int)
+        for part, at, own in self.split(found):
+            out[at] = part.members[part.problem.plants_of(own)]
+        return out
 
 
 def composite_problem(
@@ -128,7 +151,7 @@ def composite_problem(
     if len(together):
         matrices = plant_set([alike[j] for j in together], sampling, structure.decoupling)
         place = structure.places
-        whole = MatrixProblem(matrices, structure.apart, bounds, box[:, place], margin)
+        whole = LoopProblem(matrices, structure.apart, bounds, box[:, place], margin)
         parts.append(Part(whole, place, together))
     plant_units = parts[0].problem.plants
     return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
@@ -151,18 +174,35 @@ def _(
     seen = [one.stable for one in found]
     if not (any(seen) if each else all(seen)):
         return Assessment(False, poles, None, None)
-    sides = []
-    for side in ("peaks", "near"):
-        rows = []
-        for number, (part, one) in enumerate(zip(problem.parts, found, strict=True)):
-            own = getattr(one, side)
-            if own is None:
-                continue
+    peaks, near = [], []
+    for number, (part, one) in enumerate(zip(problem.parts, found, strict=True)):
+        own, start = one.peaks, problem.rows_of(number)[0]
+        if own is not None and one.near is not None:
             wide = own.to_kappa @ part.spread(len(kappa))
-            start = problem.rows_of(number)[0]
-            rows.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
-        sides.append(Constraints(*(np.concatenate(column) for column in zip(*rows, strict=True))))
-    return Assessment(True, poles, sides[0], sides[1])
+            peaks.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
+            near.append((one.near.curve, one.near.plant + start, one.near.v))
+    columns = (map(np.concatenate, zip(*rows, strict=True)) for rows in (peaks, near))
+    return Assessment(True, poles, Constraints(*next(columns)), Places(*next(columns)))
+
+
+@constraints.register
+def _(
+    problem: CompositeProblem,
+    kappa: Array,
+    tau: float,
+    curve: np.ndarray,
+    row: np.ndarray,
+    v: Array,
+) -> Constraints:
+    value, to_kappa, to_tau = np.zeros(len(v)), np.zeros((len(v), len(kappa))), np.zeros(len(v))
+    found = Constraints(curve, row, v, value, to_kappa, to_tau)
+    for part, at, own in problem.split(found):
+        inside = constraints(
+            part.problem, kappa[part.place], tau + part.lead, own.curve, own.plant, own.v
+        )
+        value[at], to_tau[at] = inside.value, inside.to_tau
+        to_kappa[at] = inside.to_kappa @ part.spread(len(kappa))
+    return found
 
 
 @to_theta.register
@@ -203,33 +243,3 @@ def answer_alike(a: Sequence[ScaledPlant], b: Sequence[ScaledPlant]) -> bool:
     v = np.tile(v, len(a))
     one, other = first.responses(which, v)[0], second.responses(which, v)[0]
     return bool((np.abs(one - other) <= ALIKE * np.abs(one)).all())
-
-
-def kinds_of_rows(problem: LoopProblem, found: Constraints) -> list[str]:
-    """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
-    names = [Curve(int(code)).name for code in found.curve]
-    if not isinstance(problem, CompositeProblem) or not problem.bounds.channels:
-        return names
-    for part, at, inside in problem.split(found):
-        for j, row in zip(at.tolist(), inside.plant.tolist(), strict=True):
-            channel = part.channel
-            if isinstance(part.problem, MatrixProblem):
-                past = row // part.problem.plants.count - part.problem.first
-                channel = past if past >= 0 else None
-            if channel is None:
-                continue
-            own = problem.bounds.channels[channel]
-            given = {"S_MAX": own.S_max, "KS": own.M_K}
-            if given.get(names[j]) is not None:
-                names[j] += f" of {own.name}"
-    return names
-
-
-def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:
-    """The number of the plant that each row is of."""
-    if not isinstance(problem, CompositeProblem):
-        return plant_of_row(problem, found.plant)
-    out = np.zeros(len(found.v), int)
-    for part, at, own in problem.split(found):
-        out[at] = part.members[plant_of_row(part.problem, own.plant)]
-    return out

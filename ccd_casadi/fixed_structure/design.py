@@ -1,11 +1,10 @@
 """The largest bandwidth of a fixed structure on a set of plants: starts, search, certificate.
 
 The best end of a multi-start search whose controller passes the judge (`certificate`) is the
-design.
+design; its bandwidth has gradients to the hardware by the envelope theorem.
 """
 
-from collections.abc import Callable, Sequence
-from time import perf_counter
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -14,16 +13,16 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import ascend
+from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.race import SAME, Runner, distinct, finished, local_optima, run_race
+from ccd_casadi.fixed_structure.optimality import Envelope, envelope_of, optimality
+from ccd_casadi.fixed_structure.race import SAME, distinct, run_race
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
+    DesignSearch,
+    Progress,
     SectionsDesign,
-    SectionsOutcome,
-    designed,
-    failed,
     in_problem_units,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
@@ -33,14 +32,11 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
+LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 REDRAWS = 2  # searches at most from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
 POOL = 12  # random starts tried for stability for each one that is kept
-RESTORING = 400.0  # penalty when an end is to be brought within its bounds
-
-
-Progress = Callable[[str], None]
 
 
 def problem_for(
@@ -89,61 +85,25 @@ def synthesise_sections(
     compared. The searches are spread over `workers`; their number changes nothing else. Raises
     PlantError for plants that cannot be in a set.
     """
-    begun = perf_counter()
     problem = cast(Problem, problem_for(plants, structure, bounds, sampling, frequencies))
+    search = DesignSearch(problem, plants, sampling, seed, progress)
     rng = np.random.default_rng(seed)
-    begun_at = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
-    pool = stabilising(problem, np.reshape(begun_at, (-1, len(structure.names))))
+    pool = stabilising(problem, np.reshape(search.inside(initial), (-1, len(structure.names))))
     known = len(pool)
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
-    tell = progress or (lambda words: None)
     if not len(pool):
-        return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
-    runners = run_race(problem, pool, tell, workers, known=known, last=only_initial)
+        return search.failed()
+    runners = run_race(problem, pool, search.tell, workers, known=known, last=only_initial)
     for _ in range(0 if only_initial else REDRAWS):
         best = runners[0].merit
-        fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)
-        runners = run_race(problem, fresh, tell, workers, runners)
+        count = max(starts // 2, 1)
+        fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
+        fresh = _nearest(problem, stabilising(problem, fresh), count)
+        runners = run_race(problem, fresh, search.tell, workers, runners)
         if runners[0].merit < best + SAME:
             break
-    return concluded(problem, plants, sampling, runners, len(pool), 0, seed, begun, tell)
-
-
-def concluded(
-    problem: LoopProblem,
-    plants: Sequence[ScaledPlant],
-    sampling: Sampling | None,
-    runners: Sequence[Runner],
-    starts: int,
-    spent: int,
-    seed: int,
-    begun: float,
-    tell: Progress,
-) -> SectionsDesign:
-    """The best end of a search that the judge confirms, brought within its bounds; `spent`: loops
-    looked at before it."""
-    evaluations = spent + sum(runner.evaluations for runner in runners)
-    ends = finished(runners)
-    best: SectionsDesign | None = None
-    optima = local_optima(problem, ends)
-    for point in (runner.point for runner in ends):
-        if point.assessment.violation > MARGIN:
-            again = ascend(problem, point, iterations=30, penalty=RESTORING, radius=0.02)
-            evaluations += again.evaluations
-            point = again.point
-        last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,
-                      least_gain=1e-14)  # fmt: skip
-        evaluations += last.evaluations
-        made = designed(problem, plants, sampling, last.point, optima, starts, evaluations, seed,
-                        perf_counter() - begun)  # fmt: skip
-        if best is None or (made.certified and not best.certified):
-            best = made
-        if best.certified:
-            break
-    assert best is not None
-    tell(f"{best.outcome.value}: {best.bandwidth / (2.0 * np.pi):.2f} Hz")
-    return best
+    return search.concluded(runners, len(pool))
 
 
 def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
@@ -168,16 +128,42 @@ def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
     return np.zeros((0, len(problem.structure.names)))
 
 
-def _redrawn(
-    problem: Problem, runners: Sequence[Runner], count: int, rng: np.random.Generator
-) -> Array:
-    """Those of the best ends with one section drawn anew that are stable and miss least."""
-    fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
-    return _nearest(problem, stabilising(problem, fresh), count)
-
-
 def _nearest(problem: Problem, kappa: Array, count: int) -> Array:
     """The `count` controllers that miss the bounds least at a modest bandwidth."""
     tau = float(np.log(0.1))
     misses = [assess(problem, one, tau).violation for one in kappa]
     return kappa[np.argsort(misses)[:count]]
+
+
+def bandwidth_envelope(
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
+    design: SectionsDesign,
+    sampling: Sampling | None = None,
+) -> Envelope | None:
+    """The gradients of ω_b*(θ) in rad/s at a design that is optimal on these plants.
+
+    None where a loop is unstable or the point is not stationary to 1e-3. Plants carry dA, dB, dC.
+    """
+    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
+    kappa = in_problem_units(problem, design.kappa)
+    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
+    point = _at_the_bounds(problem, kappa, tau)
+    if not point.assessment.stable:
+        return None
+    found = optimality(problem, point)
+    envelope = envelope_of(problem, kappa, found)
+    return None if envelope is None else envelope.times(design.bandwidth)
+
+
+def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:
+    """The point with the largest ω_b of this κ; the judge's is lower, by its own grid."""
+    assessment = assess(problem, kappa, tau)
+    peaks = assessment.peaks
+    if peaks is not None:
+        rising = peaks.to_tau > 0.0
+        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=np.inf))
+        if abs(room) < LOWER_AT_MOST:
+            tau += room
+            assessment = assess(problem, kappa, tau)
+    return Point(kappa, tau, assessment)

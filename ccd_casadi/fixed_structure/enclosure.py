@@ -27,7 +27,14 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.boxes import Axis, Boxes, Chart, axis_of, gain_of
 from ccd_casadi.fixed_structure.mode_discs import discs_of
-from ccd_casadi.fixed_structure.rank_one import Range, Turned, inverses, norm, norm_with
+from ccd_casadi.fixed_structure.rank_one import (
+    Range,
+    Turned,
+    inverses,
+    norm,
+    norm_of_any,
+    norm_with,
+)
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
@@ -108,7 +115,7 @@ class LoopFamily:
             * np.linalg.norm(self.outputs, axis=0)
         )
         faintly = np.einsum("iN,ic,Nc->N", np.abs(m) + r, apart, faint)
-        known = _left(others * r, c, rows)
+        known = norm_of_any(c, rows, others * r)
         off = known + faintly + moved
         good &= damped & W.good & (w[0] * off < 1.0)
         after = w[0] / np.where(good, 1.0 - w[0] * off, 1.0)  # ‖M₁⁻¹‖
@@ -149,7 +156,7 @@ class LoopFamily:
         if compliance is not None:
             g, e = np.where(good, free.middle, 0.0), np.where(good, free.radius, 0.0)
             WG = W.between(unit, _total(g, c, b))
-            h, apart = WG.norms(), most * after * _left(e, c, b)
+            h, apart = WG.norms(), most * after * norm_of_any(c, b, e)
             apart += (np.abs(y) * after * off + moved * (1.0 + after * off)) * h[0]
             p, q = (
                 np.concatenate([u, u]),
@@ -160,7 +167,7 @@ class LoopFamily:
             along = np.abs(np.einsum("iNp,Np->iN", c, v[strong, at]))
             aside = (e * along * np.linalg.norm(b, axis=2)).sum(axis=0)  # of W's disc on those of G
             aside *= (radius * np.linalg.norm(u, axis=2))[strong, at]
-            upper += aside + after * off * (w[0] * off * h[0] + _left(e, u, b) + aside)
+            upper += aside + after * off * (w[0] * off * h[0] + norm_of_any(u, b, e) + aside)
             upper = np.fmin(most * upper, np.abs(y) * h[0] + apart)
             lower = np.abs(y) * h[1] - apart
             inside = compliance * self._inside(boxes)
@@ -249,15 +256,6 @@ class LoopFamily:
 def _total(g: np.ndarray, c: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Σ g_i c_i row_iᵀ (N, p, q) of g (n, N), c (n, N, p) and rows (n, N, q)."""
     return np.asarray(np.einsum("iN,iNp,iNq->Npq", g, c, rows))
-
-
-def _left(radius: Array, p: np.ndarray, q: np.ndarray) -> Array:
-    """The norm of Σ g_i p_i q_iᵀ at most for any |g_i| <= radius_i."""
-    share = np.linalg.norm(q, axis=2) + 1e-30
-    share /= np.linalg.norm(p, axis=2) + 1e-30
-    one = np.einsum("iN,iNp,iNq->Npq", radius * share, p, p.conj())
-    two = np.einsum("iN,iNp,iNq->Npq", radius / share, q.conj(), q)
-    return np.asarray(np.sqrt(norm(one) * norm(two)))
 
 
 def _sizes(p: np.ndarray, q: np.ndarray) -> Array:

@@ -7,8 +7,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import design
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.design import Progress
-from ccd_casadi.fixed_structure.sections_design import SectionsDesign
+from ccd_casadi.fixed_structure.sections_design import Progress, SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant

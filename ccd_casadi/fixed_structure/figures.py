@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Constraints,
     Curve,
     LoopProblem,
-    plant_of_row,
+    Places,
 )
 from ccd_casadi.fixed_structure.peak_search import (
     closed_on_peaks,
@@ -64,8 +64,7 @@ def assess(
     v, regular = frequency_grid(problem, problem.roots(kappa), poles)
     P, curves, loop = len(v), np.array(problem.curves, np.int64), problem.loop(kappa, tau)
     crossing = plants.variable(np.exp(tau + problem.leads))  # by number
-    short = np.array([problem.ends_at_crossing(curve) for curve in problem.curves])
-    end = np.where(short[:, None], crossing, np.inf)
+    end = np.where(problem.short[:, None], crossing, np.inf)
     every = np.arange(P)
     value = levels(np.tile(curves, (P, 1)), every, v, loop, min(depth, -within))
     value = np.where(v[..., None, None] <= end, value, -np.inf)
@@ -74,7 +73,7 @@ def assess(
     top, closed = closed_on_peaks(loop, peaks)
     # An open end at ω_b is the crossing; one at the lowest frequency is a row of its own.
     low_end = peaks.start < 0.1 * crossing[peaks.row // P]
-    whole = closed | ~np.isin(peaks.curve, curves[short]) | low_end
+    whole = closed | ~np.isin(peaks.curve, curves[problem.short]) | low_end
     sought = np.arange(len(whole)) >= len(whole) - len(hidden.row)
     whole = np.where(sought, closed, whole)
     curve, row, at = [peaks.curve[whole]], [peaks.row[whole]], [top[whole]]
@@ -85,12 +84,12 @@ def assess(
         curve.append(np.full(len(row[-1]), end_curve))
         at.append(np.repeat(place[numbers], P))
     i, j, c, k = np.nonzero(regular[..., None, None] & (value > -within))
-    count = sum(map(len, curve))
-    parts = ((*curve, curves[c]), (*row, i + k * P), (*at, v[i, j]))
-    found = constraints(problem, kappa, tau, *(np.concatenate(part) for part in parts))
-    return Assessment(True, poles, found.only(slice(count)), found.only(slice(count, None)))
+    peaks_at = (np.concatenate(part) for part in (curve, row, at))
+    near = Places(curves[c], i + k * P, v[i, j])
+    return Assessment(True, poles, constraints(problem, kappa, tau, *peaks_at), near)
 
 
+@singledispatch
 def constraints(
     problem: LoopProblem, kappa: Array, tau: float, curve: np.ndarray, row: np.ndarray, v: Array
 ) -> Constraints:
@@ -116,7 +115,7 @@ def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
     plants, v = problem.plants, found.v
     out = np.zeros((len(v), plants.plants[0].dA.shape[0]))
     *_, x, y, right = evaluate_rows(problem, kappa, 0.0, found.curve, found.plant, v)
-    which = plant_of_row(problem, found.plant)
+    which = problem.plants_of(found)
     for i in np.unique(which):
         own = np.flatnonzero(which == i)
         out[own] = plants.form_to_theta(int(i), v[own], x[own], y[own]).real

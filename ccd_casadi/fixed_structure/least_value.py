@@ -20,20 +20,20 @@ from typing import Protocol
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
+from ccd_casadi.budget.derivatives import Change, variance_slopes
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.certificate import certify
-from ccd_casadi.fixed_structure.channel_structure import controller_of
-from ccd_casadi.fixed_structure.design import Progress, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Assessment
 from ccd_casadi.fixed_structure.optimality import Envelope, Optimality, envelope_of, optimality
 from ccd_casadi.fixed_structure.sections_design import (
+    DesignSearch,
+    Progress,
     SectionsDesign,
     SectionsOutcome,
     in_problem_units,
 )
-from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -75,7 +75,7 @@ class RmsError:
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
         kappa = np.asarray(kappa, float)
-        stepped = state_spaces(self.structure, kappa + 1j * STEP * np.eye(len(kappa)))
+        stepped = self.structure.state_spaces(kappa + 1j * STEP * np.eye(len(kappa)))
         changes = [
             Change(None, StateSpace(*(part[i].imag / STEP for part in stepped)))
             for i in range(len(kappa))
@@ -97,7 +97,7 @@ class RmsError:
 
     def _summed(self, kappa: Array, changes: Sequence[Sequence[Change]]) -> tuple[float, Array]:
         """ln e and its derivatives to what the changes of each plant's loop are of."""
-        K, budget = state_space(self.structure, kappa), replace(self.budget, window=None)
+        K, budget = self.structure.state_space(kappa), replace(self.budget, window=None)
         total = None
         for plant, own in zip(self.plants, changes, strict=True):
             found = variance_slopes(Loop(plant.plant_si(), K, self.hold), budget, own)
@@ -107,8 +107,9 @@ class RmsError:
                 total, value=total.value + found.value, gradient=total.gradient + found.gradient
             )  # fmt: skip
         assert total is not None
-        value, slope = rms_error_slope(total)
-        return value - 0.5 * float(np.log(len(self.plants))), slope
+        variance = total.value[0]
+        value = 0.5 * float(np.log(variance / len(self.plants)))
+        return value, 0.5 * total.gradient[0] / variance
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,7 @@ def least_value(
     if not isinstance(structure, Structure):
         raise ValueError("the least value is searched for one input and one output only")
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
+    search = DesignSearch(problem, plants, sampling, progress=progress)
     w0, force = problem.plants.omega_0, problem.plants.force
     floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
 
@@ -155,7 +157,6 @@ def least_value(
 
     model = LoopModel(problem, scaled, REWARD, floor)
     first_hessian = np.diag(np.append(np.ones(len(design.kappa)), 0.0))
-    tell = progress or (lambda words: None)
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
     first = float(np.exp(goal.at(design.kappa)[0]))
@@ -174,9 +175,10 @@ def least_value(
             continue
         end, count = descend(model, start, first_hessian, problem.margin)
         steps += count
-        made, conditions = _judged(problem, plants, sampling, end, design, floor)
+        made, conditions = _judged(search, end, design, floor)
         value = float(np.exp(end.value + REWARD * end.x[-1]))
-        tell(f"{goal.shown(value)} at {made.bandwidth / HZ:.2f} Hz, {count} steps: {made.words}")
+        at = f"{goal.shown(value)} at {made.bandwidth / HZ:.2f} Hz"
+        search.tell(f"{at}, {count} steps: {made.words}")
         if made.certified and value < best.value:
             direct = goal.to_theta(made.kappa)
             envelope = envelope_of(problem, end.x[:-1], conditions, direct)
@@ -187,21 +189,13 @@ def least_value(
 
 
 def _judged(
-    problem: LoopProblem,
-    plants: Sequence[ScaledPlant],
-    sampling: Sampling | None,
-    end: Iterate[Assessment],
-    design: SectionsDesign,
-    floor: float,
+    search: DesignSearch, end: Iterate[Assessment], design: SectionsDesign, floor: float
 ) -> tuple[SectionsDesign, Optimality]:
     """The end as a design, certified by the judge, and its conditions of optimality."""
-    structure, P = problem.structure, problem.plants
     inside, tau = end.x[:-1], float(end.x[-1])
-    kappa = structure.in_units(inside, P.omega_0, P.force)
-    controller = controller_of(structure, kappa)
-    judged = certify(plants, controller, problem.bounds, sampling, integrator=structure.integrator)
-    found = optimality(problem, Point(inside, tau, end.data), -end.gradient, floor)
-    least = float(np.exp(floor)) * P.omega_0
+    kappa, controller, judged = search.judged(inside)
+    found = optimality(search.problem, Point(inside, tau, end.data), -end.gradient, floor)
+    least = float(np.exp(floor)) * search.problem.plants.omega_0
     good = judged.passed and judged.bandwidth >= least / KEPT
     made = replace(
         design,

@@ -23,10 +23,11 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Constraints,
     Curve,
     LoopProblem,
+    Places,
 )
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import winding
-from ccd_casadi.fixed_structure.structure import Structure, response
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.kernels.loop_point import Loop
@@ -130,14 +131,11 @@ class LineProblem(LoopProblem):
 
     def _open(self, kappa: Array) -> Iterator[tuple[MeasuredResponse, np.ndarray]]:
         """L on the followed lines of every response."""
-        plants, structure = self.plants, self.structure
-        parts = [(structure, kappa)] if isinstance(structure, Structure) else [
-            *structure.split(kappa)
-        ]  # fmt: skip
+        plants, parts = self.plants, [*self.structure.split(kappa)]
         for measured in self.responses:
             whole = measured.followed
             s = 1j * plants.variable(HZ * whole.hz / plants.omega_0)
-            k = np.stack([response(own, part, s) for own, part in parts], axis=-1)
+            k = np.stack([own.response(part, s) for own, part in parts], axis=-1)
             yield measured, plants.force * whole.G @ (plants.into * k[:, None, :]) @ plants.out
 
     @cached_property
@@ -202,9 +200,8 @@ def _plants(
     basis = np.array([[both.real, apart.real], [both.imag, apart.imag]]).transpose(2, 0, 1)
     parts = np.linalg.solve(basis, np.stack([G.real, G.imag], axis=1).reshape(count, 2, p * m))
     residues = (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
-    out = np.eye(p) if isinstance(structure, Structure) else structure.decoupling.outputs.T
-    into = np.eye(m) if isinstance(structure, Structure) else structure.decoupling.inputs
-    out, into = (np.ascontiguousarray(M, float) for M in (out, into))
+    U, V = structure.directions
+    out, into = (np.ascontiguousarray(M, float) for M in (U.T, V))
     T = None if period is None else period * omega_0
     return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, out, into, omega)
 
@@ -230,8 +227,7 @@ def _(
     codes = np.array(problem.curves, np.int64)
     every = np.arange(lines)
     value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT)[:, 0]
-    short = np.array([problem.ends_at_crossing(curve) for curve in problem.curves])
-    value = np.where(short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
+    value = np.where(problem.short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
     i, c, k = np.nonzero(value > RELEVANT)
     at_low = np.flatnonzero(np.isfinite(problem.limits[Curve.S_LOW]))
     low = (at_low[:, None] * P + np.arange(lines, P)).ravel()
@@ -244,7 +240,8 @@ def _(
     parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
     curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)
     peaks = Constraints(curve, row, at, found + problem.margin, to_kappa, to_tau)
-    return Assessment(True, np.zeros(0), peaks, peaks.only(np.zeros(0, np.int64)))
+    none = np.zeros(0, np.int64)
+    return Assessment(True, np.zeros(0), peaks, Places(none, none, np.zeros(0)))
 
 
 def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarray, ...]:

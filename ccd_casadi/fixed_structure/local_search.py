@@ -8,10 +8,11 @@ counts only where every closed loop stays stable.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import assess, hessians
+from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
 from ccd_casadi.optim.quadratic import symmetric_rank_one
 from ccd_casadi.optim.trust_region import Data, Iterate, Model, Radius, Rows, Step, minimise
@@ -65,6 +66,8 @@ class LoopModel(Model[Assessment]):
         floor: float = -np.inf,
     ) -> None:
         self.problem, self.goal, self.reward = problem, goal, reward
+        # A step that fails is followed by one from the same place.
+        self.all_rows = lru_cache(2)(self._all_rows)
         # Where nothing bounds ω_b it stops at the end of the grid instead of running away.
         top = float(np.log(problem.plants.frequency(problem.base[-1])))
         self.low = np.append(problem.box[0], floor)
@@ -85,13 +88,16 @@ class LoopModel(Model[Assessment]):
         x, gradient = np.append(kappa, tau), np.append(slope, -self.reward)
         return Iterate(x, value - self.reward * tau, gradient, found.violation, found)
 
+    def _all_rows(self, here: Iterate[Assessment]) -> Constraints:
+        return all_rows(self.problem, here.x[:-1], float(here.x[-1]), here.data)
+
     def rows(self, here: Iterate[Assessment], radius: float) -> Rows:
         """Peaks with their curvature, and the grid near them without."""
-        found, peaks = all_rows(here.data), here.data.peaks
+        kappa, tau, peaks = here.x[:-1], float(here.x[-1]), here.data.peaks
         assert peaks is not None
+        found = self.all_rows(here)
 
         def second(index: np.ndarray) -> Array:
-            kappa, tau = here.x[:-1], float(here.x[-1])
             return hessians(self.problem, kappa, tau, found.only(index))
 
         slopes = np.column_stack([found.to_kappa, found.to_tau])
@@ -111,11 +117,11 @@ class LoopModel(Model[Assessment]):
         return symmetric_rank_one(H, there.x - here.x, there.gradient - here.gradient)
 
 
-def all_rows(found: Assessment) -> Constraints:
+def all_rows(problem: LoopProblem, kappa: Array, tau: float, found: Assessment) -> Constraints:
     """The peaks, and after them the values near."""
     assert found.peaks is not None
     assert found.near is not None
-    parts = (found.peaks, found.near)
+    parts = (found.peaks, constraints(problem, kappa, tau, *found.near))
     return Constraints(*(
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("curve", "plant", "v", "value", "to_kappa", "to_tau")

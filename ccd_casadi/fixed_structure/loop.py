@@ -22,7 +22,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels
-from ccd_casadi.fixed_structure.structure import Structure, state_spaces
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.lti.hold import Sampling, delayed, in_w, moments, transfer
 from ccd_casadi.lti.state_space import StateSpace
@@ -240,11 +240,7 @@ def closed_loops(
     An algebraic loop with det(I + D_K D_G) = 0 has a pole at z = -1: it counts as not stable.
     """
     kappa = np.atleast_2d(kappa)
-    if isinstance(structure, Structure):
-        a, b, c, d = state_spaces(structure, kappa)
-    else:
-        systems = [structure.diagonal(one) for one in kappa]
-        a, b, c, d = (np.array([getattr(one, name) for one in systems]) for name in "ABCD")
+    a, b, c, d = structure.state_spaces(kappa)
     A, B, C, D = plants.states
     a, d = a[:, None], (plants.into @ d @ plants.out)[:, None]
     b, c = (b @ plants.out)[:, None], (plants.into @ c)[:, None]

@@ -13,13 +13,14 @@ rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u a
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet
-from ccd_casadi.fixed_structure.structure import Structure, roots
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.limits import HALF_POWER, Curve, Limit
 from ccd_casadi.kernels.loop_point import Loop
 from ccd_casadi.lti.grid import root_flanks
@@ -85,10 +86,11 @@ class LoopProblem:
             found.append(Curve.GS)
         return tuple(found)
 
-    def ends_at_crossing(self, curve: Curve) -> bool:
-        """Whether a curve is bounded on ω <= ω_b only."""
-        short = self.bounds.shape_ends is ShapeEnd.CROSSING
-        return curve is Curve.LEVEL or (curve is Curve.SHAPE and short)
+    @cached_property
+    def short(self) -> np.ndarray:
+        """Which of the curves are bounded on ω <= ω_b only."""
+        ends = self.bounds.shape_ends is ShapeEnd.CROSSING
+        return np.isin(self.curves, [Curve.LEVEL, *[Curve.SHAPE] * ends])
 
     @property
     def first(self) -> int:
@@ -99,21 +101,15 @@ class LoopProblem:
     def _factors(self) -> tuple[np.ndarray, np.ndarray]:
         """The factors of K and the channel of every parameter, see `kernels.loop_point.Loop`."""
         structure = self.structure
-        parts = [(structure, 0)] if isinstance(structure, Structure) else [
-            (own, place.start)
-            for own, place in zip(structure.structures, structure.slices, strict=True)
-        ]  # fmt: skip
         factors, channel = [], np.zeros(len(structure.names), np.int64)
-        for i, (own, start) in enumerate(parts):
-            channel[start : start + len(own.names)] = i
-            factors.append(np.insert(own.factors + np.array([0, 0, start]), 0, i, axis=1))
+        for i, (own, at) in enumerate(zip(structure.structures, structure.slices, strict=True)):
+            channel[at] = i
+            factors.append(np.insert(own.factors + np.array([0, 0, at.start]), 0, i, axis=1))
         return np.concatenate(factors), channel
 
     def roots(self, kappa: Array) -> np.ndarray:
         """Zeros and poles of K."""
-        own = self.structure
-        found = roots(own, kappa) if isinstance(own, Structure) else own.roots(kappa)
-        return np.concatenate(found)
+        return np.concatenate(self.structure.roots(kappa))
 
     @cached_property
     def resonances(self) -> Array:
@@ -179,6 +175,14 @@ class LoopProblem:
         found[1] = np.linalg.inv(into)[:count]
         return found
 
+    def plants_of(self, found: "Constraints") -> np.ndarray:
+        """The number of the plant that each row is of: several rows of a plant are numbered on."""
+        return found.plant % self.plants.count
+
+    def kinds_of(self, found: "Constraints") -> list[str]:
+        """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
+        return [Curve(int(code)).name for code in found.curve]
+
     def loop(self, kappa: Array, tau: float) -> Loop:
         """What the kernels take at κ and τ."""
         limits = self.limits.copy()
@@ -193,13 +197,6 @@ class Problem(LoopProblem):
     """That of one channel."""
 
     structure: Structure
-
-
-@dataclass(frozen=True)
-class MatrixProblem(LoopProblem):
-    """That of several channels as a whole, each with parameters of its own."""
-
-    structure: ChannelStructure
 
 
 @dataclass(frozen=True)
@@ -219,22 +216,26 @@ class Constraints:
         return Constraints(*(part[chosen] for part in parts))
 
 
-def plant_of_row(problem: LoopProblem, row: np.ndarray) -> np.ndarray:
-    """The plant that a constraint's `plant` belongs to: several rows of a plant are numbered on."""
-    return row % problem.plants.count
+class Places(NamedTuple):
+    """Curve, plant and v (over ω₀) of constraints."""
+
+    curve: np.ndarray
+    plant: np.ndarray
+    v: Array
 
 
 @dataclass(frozen=True)
 class Assessment:
     """One controller on all plants: stable or not, and where it is, its constraints.
 
-    `peaks` are exact; `near` lie on the base grid and tell how curves go between the peaks.
+    `peaks` are exact; `near` lie on the base grid and tell how curves go between the peaks: only
+    steps from here need their derivatives.
     """
 
     stable: bool
     poles: np.ndarray
     peaks: Constraints | None
-    near: Constraints | None
+    near: Places | None
 
     @property
     def violation(self) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_design import TIGHTENED
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling
 from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
@@ -26,7 +26,7 @@ from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge_all
 from ccd_casadi.fixed_structure.race import finished, run_race
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.sections_design import MARGIN, in_problem_units, titled
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
@@ -35,7 +35,6 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 
 FEWER = 600  # lines that starts of single channels are designed on
-MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
 CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
 NO_START = (
@@ -148,7 +147,7 @@ def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int
     """The controller at κ and what the judge says of it."""
     structure, bounds, plants = problem.structure, problem.bounds, problem.plants
     si = structure.in_units(kappa, plants.omega_0, plants.force)
-    K = controller_of(structure, si)
+    K = structure.state_space(si)
     figures = judge_all(
         problem.responses, K, bounds, period=period, integrator=structure.integrator
     )
@@ -193,7 +192,7 @@ def _channels_stacked(
     workers: Pool | None,
 ) -> tuple[list[Array], int]:
     """The channels' own designs as one κ, with ever tighter S_max until it is stable."""
-    U, V = structure.decoupling.outputs, structure.decoupling.inputs
+    U, V = structure.directions
     spent = 0
     for share in TIGHTENED:
         parts = []
@@ -204,8 +203,7 @@ def _channels_stacked(
             name = structure.decoupling.names[i]
             design = design_on_data(
                 entries, structure.structures[i], limits, period=period, starts=starts, seed=seed,
-                effort=problem.effort,
-                progress=lambda words, name=name: tell(f"channel {name}: {words}"), workers=workers,  # type: ignore[misc]
+                effort=problem.effort, progress=titled(tell, f"channel {name}"), workers=workers,
             )  # fmt: skip
             spent += design.steps
             parts.append(design.kappa)

@@ -24,9 +24,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.bounds import Bounds, LoopPeaks, ShapeEnd
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.kernels.limits import HALF_POWER
+from ccd_casadi.lti.closed_loop import responses_of, sensitivity, sigma_max
 from ccd_casadi.lti.hold import tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -42,10 +43,10 @@ BETWEEN = np.linspace(0.0, 1.0, 9)  # places on a chord
 
 
 @dataclass(frozen=True)
-class MeasuredFigures:
-    """A loop on its lines. Frequencies in rad/s, KS in N/m, GS in m/N; NaN where not stable.
+class MeasuredFigures(LoopPeaks):
+    """A loop on its lines; NaN where it is not stable.
 
-    Of several channels the largest singular values. `right_half_plane`: Z. `sure`: whether the
+    `right_half_plane`: Z. `sure`: whether the
     assumptions that the data can show hold. `S_between` bounds |S| on and between the lines by r,
     infinite where I + L may be singular on the curve; `bandwidth` is the largest that the shape
     allows on the lines.
@@ -55,16 +56,7 @@ class MeasuredFigures:
     sure: bool
     right_half_plane: int
     words: str
-    S_peak: float = np.nan
-    S_peak_frequency: float = np.nan
     S_between: float = np.nan
-    S_low: float = np.nan
-    bandwidth: float = np.nan
-    KS: float = np.nan
-    T: float = np.nan
-    GS: float = np.nan
-    weighted_KS: float = np.nan
-    weighted_T: float = np.nan
 
 
 def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
@@ -105,33 +97,26 @@ def judge(
     words, sure = "; ".join([assumed, *doubts]), measured.modelled or not doubts
     if Z != 0:
         return MeasuredFigures(False, sure, Z, words)
-    L, k, eye = joint[first:], k[first:], np.eye(joint.shape[1])
-    S, omega = np.linalg.inv(eye + L), HZ * hz
-    KS, T = gain(k @ S), gain(L @ S)
-    weighted_KS, weighted_T = np.nan, np.nan
+    omega, low = HZ * hz, bounds.omega_low / HZ
+    size = {name: sigma_max(M) for name, M in responses_of(G, k[first:]).items()}
+    most = {name: float(size[name].max()) for name in ("KS", "T", "GS")}
     if bounds.weights is not None:
-        _, W_KS, W_T = np.abs(bounds.weights.responses(omega))
-        weighted_KS, weighted_T = float((W_KS * KS).max()), float((W_T * T).max())
-    size = gain(S)
-    low = bounds.omega_low / HZ
-    K_low = controller_response(K, np.array([low]), period)[0]
-    S_low = np.linalg.inv(eye + measured.at(low) @ K_low)
+        W = np.abs(bounds.weights.responses(omega))
+        most["weighted_KS"] = float((W[1] * size["KS"]).max())
+        most["weighted_T"] = float((W[2] * size["T"]).max())
+    L_low = measured.at(low) @ controller_response(K, np.array([low]), period)
     return MeasuredFigures(
         stable=True,
         sure=sure,
         right_half_plane=0,
         words=words,
-        S_peak=float(size.max()),
-        S_peak_frequency=float(omega[np.argmax(size)]),
+        S_peak=float(size["S"].max()),
+        S_peak_frequency=float(omega[np.argmax(size["S"])]),
         S_between=float(reach.max()),
-        S_low=float(gain(S_low)),
-        bandwidth=_bandwidth(omega, np.log(size), bounds, integrator),
-        KS=float(KS.max()),
-        T=float(T.max()),
-        GS=float(gain(G @ np.linalg.inv(eye + k @ G)).max()),
-        weighted_KS=weighted_KS,
-        weighted_T=weighted_T,
-    )  # fmt: skip
+        S_low=float(sigma_max(sensitivity(L_low))[0]),
+        bandwidth=_bandwidth(omega, np.log(size["S"]), bounds, integrator),
+        **most,
+    )
 
 
 def judge_all(
@@ -151,23 +136,18 @@ def judge_all(
     unstable = max(one.right_half_plane for one in each)
     if not stable:
         return MeasuredFigures(False, sure, unstable, words)
-    names = [field.name for field in fields(MeasuredFigures)][4:]
+    names = [*(field.name for field in fields(LoopPeaks)), "S_between"]
     worst = {name: max(getattr(one, name) for one in each) for name in names}
     worst["bandwidth"] = min(one.bandwidth for one in each)
     worst["S_peak_frequency"] = max(each, key=lambda one: one.S_peak).S_peak_frequency
     return MeasuredFigures(True, sure, unstable, words, **worst)
 
 
-def gain(M: np.ndarray) -> Array:
-    """The largest singular values (...) of matrices (..., p, m)."""
-    return np.asarray(np.linalg.norm(M, 2, axis=(-2, -1)))
-
-
 def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
     """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f."""
     x = np.log(hz)
     slope = np.diff(L, axis=0) / np.diff(x)[:, None, None]
-    second = gain(2.0 * np.diff(slope, axis=0) / (x[2:] - x[:-2])[:, None, None])
+    second = sigma_max(2.0 * np.diff(slope, axis=0) / (x[2:] - x[:-2])[:, None, None])
     around = np.concatenate([second[:1], second, second[-1:]])  # at each line
     wider = np.maximum(np.append(around[1:], 0.0), np.insert(around[:-1], 0, 0.0))
     each = np.maximum(around, wider)
@@ -182,10 +162,10 @@ def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
     """
     hz, over, unsure = measured.hz, np.linalg.inv(L), np.zeros(len(L))
     if measured.spread is not None:
-        unsure = gain(measured.spread.reshape(measured.matrix.shape) @ np.abs(k))
-    far = gain(over) * unsure
+        unsure = sigma_max(measured.spread.reshape(measured.matrix.shape) @ np.abs(k))
+    far = sigma_max(over) * unsure
     with np.errstate(divide="ignore"):
-        of_inverse = np.where(far < 1.0, gain(over) * far / np.maximum(1.0 - far, 0.0), np.inf)
+        of_inverse = np.where(far < 1.0, sigma_max(over) * far / np.maximum(1.0 - far, 0.0), np.inf)
     direct, inverse = _clearances(hz, L, unsure), _clearances(hz, over, of_inverse)
     with np.errstate(divide="ignore"):
         by_L = np.where(direct > 0.0, 1.0 / np.maximum(direct, 0.0), np.inf)
@@ -207,7 +187,7 @@ def _clearances(hz: Array, L: np.ndarray, unsure: Array) -> Array:
     else:
         places = np.eye(L.shape[1]) + L[:-1] + BETWEEN[:, None, None, None] * step
         least = np.linalg.svd(places, compute_uv=False)[..., -1].min(axis=0)
-        least = least - 0.5 * BETWEEN[1] * gain(step)
+        least = least - 0.5 * BETWEEN[1] * sigma_max(step)
     return np.asarray(least - interpolation_errors(hz, L) - np.maximum(unsure[1:], unsure[:-1]))
 
 

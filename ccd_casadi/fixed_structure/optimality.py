@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.figures import to_theta
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
@@ -112,7 +111,7 @@ def optimality(
         rows.append(-unit[n:])
     matrix, goal = np.concatenate(rows), unit[n] if goal is None else goal
     return Optimality(
-        active, near, tuple(kinds_of_rows(problem, active)), tuple(ends), matrix, goal,
+        active, near, tuple(problem.kinds_of(active)), tuple(ends), matrix, goal,
         *non_negative(matrix, goal), point.assessment.violation,
     )  # fmt: skip
 
@@ -133,7 +132,7 @@ def envelope_of(
     at = np.full(len(near.v), count)  # behind those that bind, before the ends of the box
     rows = np.insert(found.rows, at, np.column_stack([near.to_kappa, near.to_tau]), axis=0)
     return Envelope(
-        (*found.kinds, *kinds_of_rows(problem, near)), direct, slopes, rows, found.goal,
+        (*found.kinds, *problem.kinds_of(near)), direct, slopes, rows, found.goal,
         np.insert(found.multipliers, at, 0.0),
         np.insert(np.zeros(len(found.rows)), at, np.abs(near.value)),
     )  # fmt: skip

@@ -87,7 +87,7 @@ def run_race(
             break
         others = [runner for runner in field if not runner.running]
         field = others + _climbed(problem, running, workers or Workers(1))
-        field = _merged(problem, sorted(field, key=lambda runner: -runner.merit))
+        field = _merged(sorted(field, key=lambda runner: -runner.merit))
         field = _going_on(field, turn)
         lead = field[0].point
         going = sum(runner.running for runner in field)
@@ -184,7 +184,7 @@ def _climb(task: tuple[int, LoopProblem, Point, float]) -> tuple[int, Ascent]:
     return index, ascend(problem, point, iterations=STEPS, radius=radius)
 
 
-def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
+def _merged(field: Sequence[Runner]) -> list[Runner]:
     """The field, best first, without searches that are where a better one is."""
     kept: list[Runner] = []
     for runner in field:

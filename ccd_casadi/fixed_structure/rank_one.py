@@ -92,11 +92,22 @@ def norm_with(A: np.ndarray, p: np.ndarray, q: np.ndarray, radius: Array) -> Arr
 
     A (N, k, l), p (n, N, k), q (n, N, l). Terms that A keeps apart count apart.
     """
-    share = (np.linalg.norm(q, axis=2) + 1e-30) / (np.linalg.norm(p, axis=2) + 1e-30)
-    P = np.einsum("iN,iNa,iNb->Nab", radius * share, p, p.conj())
-    Q = np.einsum("iN,iNa,iNb->Nab", radius / share, q.conj(), q)
+    P, Q = _grams(p, q, radius)
     values = np.linalg.eigvalsh(np.block([[P, A], [A.conj().transpose(0, 2, 1), Q]]))
     return np.asarray(values[:, -1] + GUARD * np.abs(values).max(axis=1))
+
+
+def norm_of_any(p: np.ndarray, q: np.ndarray, radius: Array) -> Array:
+    """The norm of Σ δ_i p_i q_iᵀ at most for all |δ_i| <= radius_i."""
+    P, Q = _grams(p, q, radius)
+    return np.asarray(np.sqrt(norm(P) * norm(Q)))
+
+
+def _grams(p: np.ndarray, q: np.ndarray, radius: Array) -> tuple[np.ndarray, np.ndarray]:
+    """P and Q of `norm_with`, a_i by the lengths of both."""
+    share = (np.linalg.norm(q, axis=2) + 1e-30) / (np.linalg.norm(p, axis=2) + 1e-30)
+    return (np.einsum("iN,iNa,iNb->Nab", radius * share, p, p.conj()),
+            np.einsum("iN,iNa,iNb->Nab", radius / share, q.conj(), q))  # fmt: skip
 
 
 def norm(M: np.ndarray, loosely: bool = False) -> Array:

@@ -1,27 +1,30 @@
-"""A controller of fixed structure as it was found, judged and put in words."""
+"""A controller of fixed structure: the end of a search, judged and put in words."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from time import perf_counter
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
-from ccd_casadi.fixed_structure.composite import kinds_of_rows
-from ccd_casadi.fixed_structure.local_search import Point
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.fixed_structure.optimality import optimality
-from ccd_casadi.fixed_structure.race import LocalOptimum
+from ccd_casadi.fixed_structure.race import LocalOptimum, Runner, finished, local_optima
 from ccd_casadi.fixed_structure.structure import Kind, Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.units import HZ
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
+RESTORING = 400.0  # penalty when an end is to be brought within its bounds
+
+Progress = Callable[[str], None]
 
 
 class SectionsOutcome(StrEnum):
@@ -83,6 +86,11 @@ class SectionsDesign(NotebookHtml):
         return self.outcome is SectionsOutcome.CERTIFIED
 
 
+def titled(progress: Progress, title: str) -> Progress:
+    """Lines of progress with what they are of."""
+    return lambda words: progress(f"{title}: {words}")
+
+
 def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:
     """SI parameters κ in the units of the problem."""
     P = problem.plants
@@ -96,53 +104,96 @@ def span_of(problem: LoopProblem) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def designed(
-    problem: LoopProblem,
-    plants: Sequence[ScaledPlant],
-    sampling: Sampling | None,
-    point: Point,
-    optima: tuple[LocalOptimum, ...],
-    starts: int,
-    evaluations: int,
-    seed: int,
-    seconds: float,
-) -> SectionsDesign:
-    """The design at an end of the search: certified where the judge confirms what it found."""
-    structure, bounds, P = problem.structure, problem.bounds, problem.plants
-    kappa = structure.in_units(point.kappa, P.omega_0, P.force)
-    controller = controller_of(structure, kappa)
-    found = optimality(problem, point)
-    bandwidth = float(np.exp(point.tau)) * P.omega_0
-    judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
-    short: dict[str, float] = {}
-    peaks = point.assessment.peaks
-    assert peaks is not None
-    for name, value in zip(kinds_of_rows(problem, peaks), peaks.value, strict=True):
-        if value > 2.0 * MARGIN:
-            short[name] = max(short.get(name, 0.0), float(np.exp(value)))
-    outcome, words = SectionsOutcome.CERTIFIED, judged.words
-    if short:
-        outcome = SectionsOutcome.BOUND_NOT_MET
-        missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
-        words = f"none found from {starts} starts: the nearest controller misses {missed}"
-    elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
-        outcome = SectionsOutcome.NOT_CERTIFIED
-        words = f"judged {judged.bandwidth:.6g} rad/s, searched {bandwidth:.6g}: {judged.words}"
-    if outcome is SectionsOutcome.CERTIFIED:
-        bandwidth = min(bandwidth, judged.bandwidth)
-    return SectionsDesign(
-        outcome, words, structure, kappa, span_of(problem), controller, bandwidth, judged,
-        found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed,
-        seconds,
-    )  # fmt: skip
+@dataclass(frozen=True)
+class DesignSearch:
+    """A search for controllers on plants: what its randomness began with, where its lines of
+    progress go, and when it `began` (s of `perf_counter`)."""
 
+    problem: LoopProblem
+    plants: Sequence[ScaledPlant]
+    sampling: Sampling | None
+    seed: int = 0
+    progress: Progress | None = None
+    began: float = field(default_factory=perf_counter)
 
-def failed(
-    problem: LoopProblem, outcome: SectionsOutcome, words: str, seed: int, begun: float
-) -> SectionsDesign:
-    """A design without a controller, of a search that `begun` in seconds of `perf_counter`."""
-    nothing = np.full(len(problem.box[0]), np.nan)
-    return SectionsDesign(
-        outcome, words or outcome.value, problem.structure, nothing, span_of(problem), None,
-        np.nan, None, {}, (), np.nan, {}, (), 0, 0, seed, perf_counter() - begun,
-    )  # fmt: skip
+    def tell(self, words: str) -> None:
+        """A line of progress."""
+        if self.progress is not None:
+            self.progress(words)
+
+    def inside(self, kappas: Sequence[Array]) -> list[Array]:
+        """Controllers κ in SI in the units of the problem and in its box."""
+        return [np.clip(in_problem_units(self.problem, one), *self.problem.box) for one in kappas]
+
+    def judged(self, inside: Array) -> tuple[Array, StateSpace, SetCertificate]:
+        """κ in SI of one in the problem's units, its controller, and what the judge says of it."""
+        structure, P = self.problem.structure, self.problem.plants
+        kappa = structure.in_units(inside, P.omega_0, P.force)
+        K = structure.state_space(kappa)
+        return kappa, K, certify(self.plants, K, self.problem.bounds, self.sampling,
+                                 integrator=structure.integrator)  # fmt: skip
+
+    def designed(
+        self, point: Point, optima: tuple[LocalOptimum, ...], starts: int, evaluations: int
+    ) -> SectionsDesign:
+        """The design at an end: certified where the judge confirms what the search found."""
+        problem = self.problem
+        kappa, controller, judged = self.judged(point.kappa)
+        found = optimality(problem, point)
+        bandwidth = float(np.exp(point.tau)) * problem.plants.omega_0
+        short: dict[str, float] = {}
+        peaks = point.assessment.peaks
+        assert peaks is not None
+        for name, value in zip(problem.kinds_of(peaks), peaks.value, strict=True):
+            if value > 2.0 * MARGIN:
+                short[name] = max(short.get(name, 0.0), float(np.exp(value)))
+        outcome, words = SectionsOutcome.CERTIFIED, judged.words
+        if short:
+            outcome = SectionsOutcome.BOUND_NOT_MET
+            missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
+            words = f"none found from {starts} starts: the nearest controller misses {missed}"
+        elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
+            outcome = SectionsOutcome.NOT_CERTIFIED
+            words = f"judged {judged.bandwidth:.6g} rad/s, searched {bandwidth:.6g}: {judged.words}"
+        if outcome is SectionsOutcome.CERTIFIED:
+            bandwidth = min(bandwidth, judged.bandwidth)
+        return SectionsDesign(
+            outcome, words, problem.structure, kappa, span_of(problem), controller, bandwidth,
+            judged, found.named(), found.ends, found.residual, short, optima, starts, evaluations,
+            self.seed, perf_counter() - self.began,
+        )  # fmt: skip
+
+    def failed(
+        self, outcome: SectionsOutcome = SectionsOutcome.NO_STABLE_START, words: str = ""
+    ) -> SectionsDesign:
+        """A design without a controller."""
+        problem = self.problem
+        nothing = np.full(len(problem.box[0]), np.nan)
+        return SectionsDesign(
+            outcome, words or outcome.value, problem.structure, nothing, span_of(problem), None,
+            np.nan, None, {}, (), np.nan, {}, (), 0, 0, self.seed, perf_counter() - self.began,
+        )  # fmt: skip
+
+    def concluded(self, runners: Sequence[Runner], starts: int, spent: int = 0) -> SectionsDesign:
+        """The best end that the judge confirms, brought within its bounds; `spent`: loops that were
+        looked at before."""
+        problem, ends = self.problem, finished(runners)
+        evaluations = spent + sum(runner.evaluations for runner in runners)
+        best: SectionsDesign | None = None
+        optima = local_optima(problem, ends)
+        for point in (runner.point for runner in ends):
+            if point.assessment.violation > MARGIN:
+                again = ascend(problem, point, iterations=30, penalty=RESTORING, radius=0.02)
+                evaluations += again.evaluations
+                point = again.point
+            last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,
+                          least_gain=1e-14)  # fmt: skip
+            evaluations += last.evaluations
+            made = self.designed(last.point, optima, starts, evaluations)
+            if best is None or (made.certified and not best.certified):
+                best = made
+            if best.certified:
+                break
+        assert best is not None
+        self.tell(f"{best.outcome.value}: {best.bandwidth / HZ:.2f} Hz")
+        return best

@@ -20,7 +20,7 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.structure import Kind, response
+from ccd_casadi.fixed_structure.structure import Kind
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -158,7 +158,7 @@ def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     kinds = np.array([kind is Kind.GAIN for kind in problem.structure.kinds])
     v = problem.plants.variable(np.asarray(crossovers, float))
     kappa[:, kinds] = 0.0
-    K = response(problem.structure, kappa.T, 1j * v)
+    K = problem.structure.response(kappa.T, 1j * v)
     kappa[:, kinds] = -np.log(np.abs(problem.first_response(v) * K))[:, None]
     return np.clip(kappa, *problem.box)
 

@@ -8,6 +8,7 @@ frequency and damping ratio: all positive, so K is stable (but the integrator) a
 by construction. κ has the units of what it is multiplied with: everything here is blind to them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -118,27 +119,90 @@ class Structure:
         shift = {Kind.GAIN: np.log(gain), Kind.FREQUENCY: np.log(frequency), Kind.DAMPING: 0.0}
         return kappa + np.array([shift[kind] for kind in self.kinds])
 
+    @property
+    def structures(self) -> "tuple[Structure, ...]":
+        """Those of its channels: itself."""
+        return (self,)
 
-def response(structure: Structure, kappa: Array, s: np.ndarray) -> np.ndarray:
-    """K(s), of the shape of s; `kappa` (n,) or (n, ...) with trailing axes that go with s's."""
-    values = np.exp(kappa)
-    K = values[0] * np.ones_like(s)
-    for kind, sign, at in structure.factors[1:].tolist():
-        x = values[at] / s if kind == INTEGRATOR else s / values[at]
-        factor = 1.0 + 2.0 * values[at + 1] * x + x * x if kind == PAIR else 1.0 + x
-        K = K * factor if sign > 0 else K / factor
-    return K
+    @property
+    def slices(self) -> tuple[slice, ...]:
+        """Where each channel's parameters are in κ."""
+        return (slice(0, len(self.names)),)
 
+    @property
+    def directions(self) -> tuple[Array, Array]:
+        """U (p, c) of outputs and V (m, c) of inputs of its channels."""
+        return np.eye(1), np.eye(1)
 
-def roots(structure: Structure, kappa: Array) -> tuple[np.ndarray, np.ndarray]:
-    """The zeros and the poles of K, the integrator's pole included."""
-    values = np.exp(kappa)
-    zeros: list[complex] = []
-    poles: list[complex] = [0.0] * structure.integrator
-    for kind, sign, at in structure.factors[1:].tolist():
-        found = _pair(values[at], values[at + 1]) if kind == PAIR else [-values[at]]
-        (zeros if sign > 0 else poles).extend(found)
-    return np.array(zeros, complex), np.array(poles, complex)
+    def split(self, kappa: Array) -> "Iterator[tuple[Structure, Array]]":
+        """The structure and the parameters of each channel."""
+        yield self, kappa
+
+    def response(self, kappa: Array, s: np.ndarray) -> np.ndarray:
+        """K(s), of the shape of s; `kappa` (n,) or (n, ...) with trailing axes that go with s's."""
+        values = np.exp(kappa)
+        K = values[0] * np.ones_like(s)
+        for kind, sign, at in self.factors[1:].tolist():
+            x = values[at] / s if kind == INTEGRATOR else s / values[at]
+            factor = 1.0 + 2.0 * values[at + 1] * x + x * x if kind == PAIR else 1.0 + x
+            K = K * factor if sign > 0 else K / factor
+        return K
+
+    def roots(self, kappa: Array) -> tuple[np.ndarray, np.ndarray]:
+        """The zeros and the poles of K, the integrator's pole included."""
+        values = np.exp(kappa)
+        zeros: list[complex] = []
+        poles: list[complex] = [0.0] * self.integrator
+        for kind, sign, at in self.factors[1:].tolist():
+            found = _pair(values[at], values[at + 1]) if kind == PAIR else [-values[at]]
+            (zeros if sign > 0 else poles).extend(found)
+        return np.array(zeros, complex), np.array(poles, complex)
+
+    def state_space(self, kappa: Array) -> StateSpace:
+        """K as a real cascade of its sections, e to u; every section in its own scale."""
+        return StateSpace(*(part[0] for part in self.state_spaces(np.asarray(kappa, float)[None])))
+
+    def state_spaces(self, kappa: Array) -> tuple[Array, Array, Array, Array]:
+        """The cascades of many parameters κ (N, n): A (N, o, o), B (N, o, 1), C (N, 1, o), D.
+
+        Analytic in κ, which may be complex: a step along the imaginary axis gives derivatives.
+        """
+        kappa = np.asarray(kappa)
+        values, at, count = np.exp(kappa).T, 1, len(kappa)
+        A, B, C = np.zeros((count, 0, 0)), np.zeros((count, 0, 1)), np.zeros((count, 1, 0))
+        D = values[0][:, None, None] * np.ones((count, 1, 1))
+
+        def append(a: list, b: list, c: list, d: object) -> None:
+            """The next section behind what there is: u of it is y of the one before."""
+            nonlocal A, B, C, D
+            k, n = len(b), A.shape[1]
+            a_, b_ = _stack(a, values), _stack([[x] for x in b], values)
+            c_, d_ = _stack([c], values), _stack([[d]], values)
+            joint = np.zeros((count, n + k, n + k), values.dtype)
+            joint[:, :n, :n], joint[:, n:, n:], joint[:, n:, :n] = A, a_, b_ @ C
+            A, B = joint, np.concatenate([B, b_ @ D], axis=1)
+            C, D = np.concatenate([d_ @ C, c_], axis=2), d_ @ D
+
+        if self.integrator:
+            append([[0.0]], [values[1]], [1.0], 1.0)
+            at = 2
+        for _ in range(self.lead):
+            z, p = values[at], values[at + 1]
+            append([[-p]], [p], [1.0 - p / z], p / z)
+            at += 2
+        for _ in range(self.biquads):
+            wz, dz, wp, dp = values[at : at + 4]
+            g = (wp / wz) ** 2
+            c = [1.0 - g, 2.0 * g * (dz * wz - dp * wp) / wp]
+            append([[0.0, wp], [-wp, -2.0 * dp * wp]], [0.0, wp], c, g)
+            at += 4
+        for _ in range(self.roll_off // 2):
+            w, d = values[at], values[at + 1]
+            append([[0.0, w], [-w, -2.0 * d * w]], [0.0, w], [1.0, 0.0], 0.0)
+            at += 2
+        if self.roll_off % 2:
+            append([[-values[at]]], [values[at]], [1.0], 0.0)
+        return A, B, C, D
 
 
 def _pair(omega: float, zeta: float) -> list[complex]:
@@ -147,58 +211,10 @@ def _pair(omega: float, zeta: float) -> list[complex]:
     return [slow, omega**2 / slow]
 
 
-def state_space(structure: Structure, kappa: Array) -> StateSpace:
-    """K as a real cascade of its sections, input e, output u; every section in its own scale."""
-    A, B, C, D = state_spaces(structure, np.asarray(kappa, float)[None])
-    return StateSpace(A[0], B[0], C[0], D[0])
-
-
-def state_spaces(structure: Structure, kappa: Array) -> tuple[Array, Array, Array, Array]:
-    """The cascades of many parameters κ (N, n): A (N, o, o), B (N, o, 1), C (N, 1, o), D.
-
-    Analytic in κ, which may be complex: a step along the imaginary axis gives derivatives.
-    """
-    kappa = np.asarray(kappa)
-    values, at, count = np.exp(kappa).T, 1, len(kappa)
-    A, B, C = np.zeros((count, 0, 0)), np.zeros((count, 0, 1)), np.zeros((count, 1, 0))
-    D = values[0][:, None, None] * np.ones((count, 1, 1))
-
-    def append(a: list, b: list, c: list, d: object) -> None:
-        """The next section behind what there is: u of it is y of the one before."""
-        nonlocal A, B, C, D
-        k, n = len(b), A.shape[1]
-        a_, b_ = _stack(a, count, (k, k)), _stack([[x] for x in b], count, (k, 1))
-        c_, d_ = _stack([c], count, (1, k)), _stack([[d]], count, (1, 1))
-        joint = np.zeros((count, n + k, n + k), values.dtype)
-        joint[:, :n, :n], joint[:, n:, n:], joint[:, n:, :n] = A, a_, b_ @ C
-        A, B = joint, np.concatenate([B, b_ @ D], axis=1)
-        C, D = np.concatenate([d_ @ C, c_], axis=2), d_ @ D
-
-    if structure.integrator:
-        append([[0.0]], [values[1]], [1.0], 1.0)
-        at = 2
-    for _ in range(structure.lead):
-        z, p = values[at], values[at + 1]
-        append([[-p]], [p], [1.0 - p / z], p / z)
-        at += 2
-    for _ in range(structure.biquads):
-        wz, dz, wp, dp = values[at : at + 4]
-        g = (wp / wz) ** 2
-        c = [1.0 - g, 2.0 * g * (dz * wz - dp * wp) / wp]
-        append([[0.0, wp], [-wp, -2.0 * dp * wp]], [0.0, wp], c, g)
-        at += 4
-    for _ in range(structure.roll_off // 2):
-        w, d = values[at], values[at + 1]
-        append([[0.0, w], [-w, -2.0 * d * w]], [0.0, w], [1.0, 0.0], 0.0)
-        at += 2
-    if structure.roll_off % 2:
-        append([[-values[at]]], [values[at]], [1.0], 0.0)
-    return A, B, C, D
-
-
-def _stack(entries: list, count: int, shape: tuple[int, int]) -> Array:
-    out = np.zeros((count, *shape), np.result_type(*(x for row in entries for x in row)))
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            out[:, i, j] = entries[i][j]
+def _stack(entries: list, like: Array) -> Array:
+    """(N, p, m) of entries that are numbers or (N,), of the type of `like` (n, N)."""
+    out = np.empty((like.shape[1], len(entries), len(entries[0])), like.dtype)
+    for i, row in enumerate(entries):
+        for j, entry in enumerate(row):
+            out[:, i, j] = entry
     return out

@@ -3,7 +3,7 @@ budget: on the model, and the largest error of the plants.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.synthesis.weights import Weights
 
 
@@ -25,13 +24,6 @@ def design_loops(
     """The loops that a controller (SI) is designed for at θ: the model's first, as they run."""
     plants = kind_of(problem).plants(theta)
     return [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
-
-
-def free_loops(
-    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
-) -> list[Loop]:
-    """The same without the suspension of rigid bodies."""
-    return design_loops(replace(problem, suspension=Suspension(0.0, 0.0)), theta, controller)
 
 
 def design_view(

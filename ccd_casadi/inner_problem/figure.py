@@ -5,7 +5,7 @@ v(θ) = max ω_b,   min e   or   min t,      J = w1 f(θ) + w2 v(θ)
 
 from dataclasses import dataclass
 
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, with_unit
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,14 @@ class Figure:
         return (other / than if self.larger_is_better else than / other) - 1.0
 
     def shown(self, value: float, digits: int = 4) -> str:
-        """The value with its unit.
+        """The value with its unit, a length or a time with the prefix that its size needs.
 
         >>> RMS_ERROR.shown(12.3456e-9)
         '12.35 nm'
         """
-        return f"{self.factor * value:.{digits}g} {self.unit}"
+        if self is BANDWIDTH:
+            return f"{self.factor * value:.{digits}g} {self.unit}"
+        return with_unit(value, self.si_unit, digits)
 
 
 BANDWIDTH = Figure("bandwidth", "bandwidth", "ω_b", "rad/s", "Hz", 1.0 / HZ, True, "bandwidth")

@@ -1,20 +1,26 @@
-"""J of the outer problem and its slopes at true values of the inner one.
+"""J of the outer problem and its constraints, and their slopes, at true values of the inner one.
 
     J(θ) = w1 f(θ) + w2 v(θ),   v = ω_b* in rad/s or the least RMS error in m,   λ(θ) <= 0
 
-λ counts in shares of its size (`constraints`), θ in the user's units and slopes per share of the
-box, in which every variable goes from 0 to 1.
+λ counts in shares of each constraint's own size: a user may write one in Pa or in m. Its size is
+by how much it changes over the box, to first order from the start, or its value there where that is
+more: no unit decides what is rounding. θ is in the user's units, slopes are per share of the box,
+in which every variable goes from 0 to 1.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
-from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, violated
+from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
+from ccd_casadi.plants.plant import constraint_values, hardware_cost, hardware_slopes
 from ccd_casadi.support.arrays import Array
+
+MET = 1e-9  # of its size: so far past 0 a constraint is met to rounding
+ACTIVE = 1e-6  # of its size: so near to 0 a design runs along it
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,47 @@ class InnerValue:
     def feasible(self) -> bool:
         """Whether a certified design meets the constraints at θ."""
         return bool(np.isfinite(self.bandwidth))
+
+
+def constraint_sizes(problem: CoDesignProblem) -> Array:
+    """The size (m,) of each constraint, positive."""
+    return _sizes(problem.source, problem.names, problem.lower, problem.upper, problem.start)
+
+
+def constraint_shares(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> Array:
+    """λ(θ) (m,) over the sizes."""
+    return constraint_values(plant_of(problem), theta) / constraint_sizes(problem)
+
+
+def violated(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
+    """Names of the constraints that θ breaks by more than rounding; none where it is allowed."""
+    names, shares = plant_of(problem).constraint_names, constraint_shares(problem, theta)
+    return tuple(name for name, share in zip(names, shares, strict=True) if not share <= MET)
+
+
+def binding(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
+    """Names of the constraints that are active at θ."""
+    names, shares = plant_of(problem).constraint_names, constraint_shares(problem, theta)
+    return tuple(name for name, share in zip(names, shares, strict=True) if share >= -ACTIVE)
+
+
+@lru_cache(maxsize=8)
+def _sizes(
+    source: PlantSource,
+    names: tuple[str, ...],
+    lower: tuple[float, ...],
+    upper: tuple[float, ...],
+    start: tuple[float, ...],
+) -> Array:
+    plant = plant_from(source, names, lower, upper)
+    if not plant.constraint_names:
+        return np.ones(0)
+    change = np.abs(hardware_slopes(plant, start)[1]) @ np.subtract(upper, lower)
+    values = [np.abs(constraint_values(plant, theta)) for theta in (start, lower, upper)]
+    sizes = np.fmax(change, values[0])  # NaN where one is unknown
+    for size in (*values[1:], np.ones_like(sizes)):
+        sizes = np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, size)
+    return sizes
 
 
 def objective(problem: CoDesignProblem, theta: Sequence[float] | Array, value: float) -> float:

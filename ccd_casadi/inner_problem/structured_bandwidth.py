@@ -13,12 +13,11 @@ import numpy as np
 
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.fixed_structure import SectionsDesign, Structure
-from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.channel_design import synthesise
-from ccd_casadi.fixed_structure.design import Progress
+from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.least_value import Goal, RmsError, least_value
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
-from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
+from ccd_casadi.fixed_structure.sections_design import Progress, SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.move_figures import FREE, motion_of
 from ccd_casadi.inner_problem.objective import InnerValue

@@ -12,10 +12,10 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
-from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
-from ccd_casadi.fixed_structure.design import Progress
+from ccd_casadi.fixed_structure.design import bandwidth_envelope
+from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
@@ -99,6 +99,28 @@ def violations(
     return heads[0], tuple(found)
 
 
+def worse_elsewhere(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    turns: range,
+    workers: Pool,
+    progress: Progress,
+) -> tuple[Scenario, ...]:
+    """What the first of several searches for the worst plants finds that exceeds a bound; as many
+    at a time as there are workers."""
+    for first in turns[:: workers.count]:
+        own = range(first, min(first + workers.count, turns.stop))
+        tasks = [(turn, worst_case, problem, theta, made, turn) for turn in own]
+        found = dict(workers.map_unordered(looked, tasks))
+        largest = max(worst.value for worst, _ in found.values())
+        progress(f"{100.0 * np.exp(largest):.6g} % of a bound at most, searched from elsewhere")
+        for turn in own:
+            if found[turn][1]:
+                return found[turn][1]
+    return ()
+
+
 def certify_lattice(
     problem: CoDesignProblem,
     theta: Sequence[float],
@@ -160,10 +182,28 @@ def proof_of(
     )  # fmt: skip
 
 
-def looked(task: tuple[Any, ...]) -> tuple[str, Any]:
-    """What a function says of a design, by the function's name: for a worker process."""
-    look, *design = task
-    return look.__name__, look(*design)
+def looked(task: tuple[Any, ...]) -> tuple[Any, Any]:
+    """What a function says of a design, by the task's first entry: for a worker process."""
+    key, look, *design = task
+    return key, look(*design)
+
+
+def checked_whole(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    worst: Excess,
+    workers: Pool,
+) -> tuple[SetCertificate, int, Proof]:
+    """`certify_lattice` and `proof_of` at one time; of several options, whose proofs are spread
+    over the workers, one after the other."""
+    own = {certify_lattice: (made.controller, worst), proof_of: (made,)}
+    tasks = [(look.__name__, look, problem, theta, *design) for look, design in own.items()]
+    if structured_of(problem).uncertainty.options:
+        found = dict(looked((*task, workers)) for task in tasks)
+    else:
+        found = dict(workers.map_unordered(looked, tasks[::-1]))
+    return (*found[certify_lattice.__name__], found[proof_of.__name__])
 
 
 def tolerance_prices(

@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_value import LeastValue, least_value
+from ccd_casadi.fixed_structure.sections_design import Progress
+from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import (
@@ -29,7 +30,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_channels,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import worst_case
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -52,6 +52,8 @@ def race(
 
     Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
     """
+    if workers is not None:  # it takes seconds: they start while the starts are drawn
+        workers.begin(__name__)
     structured, plants = structured_of(problem), plants_of(problem, theta)
     warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
     starts = None if only_warm_starts else structured.starts
@@ -93,6 +95,16 @@ def prepared(
     is the search's last; where it is not certified the problem has no warm starts, and each θ is
     searched on its own. All of it is of the largest bandwidth, whatever the problem minimises.
     """
+    return with_worst_plant(problem, progress, workers, only_warm_starts)[:2]
+
+
+def with_worst_plant(
+    problem: CoDesignProblem,
+    progress: Progress | None,
+    workers: Pool | None,
+    only_warm_starts: bool,
+) -> tuple[CoDesignProblem, SectionsDesign, Excess | None]:
+    """What `prepared` gives, and the worst plant for the design where it was searched."""
     asked = structured_of(problem).minimise
     problem = with_range(with_structured(problem, minimise="bandwidth"))
     corners = uncertain_plant(problem, problem.start).corners()
@@ -100,25 +112,28 @@ def prepared(
     problem = with_structured(problem, scenarios=scenarios)
 
     made = race(problem, problem.start, progress, workers, only_warm_starts)
-    for turn in range(ROUNDS):
-        wider = _wider(problem, problem.start, made, turn, progress) if made.certified else None
+    worst: Excess | None = None
+    for turn in range(ROUNDS if made.certified else 0):
+        worst, wider = _wider(problem, problem.start, made, turn, progress)
         if wider is None:
             break
         problem = with_structured(wider, warm_starts=_warm_starts(made))
-        made = structured_value(problem, problem.start).design
+        made, worst = structured_value(problem, problem.start).design, None
+        if not made.certified:
+            break
     if made.certified:
         problem = with_structured(problem, warm_starts=_warm_starts(made))
-    return with_structured(problem, minimise=asked), made
+    return with_structured(problem, minimise=asked), made, worst
 
 
 def _wider(
     problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign, turn: int,
     progress: Progress | None,
-) -> CoDesignProblem | None:  # fmt: skip
-    """The problem with the plants that are worse than its own, None where there are none."""
-    found = worst_case(problem, theta, made, turn, progress)[1]
+) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
+    """The worst plant, and the problem with those that are worse than its own, if there are any."""
+    worst, found = worst_case(problem, theta, made, turn, progress)
     scenarios = (*structured_of(problem).scenarios, *found)
-    return with_structured(problem, scenarios=scenarios) if found else None
+    return worst, with_structured(problem, scenarios=scenarios) if found else None
 
 
 def _warm_starts(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
@@ -132,41 +147,11 @@ def _warm_starts(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
     return (own, *others)[:MOST_WARM_STARTS]
 
 
-def with_warm_start(
-    problem: CoDesignProblem, kappa: Array, scenarios: Sequence[Scenario]
-) -> CoDesignProblem:
-    """The problem with one more warm start, first, of what it minimises, and more plants."""
+def with_warm_start(problem: CoDesignProblem, kappa: Sequence[float] | Array) -> CoDesignProblem:
+    """The problem with one more warm start, first, of what it minimises."""
     structured = structured_of(problem)
     structured = structured.with_warm_start(tuple(map(float, kappa)), MOST_WARM_STARTS + 1)
-    return replace(
-        problem, controller=replace(structured, scenarios=(*structured.scenarios, *scenarios))
-    )
-
-
-def least_value_at(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    made: SectionsDesign,
-    progress: Progress | None = None,
-) -> tuple[CoDesignProblem, LeastValue]:
-    """The problem with the plants that were found worse on the way, and the design on all of them,
-    which is the first of its warm starts of least error.
-
-    `made` is its certified design of largest bandwidth.
-    """
-    wider = problem
-    for turn in range(ROUNDS_OF_ERROR):
-        problem, structured = wider, structured_of(wider)
-        plants = plants_of(problem, theta)
-        found = least_value(
-            plants, bounds_of(problem), made, goal_of(problem, theta, plants),
-            sampling=structured.sampling, least_bandwidth=structured.bandwidth_least,
-            initial=[np.array(kappa) for kappa in structured.error_warm_starts], progress=progress,
-        )  # fmt: skip
-        wider = _wider(problem, theta, found.design, turn, progress) or problem
-        if wider is problem:
-            break
-    return with_warm_start(problem, found.design.kappa, ()), found
+    return replace(problem, controller=structured)
 
 
 def least_from(
@@ -176,10 +161,25 @@ def least_from(
     progress: Progress | None = None,
 ) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:
     """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
-    one of the least of another figure, not certified where it has to be slower than is allowed."""
+    one of the least of another figure, not certified where it has to be slower than is allowed.
+
+    The problem has the plants then that were found worse on the way, and that design as the first
+    of its warm starts.
+    """
     if problem.figure is not BANDWIDTH and made.certified:
         made = too_slow(problem, made)
     if problem.figure is BANDWIDTH or not made.certified:
         return problem, made, None
-    problem, found = least_value_at(problem, theta, made, progress)
-    return problem, found.design, found
+    wider = problem
+    for turn in range(ROUNDS_OF_ERROR):
+        problem, structured = wider, structured_of(wider)
+        plants = plants_of(problem, theta)
+        found = least_value(
+            plants, bounds_of(problem), made, goal_of(problem, theta, plants),
+            sampling=structured.sampling, least_bandwidth=structured.bandwidth_least,
+            initial=[np.array(kappa) for kappa in structured.error_warm_starts], progress=progress,
+        )  # fmt: skip
+        wider = _wider(problem, theta, found.design, turn, progress)[1] or problem
+        if wider is problem:
+            break
+    return with_warm_start(problem, found.design.kappa), found.design, found

@@ -75,10 +75,10 @@ def equivalent_open_loop(L: np.ndarray, i: int) -> np.ndarray:
 
 
 def sigma_max(response: np.ndarray) -> Array:
-    """σ_max (k,) of a response (k, p, m)."""
-    if response.shape[1:] == (1, 1):
-        return np.abs(response[:, 0, 0])
-    return np.asarray(np.linalg.norm(response, 2, axis=(1, 2)), dtype=float)
+    """σ_max (...) of matrices (..., p, m)."""
+    if response.shape[-2:] == (1, 1):
+        return np.abs(response[..., 0, 0])
+    return np.asarray(np.linalg.norm(response, 2, axis=(-2, -1)), dtype=float)
 
 
 def responses_of(G: np.ndarray, K: np.ndarray) -> dict[str, np.ndarray]:

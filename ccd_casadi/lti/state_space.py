@@ -104,7 +104,7 @@ class StateSpace:
     def zeros(self, unit: float = 1.0) -> np.ndarray:
         """Finite invariant zeros of a square system, |z| < 1e5 `unit`; none of another.
 
-        The eigenvalues of [[A, B], [C, D]] - z [[1, 0], [0, 0]], each part made about one.
+        The eigenvalues of [[A, B], [C, D]] - z [[1, 0], [0, 0]], each part scaled to about one.
         """
         n, m = self.B.shape
         if len(self.C) != m or n == 0:
@@ -132,9 +132,8 @@ class StateSpace:
     def in_units(self, rate: float, gain: float) -> "StateSpace":
         """The system with its time in 1/`rate` and its output in `gain`: A/rate, B/rate, C/gain."""
         return StateSpace(
-            self.A / rate, self.B / rate, self.C / gain, self.D / gain,
-            period=self.period * rate,
-        )  # fmt: skip
+            self.A / rate, self.B / rate, self.C / gain, self.D / gain, period=self.period * rate
+        )
 
 
 def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:

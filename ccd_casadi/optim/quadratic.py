@@ -87,13 +87,14 @@ def solve_elastic(
         found = solve_quadratic(hessian, cost, A[held], upper[held], *ends)
         if found is None:
             return None
-        missed = A @ found.x - upper if len(held) < m else np.zeros(0)
-        missed[held[: len(missed)]] = -np.inf
-        worst = np.argsort(-missed)[:ADDED]
-        fresh = worst[missed[worst] > KEPT]
-        if not len(fresh):
+        if len(held) == m:
             break
-        held = np.concatenate([held, fresh])
+        missed = A @ found.x - upper
+        missed[held] = -np.inf
+        if missed.max() <= KEPT:
+            break
+        worst = np.argsort(-missed)[:ADDED]
+        held = np.concatenate([held, worst[missed[worst] > KEPT]])
     multipliers = np.zeros(m)
     multipliers[held] = unit * found.multipliers
     return radius * np.clip(found.x[:n], *ends[:, :n]), multipliers

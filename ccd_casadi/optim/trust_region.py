@@ -62,7 +62,7 @@ class Rows:
     curved: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Iterate(Generic[Data]):
     """x (n,), f and its gradient (n,), the largest c above 0, and what its rows are made from."""
 

@@ -79,10 +79,11 @@ def facts_of(
     effort = _effort_hz(modal, scaled)
     driven = float((modal.B[modal.rigid] ** 2).sum(axis=0).max(initial=0.0))
     inertia = 1.0 / driven if driven > 0.0 else float("inf")
-    return PlantFacts(theta, _modes(modal), _zeros(scaled, effort, free), effort, inertia)
+    return PlantFacts(theta, modes_of(modal), _zeros(scaled, effort, free), effort, inertia)
 
 
-def _modes(modal: ModalPlant) -> tuple[PlantMode, ...]:
+def modes_of(modal: ModalPlant) -> tuple[PlantMode, ...]:
+    """Every mode in the order of the plant."""
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
     zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.diag(modal.K)))

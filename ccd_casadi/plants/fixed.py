@@ -10,8 +10,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.drawing.content import Figure
-from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 from ccd_casadi.support.arrays import Array
 
@@ -90,28 +88,15 @@ def reparametrised(
     `others`: fields that are given as they are, of the new θ.
     """
     shapes, drawing, nearby = plant.shapes, plant.drawing, plant.nearby
-
-    def near(known: Sequence[Sequence[float]]) -> Evaluate:
-        assert nearby is not None
-        return of(nearby([own(theta) for theta in known]))
-
-    def shown(theta: Sequence[float], count: int) -> ModeShapes:
-        assert shapes is not None
-        return shapes(own(theta), count)
-
-    def drawn(thetas: Mapping[str, Sequence[float]]) -> Figure:
-        assert drawing is not None
-        return drawing({name: own(theta) for name, theta in thetas.items()})
-
     seen: dict[str, Any] = {
         "evaluate": of(plant.evaluate),
         "references": {name: of(closer) for name, closer in plant.references.items()},
-        "values": None if plant.values is None else of(plant.values),
-        "nearby": None if nearby is None else near,
+        "values": plant.values and of(plant.values),
+        "nearby": nearby and (lambda known: of(nearby([own(theta) for theta in known]))),
         "notes": lambda theta: plant.notes(own(theta)),
         "doubt": lambda theta: plant.doubt(own(theta)),
-        "shapes": None if shapes is None else shown,
-        "drawing": None if drawing is None else drawn,
+        "shapes": shapes and (lambda theta, count: shapes(own(theta), count)),
+        "drawing": drawing and (lambda thetas: drawing({k: own(v) for k, v in thetas.items()})),
     }
     return replace(plant, **(seen | others))
 

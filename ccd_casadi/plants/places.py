@@ -116,7 +116,7 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         domain=_domain(plant, whole, len(names)),
         shapes=whole.shapes if nodes.shape[1] == 2 else None,
         drawing=whole.drawing if nodes.shape[1] < 3 else None,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

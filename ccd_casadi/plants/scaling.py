@@ -74,6 +74,11 @@ class ScaledPlant:
     family: PlantFamily | None = None
 
     @property
+    def design_plant(self) -> "ScaledPlant":
+        """The plant that a design is made on: itself, or that of its family."""
+        return self if self.family is None else self.family.design
+
+    @property
     def members(self) -> "tuple[ScaledPlant, ...]":
         """The plants that a design on it is judged on: itself, and those of its family."""
         return (self, *(() if self.family is None else self.family.perturbed))

@@ -9,6 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.support.terminal import plain
 from ccd_casadi.support.units import HZ, counted, display_unit, number, small_share, with_unit
 
 
@@ -53,8 +54,8 @@ def _prediction(result: Mapping[str, Any]) -> str:
         return ""
     if line.get("left_out") is not None:
         missed = number(100.0 * line["left_out"], 2)
-        return f" It is a sample of the surrogate, and is missed by {missed} % without that sample."
-    return f" The prediction errs by {number(result['verification_error'], 2)} of the truth."
+        return f" It is a training sample; a surrogate without it misses ω_b by {missed} %."
+    return f" The prediction errs by {small_share(result['verification_error'])}."
 
 
 def run_name(place: Path) -> str:
@@ -116,7 +117,7 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
 
 
 def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fact]:
-    """Quantity, value, remark: the design, its loop, its proof and its price."""
+    """Quantity, value, remark: the design, its loop, its proof and what it cost."""
     r, inner, certificate = result, problem.inner, result["certificate"]
     proof = "all closed-loop poles stable" if certificate["stable"] else "UNSTABLE"
     ranges = [
@@ -128,7 +129,7 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
     bound = f"least possible norm; lower bound γ_jω = {number(r['gamma_lower_bound'], 6)}"
     backoff = f"synthesised at {inner.gamma_backoff:g} γ_opt, recomputed from the closed loop"
     return [
-        *value_facts(problem, r, "true: first -3 dB crossing of σ_max(S)"),
+        *value_facts(problem, r, "true: the first crossing of -3 dB by S"),
         ("Weight on S: ω_S", hz["omega_S"], ranges[0]),
         ("Weight on T: ω_T", hz["omega_T"], ranges[1]),
         ("γ_opt", number(r["gamma_opt"], 6), bound),
@@ -145,7 +146,7 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
         *_without_suspension(r),
         *_references(r),
         *_optimality(r),
-        ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
+        ("Cost", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]
 
 
@@ -174,7 +175,7 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
     if r["formulation"] == "direct":
         return ""
     if r.get("verdict", {}).get("predicted", {}).get("left_out") is not None:
-        return "a sample of the surrogate"  # which repeats it
+        return "a training sample of the surrogate"  # which repeats it
     return f"predicted {guess} (error {small_share(r['verification_error'])})"
 
 
@@ -217,19 +218,17 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
 
 def loop_lines(r: Mapping[str, Any]) -> list[str]:
     """The same for the terminal."""
-    plain = str.maketrans({"µ": "u", "°": " deg", "×": "x", "÷": "/"})
-    lines = (f"{name.lower():14s}{value}, {remark}" for name, value, remark in loop_facts(r))
-    return [line.translate(plain) for line in lines]
+    return [plain(f"{name.lower():14s}{value}, {remark}") for name, value, remark in loop_facts(r)]
 
 
 def _compliance(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
     """What a force moves, at most and at rest; nothing of a run of before."""
     if "compliance_words" not in r:
         return []
-    asked = problem.inner.compliance_max
-    bound = "no compliance_max" if asked is None else f"compliance_max = {1e6 * asked:g} µm/N"
-    value = f"{number(1e6 * r['compliance_max'], 4)} µm/N"
-    return [("Compliance ‖GS‖∞", value, f"{bound}; {r['compliance_words']}")]
+    most = problem.inner.compliance_max
+    bound = "" if most is None else f"compliance_max = {with_unit(most, 'm')}/N; "
+    value = f"{with_unit(r['compliance_max'], 'm', 4)}/N"
+    return [("Compliance ‖GS‖∞", value, f"{bound}{r['compliance_words']}")]
 
 
 def _robust(r: Mapping[str, Any]) -> list[Fact]:
@@ -295,8 +294,8 @@ def _optimality(r: Mapping[str, Any]) -> list[Fact]:
         )
     gap = r.get("inner_gap")
     if gap is not None:
-        words = "by how much the best controller that was found at this θ is faster, relative"
-        facts.append(("Gap of the controller search", number(gap, 2), words))
+        words = "more bandwidth by the best controller that the searches at this θ found"
+        facts.append(("Gap of the controller search", small_share(gap), words))
     return facts
 
 
@@ -327,7 +326,7 @@ def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
     if name == "S_low":
         return f"|S| at ω_low is at S_low = {inner.S_low:g}", 0.01, "raising S_low by 1 %"
     if name == "compliance_max" and inner.compliance_max is not None:
-        words = f"‖GS‖∞ is at compliance_max = {1e6 * inner.compliance_max:g} µm/N"
+        words = f"‖GS‖∞ is at compliance_max = {with_unit(inner.compliance_max, 'm')}/N"
         return words, 0.01, "raising it by 1 %"
     if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
         ends = inner.omega_S if variable == "omega_S" else inner.omega_T

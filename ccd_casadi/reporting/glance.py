@@ -40,6 +40,11 @@ def glance(
         f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
         f"from -1 in the Nyquist plot.{margin_words(view)} {move.caption}"
     )
+    if isinstance(rows[0][0], Table):
+        words += (
+            " In the table of modes, driven is how strongly the actuators excite a mode and "
+            "measured how strongly the sensors see it, relative to the largest."
+        )
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
     return Chapter("At a glance", (Figure(lines, words, (*tables_of(lines), move.tables[0])),))
 

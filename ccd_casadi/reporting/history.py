@@ -9,8 +9,9 @@ import numpy as np
 from ccd_casadi.codesign.formulation import Iterate
 from ccd_casadi.drawing.content import Table, Words
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, number
+from ccd_casadi.support.units import HZ, counted, small_share
 
 
 def history_blocks(
@@ -31,13 +32,13 @@ def history_blocks(
     ]
     known = np.array(rows, float)
     known[~np.isfinite(known)] = np.nan
-    head = (
-        "round", *problem.names, "ω_b predicted Hz", "ω_b true Hz", "J predicted", "J true",
-        "error",
-    )  # fmt: skip
+    axes = theta_axes(problem)
+    units = (f"{name} ({unit})" if unit else name for name, unit, _ in axes)
+    head = ("round", *units, "ω_b predicted Hz", "ω_b true Hz", "J predicted", "J true", "error")
     names = [*(str(i + 1) for i in range(len(iterates))), "verified"]
     table = Table(head, tuple(
-        (name, *item.theta, *row)
+        (name, *(v * axis[2] for v, axis in zip(item.theta, axes, strict=True)), *row[:-1],
+         small_share(row[-1]) if np.isfinite(row[-1]) else "–")
         for name, item, row in zip(names, (*iterates, last), known, strict=True)
     ))  # fmt: skip
     *_, objective, error = known.T
@@ -48,21 +49,22 @@ def _words(error: Array, lost: int, tolerance: float, lifted: bool) -> str:
     """How the error fell, in numbers."""
     known = error[np.isfinite(error)]
     met = np.flatnonzero(error[:-1] <= tolerance)
-    words = f"{counted(len(error) - 1, 'round')} of fit, IPOPT and truth: the error goes "
-    words += f"from {number(float(known[0]), 2)} to {number(float(known[-1]), 2)}"
+    first, last = small_share(float(known[0])), small_share(float(known[-1]))
+    words = f"{counted(len(error) - 1, 'round')} of fit, IPOPT and truth: the error "
+    words += f"is {last}" if first == last else f"goes from {first} to {last}"
     if met.size:
         stays = (error[met[0] : -1] <= tolerance).all()
         when = f"from round {met[0] + 1} on" if stays else f"first in round {met[0] + 1}"
-        words += f" and is within the tolerance {tolerance:g} {when}"
+        words += f" and is within the tolerance of {100.0 * tolerance:g} % {when}"
     else:
-        words += f", in no round within the tolerance {tolerance:g}"
+        words += f", in no round within the tolerance of {100.0 * tolerance:g} %"
     words += ". "
     if lost:
-        words += f"{lost} of the promised θ had no feasible design. "
+        words += f"{lost} of the predicted θ had no feasible design. "
     if lifted:
         words += (
             "In the rounds the error is the largest of those of ω_b (relative), ln‖S‖∞ and "
-            "ln|S(ω_low)|; at the verified design, of ω_b alone. A round may promise a design just "
+            "ln|S(ω_low)|; at the verified design, of ω_b alone. A round may predict a design just "
             "outside S_max, so its true J may lie below the final one."
         )
     return words.strip()

@@ -54,6 +54,10 @@ def write_index(folder: Path) -> None:
         result["status"] = str(result["status"])
     except (OSError, ValueError, KeyError):
         return
+    if (
+        result["status"] != "infeasible" and "objective" not in result
+    ):  # of `tune`, whose page is one
+        return
     pages = _pages(folder)
     for place in pages:
         text = place.read_text(encoding="utf-8")

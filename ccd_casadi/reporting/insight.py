@@ -175,16 +175,10 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> c.Table:
             for label, v, size in zip(labels, moves, sizes, strict=True)
             if abs(v) * (abs(item.value) or 1.0) > ROUNDING * size
         )
-        rows.append(
-            (
-                name,
-                f"{number(value)} {unit}".strip(),
-                item.objective / factor,
-                item.bandwidth / HZ / factor,
-                item.hardware_cost / factor,
-                theta or ("does not move" if found.determined or swept else "–"),
-            )
-        )
+        still = "does not move" if found.determined or swept else "–"
+        slopes = (item.objective, item.bandwidth / HZ, item.hardware_cost)
+        shown_value = f"{number(value)} {unit}".strip()
+        rows.append((name, shown_value, *(slope / factor for slope in slopes), theta or still))
     moving = "how θ, ln ω_S and ln ω_T move per unit" if swept else "how θ moves per unit"
     head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", moving)
     return c.Table(head, tuple(rows))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.drawing.content import Landscape
-from ccd_casadi.inner_problem.constraints import violated
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, sample_key
 from ccd_casadi.sampling.store import SampleStore
@@ -117,7 +117,7 @@ def caption_landscape(land: Landscape, best_hz: float) -> str:
     """What the colours and the dots are, and what the field leaves out."""
     if not land.bandwidth_hz.size:
         return (
-            "No surrogate is of ω_b*(θ) alone: the large dots are the θ where a synthesis met "
+            "No surrogate was fitted to ω_b*(θ): the large dots are the θ where a synthesis met "
             "S_max and S_low, in the colour of the best ω_b found there (ω_b* is at least "
             f"that), {len(land.truths)} of them; at the {len(land.designs)} small ones none did. "
             f"The verified design (★) has {number(best_hz)} Hz."
@@ -134,7 +134,7 @@ def caption_landscape(land: Landscape, best_hz: float) -> str:
     if land.outside.any():
         words += (
             f" Pale: outside the last trust region ({100.0 * land.outside.mean():.0f} % of the "
-            "grid), where the last surrogate was not asked to be right; believe the dots there."
+            "grid), where the last surrogate was not checked; believe the dots there."
         )
     if land.forbidden is not None and land.forbidden.any():
         words += f" Hatched: a constraint on θ forbids {100.0 * land.forbidden.mean():.0f} %."

@@ -32,10 +32,10 @@ def table_limits(loop: LoopView) -> Table:
     rows = []
     for name, hz in sorted(places, key=lambda place: place[1]):
         found = shares(loop, hz)
-        rows.append((name, hz, *(float(v) for v in found), PARTS[int(found.argmax())]))
-    return Table(
-        ("where", "Hz", "|S| / bound", "|KS| / bound", "|T| / bound", "closest"), tuple(rows)
-    )
+        percent = (float(f"{100.0 * share:.3g}") for share in found)
+        rows.append((name, hz, *percent, PARTS[int(found.argmax())]))
+    heads = (f"{part}, % of its bound" for part in PARTS)
+    return Table(("where", "Hz", *heads, "closest"), tuple(rows))
 
 
 def limit_sentences(loop: LoopView) -> list[str]:

@@ -232,12 +232,12 @@ def _caption(view: LoopView) -> str:
     band = f"The band spans {counted(plants, 'plant')} of the set. " if plants > 1 else ""
     first = (
         f"The least ω_b of them is {number(view.bandwidth_hz, 5)} Hz." if plants > 1
-        else f"σ_max(S) first crosses -3 dB at ω_b = {number(view.bandwidth_hz, 5)} Hz."
+        else f"{view.named('S')} first crosses -3 dB at ω_b = {number(view.bandwidth_hz, 5)} Hz."
     )  # fmt: skip
     if plants > 1:
         words = words.replace("peak of S is", "peak of S on the model is")
     near = [
-        f"|{name}| reaches {100.0 * share[i]:.4g} % of {view.bounded.words[k]} at "
+        f"{view.named(name)} reaches {100.0 * share[i]:.4g} % of {view.bounded.words[k]} at "
         f"{number(float(view.hz[i]), 3)} Hz"
         for k, (name, share) in enumerate(zip(NAMES, view.shares, strict=True))
         if np.isfinite(share).any()

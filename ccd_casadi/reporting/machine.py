@@ -13,6 +13,7 @@ from ccd_casadi.drawing.content import Figure, Modes, Picture, Table
 from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.turntable import REACH
+from ccd_casadi.plants.facts import modes_of
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
@@ -150,13 +151,12 @@ def lumped_machine(
 def modes_table(modal: ModalPlant) -> Table:
     """Of each mode: frequency, damping ratio, and the norms of what drives and measures it, as
     shares of the largest of all modes."""
-    b, c = np.linalg.norm(modal.B, axis=1), np.linalg.norm(modal.C, axis=0)
     rows = []
-    for i in np.argsort(modal.natural, kind="stable"):
-        omega = float(modal.natural[i])
-        hz = "rigid" if modal.rigid[i] else f"{number(omega / HZ, 4)} Hz"
-        zeta = "" if modal.rigid[i] else f"{100.0 * modal.D[i, i] / (2.0 * omega):.3g} %"
-        rows.append((hz, zeta, f"{b[i] / b.max():.2g}", f"{c[i] / c.max():.2g}"))
+    for mode in sorted(modes_of(modal), key=lambda mode: mode.frequency_hz):
+        known = ("rigid", "") if mode.rigid else (
+            f"{number(mode.frequency_hz, 4)} Hz", f"{100.0 * mode.damping_ratio:.3g} %"
+        )  # fmt: skip
+        rows.append((*known, f"{mode.driven:.2g}", f"{mode.measured:.2g}"))
     return Table(("mode", "damping", "driven (most: 1)", "measured (most: 1)"), tuple(rows))
 
 

@@ -16,10 +16,10 @@ from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
-from ccd_casadi.inner_problem.design_loops import free_loops
-from ccd_casadi.inner_problem.move_figures import motion_of
+from ccd_casadi.inner_problem.design_loops import design_loops
+from ccd_casadi.inner_problem.move_figures import FREE, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
@@ -52,11 +52,11 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
         ahead: Array | None = motion.forward
     else:
         profile, window = setpoint(LIMITS), WINDOW
-        modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
+        modal = modal_plant(mechanics(plant_of(problem), theta), FREE)
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
         other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
-    free = free_loops(problem, theta, view.loop.controller)
+    free = design_loops(replace(problem, suspension=FREE), theta, view.loop.controller)
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
@@ -123,9 +123,10 @@ def force_step(view: LoopView) -> c.Figure:
     times = np.geomspace(0.02 / (HZ * view.bandwidth_hz), SETTLED / slow, STEPS)
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
-    y = 1e6 * np.array([step[1] for step in steps])
-    curves, bands = of_plants(1e3 * t, y)
-    panel = c.Panel("time (ms)", "y after a step of 1 N (µm)", curves, bands, log_x=True)
+    y = np.array([step[1] for step in steps])
+    unit, factor = display_unit("m", float(np.abs(y).max()))
+    curves, bands = of_plants(1e3 * t, factor * y)
+    panel = c.Panel("time (ms)", f"y after a step of 1 N ({unit})", curves, bands, log_x=True)
     on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
     words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
@@ -146,8 +147,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     first, until = made[0][0], max(shown_until(m) for each in made for m in each)
     end = c.Level(1e3 * first.duration, "setpoint ends", vertical=True)
     peaks = [max(m.peak_error for m in each) for each in made]
-    kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False)
-            if way[2] < 1e3 * peaks[0]]  # fmt: skip
+    kept = [way for way in zip(ways, made, peaks, COLOURS, strict=False) if way[2] < 1e3 * peaks[0]]
     top = max(peak for _, _, peak, _ in kept)
     time = np.linspace(0.0, until, DRAWN)
     ms = 1e3 * time

@@ -32,13 +32,16 @@ def nyquist_panel(
         for i, line in reversed(list(enumerate(loci)))
     ]  # fmt: skip
     disk = -1.0 + circle / S_max
-    curves.append(Curve(disk.real, disk.imag, f"|S| = S_max = {S_max:g}", ORANGE))
-    curves.append(Curve(circle.real, circle.imag, "|L| = 1", GREY, ":", width=0.9))
+    curves.append(Curve(disk.real, disk.imag, colour=ORANGE))
+    curves.append(Curve(circle.real, circle.imag, colour=GREY, line=":", width=0.9))
+    named = (Mark(-1.0 - 1.0 / S_max, 0.0, f"S_max {S_max:g}", "", ORANGE, (-8.0, 3.0)),
+             Mark(0.5**0.5, 0.5**0.5, "|L| = 1", "", GREY, (8.0, 3.0)))  # fmt: skip
     wide, tall = 0.5 * WIDTH - LEFT - RIGHT, height - BOTTOM - TOP
     half = 0.5 * (SHOWN[1] - SHOWN[0]) * tall / wide  # a circle is round
     arrows, marks = _along(hz, loci[0], half)
     return Panel(
-        "Re L (–)", "Im L (–)", (*curves, *arrows), marks=(Mark(-1.0, 0.0, marker="+"), *marks),
+        "Re L (–)", "Im L (–)", (*curves, *arrows),
+        marks=(Mark(-1.0, 0.0, marker="+"), *marks, *named),
         x_range=SHOWN, y_range=(-half, half),
         forbidden=(Area(disk.real, disk.imag),),
     )  # fmt: skip

@@ -176,7 +176,7 @@ def _gains(found: Study) -> Chapter:
         ("force by sensor noise", share * n.force_by_noise, f"N RMS for {sensor}"),
         ("position by force noise", 1e6 * n.position_by_disturbance, f"µm RMS for {force}"),
         ("force by force noise", n.force_by_disturbance, f"N RMS for {force}"),
-    )  # fmt: skip
+    )
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
     caption = (

@@ -219,11 +219,11 @@ def _history(
     heading = "Prediction against truth"
     outcome, result = solution.outcome, solution.result
     if not outcome.iterates:
-        words = (
-            "There are no rounds to show: "
-            + ("IPOPT worked on the true quantities, nothing was predicted."
-               if result["formulation"] == "direct" else (result["reason"] or "none was run."))
-        )  # fmt: skip
+        words = "There are no rounds to show: " + (
+            "IPOPT worked on the true quantities, nothing was predicted."
+            if result["formulation"] == "direct"
+            else (result["reason"] or "none was run.")
+        )
         return c.Chapter(heading, (c.Words(words),))
     blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
@@ -247,7 +247,7 @@ def provenance(case: Case, result: Mapping[str, Any]) -> c.Chapter:
     body = (
         c.Heading("Seed and versions"),
         c.Table(("what", "version"), tuple((a, str(b)) for a, b in rows)),
-        c.Heading("The resolved case file"),
-        c.Source(case_to_toml(case)),
+        c.Heading("The case with its defaults"),
+        c.Source(case_to_toml(case).replace(f"{case.path.resolve().parent}/", "")),
     )
     return c.Chapter("Provenance", body, own_page=True)

@@ -58,8 +58,8 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
                 worth = v.shown(0.01 * mu[name] * most, 3)
                 over_kappa.append(f"{words}{of} binds; 1 % more of it is worth {worth}.")
     ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
-    ends = [f"{name[:1].upper()}{name[1:]} is at the {end} end of its range."
-            for name, _, end in ranges]  # fmt: skip
+    ends = [f"{name if ': ' in name else name[:1].upper() + name[1:]} is at the {end} end of its "
+            "range." for name, _, end in ranges]  # fmt: skip
     return [*over_theta, *over_kappa, *ends]
 
 
@@ -92,10 +92,10 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
 def tolerance_words(hz: Mapping[str, float]) -> str:
     """Which tolerances cost most, by the change of ω_b in Hz where each grows by 1 %."""
     most = sorted(hz.items(), key=lambda item: item[1])[:MOST_TOLERANCES]
-    gains = [f"{name} {number(-10.0 * value, 3)} Hz" for name, value in most if value < -LEAST_HZ]
+    gains = [f"{number(-10.0 * value, 3)} Hz ({name})" for name, value in most if value < -LEAST_HZ]
     if not gains:
         return ""
-    return f" A tolerance narrower by a tenth would gain, to first order: {', '.join(gains)}."
+    return f" A tolerance narrower by a tenth would gain, to first order, {', '.join(gains)}."
 
 
 def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
@@ -114,15 +114,14 @@ def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fac
         *sensitivity_facts(problem, r),
         *(("Channel", own["name"], channel_words(own)) for own in r.get("channel_bounds", ())),
         ("Peak of S over the box", number(robust["worst_sensitivity_peak"], 6), worst),
-        ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
-         r["compliance_words"]),
+        ("Compliance |GS|", f"{with_unit(r['compliance_max'], 'm', 4)}/N", r["compliance_words"]),
         *loop_facts(r),
         ("Largest |KS|", with_unit(r["KS_max"], "N/m", 4), ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),
         ("Over the box", "passed" if robust["passed"] else "FAILED",
-         f"{robust['words']}, the worst plant that a search found at "
+         f"{robust['words']}; the worst plant that a search found is at "
          f"{100.0 + 100.0 * robust['worst_excess']:.6g} % of a bound; "
          f"{r['proof']['words']}"),
         ("Optimality (KKT residual)", number(kkt, 2),
@@ -130,7 +129,7 @@ def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fac
          "controller"),
         ("A multi-start search at this θ", optima or "–",
          f"local optima (searches); {counted(r['rounds'], 'round')} of the outer problem"),
-        ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
+        ("Cost", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]  # fmt: skip
 
 
@@ -140,7 +139,7 @@ def _over(kkt: Mapping[str, Any]) -> str:
     if kink is None:
         return "θ"
     alone = number(kink["one_gradient"], 2)
-    return f"θ and controller together, at a kink of J ({alone} with one side's gradient)"
+    return f"θ and controller together, at a kink of J ({alone} by the gradient of one side)"
 
 
 def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:

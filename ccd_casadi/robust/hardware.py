@@ -67,11 +67,10 @@ def tolerances(
 
     light = replace(run, result={})
     drawn: list[PerturbedLoop | None] = [None] * samples
-    with Progress(samples, "hardware tolerances") as progress:
-        tasks = [(i, light, place(x)) for i, x in enumerate(unit)]
-        for i, item in pool.map_unordered(_hardware_unit, tasks):
-            drawn[i] = item
-            progress.advance()
+    tasks = [(i, light, place(x)) for i, x in enumerate(unit)]
+    bar = Progress(samples, "hardware tolerances")
+    for i, item in bar.over(pool.map_unordered(_hardware_unit, tasks)):
+        drawn[i] = item
     failed = sum(item is None for item in drawn)
     one = np.ones(theta.size)
     order = np.argsort([-1.0 if item is None else -item.badness for item in drawn])

@@ -103,12 +103,8 @@ def _line(
     if nominal.stable:
         stable = search(loops, growth_of)
         within = search(loops, excess) if excess(nominal) <= 0.0 else within
-    judged = []
-    with progress:
-        for place, off in places.items():
-            modal = modal_plant(system, run.problem.suspension, off)
-            judged.append(judge(run, modal, (place,)))
-            progress.advance()
+    judged = [judge(run, modal_plant(system, run.problem.suspension, off), (place,))
+              for place, off in progress.over(places.items())]  # fmt: skip
     return Line(tuple(judged), stable, within)
 
 

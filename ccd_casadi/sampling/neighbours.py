@@ -40,7 +40,7 @@ def from_neighbour(
     def promise(one: InnerSample) -> float:
         return problem.figure.gain(_branch(one, theta, one.gradient), near[0].value)
 
-    return with_warm_start(problem, np.array(max(near, key=promise).kappa), ())
+    return with_warm_start(problem, max(near, key=promise).kappa)
 
 
 def from_controller(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:

@@ -14,8 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ccd_casadi.inner_problem.constraints import violated
-from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.objective import objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.neighbours import from_controller, from_neighbour, promising_starts

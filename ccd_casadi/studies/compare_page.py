@@ -39,33 +39,27 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     if best is not None:
         loops = _loops(comparison, best)
         chapters.append(Chapter("Sensitivity, baseline against co-design", (loops,)))
-        chapters += stage_chapters(
-            problem,
-            {
-                LABELS[name]: tuple(comparison.method(name).figures["theta"].values())
-                for name in ("sequential", best)
-                if comparison.method(name).figures.get("theta")
-            },
-        )
+        thetas = {
+            name: comparison.method(name).figures.get("theta") for name in ("sequential", best)
+        }
+        stages = {LABELS[name]: tuple(theta.values()) for name, theta in thetas.items() if theta}
+        chapters += stage_chapters(problem, stages)
     chapters += [
         Chapter(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
         for method in comparison.methods
         if lines_of(method.figures)
     ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
-    chapters += [
-        Chapter(
-            "The case",
-            (Words(f"{versions}; seed {answer['seed']}."), Source(case_to_toml(comparison.case))),
-        )
-    ]
+    with_seed = Words(f"{versions}; seed {answer['seed']}.")
+    chapters.append(Chapter("The case", (with_seed, Source(case_to_toml(comparison.case)))))
     ours = [method.figures for method in comparison.methods if method.solution]
     verified = all(figures["status"] == "verified" for figures in ours)
     warned = any(worst_state(figures) is not State.PASSED for figures in ours)
     head = Head(
         f"Comparison: {comparison.case.path.name}",
         "bad" if not verified else "warn" if warned else "good",
-        "verified" if verified else "not verified", "",
+        "verified" if verified else "not verified",
+        "With warnings: see the verdicts below." if verified and warned else "",
         f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
         " ".join(found["sentences"][1:2]), decision=found["sentences"][0],
     )  # fmt: skip
@@ -128,10 +122,8 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
     nested = comparison.method("nested").solution
     if nested is not None:
         process = bandwidth_process(nested.outcome.surrogates)
-    if (
-        nested is not None and nested.verified is not None
-    ):  # its samples may be of its own warm starts
-        problem = nested.verified.problem
+        if nested.verified is not None:  # its samples may be of its own warm starts
+            problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, process, truths)
     walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]

@@ -154,11 +154,8 @@ def _descents(given: _Setting) -> list[Descent]:
         for start in starts
         for step in base.steps
     ]
-    found = []
-    with Progress(len(tasks), "steepest descent", quiet=given.quiet) as progress:
-        for descent in given.workers.map_unordered(_descend, tasks):
-            found.append(descent)
-            progress.advance()
+    bar = Progress(len(tasks), "steepest descent", quiet=given.quiet)
+    found = bar.over(given.workers.map_unordered(_descend, tasks))
     return sorted(found, key=lambda d: (d.gradient, d.start, d.first_step))
 
 
@@ -264,29 +261,24 @@ def _resonance(problem: CoDesignProblem, theta: tuple[float, ...]) -> float:
 
 def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
     """compare.json."""
-    model = comparison.problem.source.model or ""
-    entries = {method.name: method.figures for method in comparison.methods}
-    return json_values(
-        {
-            "case": str(comparison.case.path),
-            "methods": entries,
-            "traces": {
-                method.name: [asdict(entry) for entry in method.trace]
-                for method in comparison.methods
-            },
-            "descents": [
-                _run_dict(descent)
-                | {
-                    "objective": descent.objective,
-                    "theta": descent.iterates[-1].theta if descent.iterates else None,
-                    "syntheses": descent.syntheses,
-                }
-                for descent in comparison.descents
-            ],
-            "published": PUBLISHED.get(model, {}) if baseline_of(comparison.problem).swept else {},
-            "conclusions": conclusions(comparison.problem, entries),
-            "seconds": comparison.seconds,
-            "seed": seed,
-            "versions": versions(),
-        }
-    )
+    problem, methods = comparison.problem, comparison.methods
+    entries = {method.name: method.figures for method in methods}
+    descents = [
+        _run_dict(run)
+        | {"objective": run.objective, "syntheses": run.syntheses}
+        | {"theta": run.iterates[-1].theta if run.iterates else None}
+        for run in comparison.descents
+    ]
+    published = PUBLISHED.get(problem.source.model or "", {})
+    answer = {
+        "case": str(comparison.case.path),
+        "methods": entries,
+        "traces": {method.name: [asdict(entry) for entry in method.trace] for method in methods},
+        "descents": descents,
+        "published": published if baseline_of(problem).swept else {},
+        "conclusions": conclusions(problem, entries),
+        "seconds": comparison.seconds,
+        "seed": seed,
+        "versions": versions(),
+    }
+    return json_values(answer)

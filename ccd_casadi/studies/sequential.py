@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, solve_program
-from ccd_casadi.inner_problem.constraints import constraint_sizes, violated
+from ccd_casadi.inner_problem.objective import constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics

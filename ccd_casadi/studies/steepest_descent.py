@@ -107,7 +107,11 @@ def steepest_descent(
     stop = Stop.ITERATIONS
     for _ in range(max_iterations):
         g = hardware_at(problem, theta).cost_gradient + problem.w2 * answer.slope * width
-        history.append(_iterate(problem, theta, answer, g, step, spent))
+        J = objective(problem, theta, answer.value)
+        places, slope = tuple(theta.tolist()), tuple(g.tolist())
+        history.append(
+            DescentIterate(places, *answer.frequencies, answer.bandwidth, J, slope, step, spent)
+        )
         if not np.isfinite(g).all():
             stop = Stop.NO_GRADIENT
             break
@@ -130,18 +134,3 @@ def steepest_descent(
             break
         theta, answer = accepted
     return Descent(gradient, tuple(start), first_step, tuple(history), answer.design, stop, spent)
-
-
-def _iterate(
-    problem: CoDesignProblem, theta: Array, answer: Answer, gradient: Array, step: float, spent: int
-) -> DescentIterate:
-    return DescentIterate(
-        theta=tuple(float(v) for v in theta),
-        omega_S=answer.frequencies[0],
-        omega_T=answer.frequencies[1],
-        bandwidth=answer.bandwidth,
-        objective=objective(problem, theta, answer.value),
-        gradient=tuple(float(v) for v in gradient),
-        step=step,
-        syntheses=spent,
-    )

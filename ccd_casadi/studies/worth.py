@@ -57,10 +57,7 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     missed: list[float] = []
     settled = False
     while not settled and len(missed) < ROUNDS:
-        before, learnt = (
-            objective_of(problem, best),
-            [sample for sample in known if sample.feasible],
-        )
+        before, learnt = objective_of(problem, best), [each for each in known if each.feasible]
         if len(learnt) <= len(problem.names):
             words = f"only {len(learnt)} of {len(known)} designs in the box were certified"
             raise UserError(f"no trade-off can be learnt: {words}; widen the bounds")

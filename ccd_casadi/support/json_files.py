@@ -12,7 +12,12 @@ from surrogates.files import write_whole
 
 def write_json(path: Path, value: Any) -> None:
     """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
-    write_whole(path, json.dumps(json_values(value), indent=2, allow_nan=False) + "\n")
+    write_whole(path, f"{json_text(value)}\n")
+
+
+def json_text(value: Any) -> str:
+    """What `write_json` writes."""
+    return json.dumps(json_values(value), indent=2, allow_nan=False)
 
 
 def json_values(value: Any) -> Any:

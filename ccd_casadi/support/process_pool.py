@@ -39,6 +39,9 @@ class Pool(Protocol):
 
     def __exit__(self, *_: object) -> None: ...
 
+    def begin(self, module: str) -> None:
+        """Start what is not running, with a module imported, while this process goes on."""
+
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
     ) -> Generator[R, None, None]:
@@ -70,7 +73,7 @@ class Workers:
         self._end(self._workers)
 
     def begin(self, module: str) -> None:
-        """Start the processes, which import a module while this one goes on."""
+        """As `Pool` says; for work that is known to be worth the processes."""
         missing = self.count - len(self._workers) if self.count > 1 else 0
         with interrupts_held():
             self._workers += [WorkerProcess(module) for _ in range(missing)]

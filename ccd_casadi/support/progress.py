@@ -7,11 +7,13 @@ notebook it is on stdout, since stderr is painted there as a failure.
 
 import sys
 import time
-from typing import Self, TextIO
+from collections.abc import Iterable, Iterator
+from typing import Self, TextIO, TypeVar
 
 from ccd_casadi.support.notebook import in_notebook
 from ccd_casadi.support.terminal import QUIET, columns
 
+T = TypeVar("T")
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
 
@@ -52,6 +54,13 @@ class Progress:
                 self._write("\r\x1b[2K" if self.terminal else "")
                 return
         self._show(end="\n")
+
+    def over(self, items: Iterable[T]) -> Iterator[T]:
+        """The items, each counted once what is done with it is done."""
+        with self:
+            for item in items:
+                yield item
+                self.advance()
 
     def advance(self, count: int = 1, note: str = "") -> None:
         """Count `count` more as done; `note` is shown behind the bar until the next one."""

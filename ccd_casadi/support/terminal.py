@@ -12,6 +12,8 @@ from typing import TextIO
 WIDTH = 100  # characters of a line at most, and where no terminal is
 LABEL = re.compile(r"\s*(\S+( \S+)*?\s{2,})?((passed|warned|failed|unknown)\s{2,})?")
 
+PLAIN = (("‖S‖∞", "the peak of S"), ("±", "+-"), ("×", "x"), ("÷", "/"), ("°", " deg"), ("µ", "u"),
+         ("ω_b", "omega_b"))  # fmt: skip
 COLOURS = {"passed": 32, "verified": 32, "warned": 33, "failed": 31, "not_verified": 31}
 QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
 STATE = re.compile(rf"^(\w+\s{{2,}})({'|'.join(COLOURS)})\b")
@@ -48,6 +50,17 @@ def coloured(line: str) -> str:
     if "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb":
         return line
     return STATE.sub(lambda m: f"{m[1]}\x1b[{COLOURS[m[2]]}m{m[2]}\x1b[0m", line)
+
+
+def plain(text: str) -> str:
+    """Words of a page in the signs that every terminal has.
+
+    >>> plain("±1 µm, damping × 0.5, 40°")
+    '+-1 um, damping x 0.5, 40 deg'
+    """
+    for sign, words in PLAIN:
+        text = text.replace(sign, words)
+    return text
 
 
 def say(text: str, stream: TextIO | None = None) -> None:

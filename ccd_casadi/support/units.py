@@ -24,7 +24,7 @@ def display_unit(unit: str, largest: float) -> tuple[str, float]:
     if unit not in ("m", "s") or largest == 0.0:
         return unit, 1.0
     for prefix, factor in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
-        if abs(largest) * factor >= 1.0:
+        if abs(largest) * factor >= 0.9995:  # which rounds to 1
             return prefix + unit, factor
     return f"n{unit}", 1e9
 
@@ -34,6 +34,8 @@ def with_unit(value: float, unit: str, digits: int = 3) -> str:
 
     >>> with_unit(4.1e-5, "m"), with_unit(0.01, "m"), with_unit(0.18, "s"), with_unit(0.0, "m")
     ('41 µm', '10 mm', '180 ms', '0 m')
+    >>> with_unit(9.996e-7, "m")
+    '1 µm'
     """
     read, factor = display_unit(unit, value)
     return f"{number(factor * value, digits)} {read}"

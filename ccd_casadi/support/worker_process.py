@@ -55,21 +55,24 @@ class WorkerProcess:
         with suppress(OSError):  # it is dead: its answer will say so
             self.pipe.send_bytes(message)
 
-    def answer(self, seconds: float | None = None) -> tuple[bool, Any]:
-        """(True, what the task came to) or (False, what it raised).
+    def answer(
+        self, seconds: float | None = None, told: Callable[[str], None] = lambda words: None
+    ) -> tuple[bool, Any]:
+        """(True, what the task came to) or (False, what it raised); `told` hears what it tells.
 
-        Raises WorkerLost if the process died, and Overrun after so many seconds.
+        Raises WorkerLost if the process died, and Overrun after so many seconds without a word.
         """
         try:
-            if not self.pipe.poll(seconds):
-                raise Overrun(f"no answer within {seconds:g} s")
-            answer = self.pipe.recv_bytes()
+            while self.pipe.poll(seconds):
+                done, value = pickle.loads(self.pipe.recv_bytes())  # our own child wrote it
+                if done is not None:
+                    return done, value
+                told(value)
+            raise Overrun(f"no answer within {seconds:g} s")
         except (EOFError, OSError):
             self.process.join(1.0)
             code = self.process.exitcode
             raise WorkerLost(f"a worker process died (exit code {code})") from None
-        found: tuple[bool, Any] = pickle.loads(answer)  # our own child wrote it, into its pipe
-        return found
 
     def end(self) -> None:
         """Kill it, whatever it is doing."""
@@ -171,9 +174,19 @@ def interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+_to_parent: list[connection.Connection] = []  # of a worker
+
+
+def tell(words: str) -> None:
+    """From within a task: how far it is, for who waits for its answer."""
+    for pipe in _to_parent:
+        pipe.send_bytes(pickle.dumps((None, words)))
+
+
 def _serve(pipe: connection.Connection, module: str) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends."""
     become_worker()
+    _to_parent.append(pipe)
     import_module(module)
     with suppress(EOFError, OSError):
         while True:

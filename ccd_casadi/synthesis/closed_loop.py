@@ -8,7 +8,6 @@ from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome, figures_from_row
 from ccd_casadi.synthesis.weights import Weights
 
@@ -33,9 +32,11 @@ def measure(
     w0, row = plant.omega_0, np.full(int(Figure.COUNT), np.nan)
     row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
     row[Figure.LIMITED_BY_BOUND] = 0.0
-    loop = (plant.A, plant.B, plant.C, *_scaled(plant, controller), weights.scaled(w0))
-    judge(*loop, weights.delta, gamma, omega_low / w0, row)
-    return figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    K = controller.in_units(w0, plant.force)
+    A, B, C, D = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
+    judge(plant.A, plant.B, plant.C, A, B, C, D, weights.scaled(w0), weights.delta, gamma,
+          omega_low / w0, row)  # fmt: skip
+    return figures_from_row(row, weights, w0)
 
 
 def recertified_in_si(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
@@ -57,10 +58,3 @@ def recertified_in_si(plant: ScaledPlant, made: Design, omega_low: float) -> Des
     if again.certified and abs(again.bandwidth / made.figures.bandwidth - 1.0) <= ROUNDING:
         return made
     return replace(made, figures=replace(made.figures, outcome=Outcome.LOST_IN_ROUNDING))
-
-
-def _scaled(plant: ScaledPlant, controller: StateSpace) -> tuple[Array, Array, Array, Array]:
-    """A controller's matrices in the plant's units, as the kernels take them."""
-    K = controller.in_units(plant.omega_0, plant.force)
-    A, B, C, D = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
-    return A, B, C, D

@@ -76,7 +76,7 @@ def sensitivities(
     so is ‖GS‖∞, which is among the values where `compliance` asks for it.
     """
     w0, count = plant.omega_0, plant.dA.shape[0]
-    made_on = plant if plant.family is None else plant.family.design
+    made_on = plant.design_plant
     names = _WEIGHTS + (("disturbance",) if weights.delta else ())
     scaled = np.append(weights.scaled(w0), weights.delta)
     made_at = DesignPlant(made_on.A, made_on.B, made_on.C, made_on.dA, made_on.dB, made_on.dC,
@@ -112,7 +112,7 @@ def sensitivities(
             row, K, to_gamma, [at is worst for at in plant.members].index(True)
         )
     except np.linalg.LinAlgError:
-        figures = figures_from_row(failed_row(), weights.omega_S, weights.omega_T, w0)
+        figures = figures_from_row(failed_row(), weights, w0)
         gradient, fixed = np.empty((0, count + len(names))), np.full(count, np.nan)
     if len(gradient) != 4 + compliance:
         gradient, gaps = np.full((4 + compliance, gradient.shape[1]), np.nan), np.full(3, np.nan)

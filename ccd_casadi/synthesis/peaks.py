@@ -58,7 +58,7 @@ def local_peaks_with_gradients(
     if made is None or made.row[Figure.CODE] != Code.CERTIFIED or made.row[Figure.BALANCED]:
         return ()
     w0, w = plant.omega_0, weights.scaled(plant.omega_0)
-    made_on = plant if plant.family is None else plant.family.design
+    made_on = plant.design_plant
     found = [
         (omega, i, gain)
         for i, member in enumerate(plant.members)

@@ -139,13 +139,10 @@ def synthesise(
     ('certified', 55.66)
     """
     w0 = plant.omega_0
-    made_on = plant if plant.family is None else plant.family.design
-    arguments = (made_on.A, made_on.B, made_on.C, weights.scaled(w0), made_on.grid, made_on.gain)
-    numbers = (gamma_backoff, omega_low / w0, guess, made_on.channels, weights.delta)
-    row, Ak, Bk, Ck = design(*arguments, *numbers)
-    figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
-    if plant.family is not None:
-        figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
+    on = plant.design_plant
+    row, Ak, Bk, Ck = design(on.A, on.B, on.C, weights.scaled(w0), on.grid, on.gain, gamma_backoff,
+                     omega_low / w0, guess, on.channels, weights.delta)  # fmt: skip
+    figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
     controller = plant.controller_si(Ak, Bk, Ck)
     if compliance and figures.certified:
         figures = replace(figures, compliance=compliance_over_family(plant, controller).gain)
@@ -165,19 +162,16 @@ def sweep(
     """A certified design at every (ω_S, ω_T) of a grid, rad/s; ω_T varies fastest."""
     w0 = plant.omega_0
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
-    w = weights.scaled(w0)
-    numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels, weights.delta)
+    points = [weights.at(float(s), float(t)) for s in S for t in T]
     if plant.family is not None or compliance:
-        points = [weights.at(float(s), float(t)) for s in S for t in T]
         made = (synthesise(plant, point, omega_low=omega_low, gamma_backoff=gamma_backoff,
                            compliance=compliance) for point in points)  # fmt: skip
         return [design.figures for design in made]
-    rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
-    return [
-        figures_from_row(rows[i, j], float(s), float(t), w0)
-        for i, s in enumerate(S)
-        for j, t in enumerate(T)
-    ]
+    rows = _sweep(plant.A, plant.B, plant.C, weights.scaled(w0), S / w0, T / w0, plant.grid,
+                  plant.gain, gamma_backoff, omega_low / w0, plant.channels,
+                  weights.delta)  # fmt: skip
+    rows = rows.reshape(len(points), -1)
+    return [figures_from_row(row, point, w0) for row, point in zip(rows, points, strict=True)]
 
 
 def over_family(
@@ -195,7 +189,7 @@ def over_family(
     """
     w0 = plant.omega_0
     if row[Figure.CODE] != Code.CERTIFIED or plant.family is None:
-        return figures_from_row(row, weights.omega_S, weights.omega_T, w0), plant
+        return figures_from_row(row, weights, w0), plant
     w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
     def assessed(member: ScaledPlant, gamma: float) -> Array:
@@ -212,23 +206,21 @@ def over_family(
         for member in plant.family.perturbed:
             other = assessed(member, UNBOUNDED)
             if other[Figure.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
-                figures = figures_from_row(own, weights.omega_S, weights.omega_T, w0)
+                figures = figures_from_row(own, weights, w0)
                 return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member
             if other[Figure.PEAK] > own[Figure.PEAK]:
-                worst = member
-                own[[Figure.PEAK, Figure.PEAK_FREQUENCY]] = other[
-                    [Figure.PEAK, Figure.PEAK_FREQUENCY]
-                ]
-    return figures_from_row(own, weights.omega_S, weights.omega_T, w0), worst
+                worst, of_peak = member, [Figure.PEAK, Figure.PEAK_FREQUENCY]
+                own[of_peak] = other[of_peak]
+    return figures_from_row(own, weights, w0), worst
 
 
-def figures_from_row(row: Array, omega_S: float, omega_T: float, omega_0: float) -> DesignFigures:
+def figures_from_row(row: Array, weights: Weights, omega_0: float) -> DesignFigures:
     """A kernel's row of scaled figures in SI."""
     code = Code(int(row[Figure.CODE]))
     pole = float(row[Figure.MAX_REAL_POLE]) * omega_0
     return DesignFigures(
-        omega_S=omega_S,
-        omega_T=omega_T,
+        omega_S=weights.omega_S,
+        omega_T=weights.omega_T,
         outcome=_OUTCOMES[code],
         gamma_opt=float(row[Figure.GAMMA_OPT]),
         gamma_lower_bound=float(row[Figure.GAMMA_LOWER_BOUND]),

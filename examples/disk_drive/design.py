@@ -26,7 +26,6 @@ from ccd_casadi.fixed_structure import (
     synthesise,
 )
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
-from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.fixed_structure.design import Progress, problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, descend
@@ -164,7 +163,7 @@ def least_error(
             bandwidth = float(np.exp(end.x[-1])) * P.omega_0
         tell(f"{shape}: worst 3σ {300.0 * errors.max() / TRACK:.2f} % of the track, {steps} loops")
     every = scaled(np.linspace(-1.0, 1.0, 17).tolist(), drive.PZT_GAINS, SOFTER_HZ)
-    judged = certify(every, controller_of(own, found), ERROR_BOUNDS, SAMPLING, integrator=False)
+    judged = certify(every, own.state_space(found), ERROR_BOUNDS, SAMPLING, integrator=False)
     return ErrorDesign(own, found, errors, judged)
 
 

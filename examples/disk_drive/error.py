@@ -19,7 +19,7 @@ import plant as drive
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet
-from ccd_casadi.fixed_structure.structure import Structure, response
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
 
 HZ = 2.0 * np.pi
@@ -50,7 +50,7 @@ def response_and_slopes(
         slopes[..., at] = sign * first / factor
         if kind == PAIR:
             slopes[..., at + 1] = sign * middle / factor
-    return response(structure, kappa, s), slopes
+    return structure.response(kappa, s), slopes
 
 
 def run_out() -> np.ndarray:

@@ -8,11 +8,11 @@ from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.direct import Direct, acceptable
+from ccd_casadi.codesign.direct import Direct, TrueDesign
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.inner_problem.constraints import ACTIVE, MET, binding, constraint_shares, violated
+from ccd_casadi.inner_problem.objective import ACTIVE, MET, binding, constraint_shares, violated
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -83,7 +83,7 @@ def test_an_optimum_is_the_same_in_every_unit(in_unit) -> None:
         assert "least mass" in solution.verified.active
         assert "least mass" in kkt.active
         assert kkt.primal <= MET
-        assert acceptable(case, x, TrueQuantities(case).at(x))
+        assert TrueDesign(case, x, TrueQuantities(case).at(x)).acceptable
         mu = kkt.multipliers["least mass"] * unit
         ends.append((*solution.verified.theta, mu))
         again = kkt_certificate(case, x, TrueQuantities(case).at(x))

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from scipy.linalg import null_space
 from test_kkt import MODEL, point
 
-from ccd_casadi.codesign.direct import acceptable, polish
-from ccd_casadi.codesign.direct import true_objective as objective
+from ccd_casadi.codesign.direct import TrueDesign, polish
 from ccd_casadi.codesign.kkt import NEAR, active_at, kkt_certificate, newton_step
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.plant_source import PlantSource
@@ -32,7 +31,7 @@ def inside_the_box(tmp_path_factory):
     case = problem(source=source, w1=10.0)
     with SampleStore(folder / "samples.sqlite") as store:
         sampler = Sampler(case, store, Workers(1))
-        x = polish(sampler, point(62.0, 62.0, 600.0, 60.0))[0]
+        x = polish(sampler, point(62.0, 62.0, 600.0, 60.0)).x
         quantities = TrueQuantities(case)
         here = active_at(case, x, quantities.at(x))
         mu = kkt_certificate(case, x, quantities.at(x)).multipliers
@@ -56,7 +55,7 @@ def distance(optimum: Optimum, x: Array) -> float:
 def test_the_polish_ends_where_nothing_is_left(inside_the_box) -> None:
     case, _, x, _ = inside_the_box
     design = TrueQuantities(case).at(x)
-    assert acceptable(case, x, design)
+    assert TrueDesign(case, x, design).acceptable
     assert kkt_certificate(case, x, design).stationarity < 1e-8
 
 
@@ -81,12 +80,13 @@ def test_a_polish_from_near_by_finds_the_same_design(
 ) -> None:
     case, sampler, x, _ = inside_the_box
     start = away(inside_the_box, sign * 10.0**power)
-    end, found = polish(sampler, start)
-    assert acceptable(case, end, found)
-    assert kkt_certificate(case, end, found).stationarity < 1e-8
+    found = polish(sampler, start)
+    end = found.x
+    assert found.acceptable
+    assert found.kkt.stationarity < 1e-8
     assert distance(inside_the_box, end) < 1e-8
-    J = objective(case, x, TrueQuantities(case).at(x))
-    assert objective(case, end, found) == pytest.approx(J, rel=1e-8)
+    J = TrueDesign(case, x, TrueQuantities(case).at(x)).objective
+    assert found.objective == pytest.approx(J, rel=1e-8)
 
 
 def test_a_step_past_the_basin_is_none(inside_the_box) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign import peak_constraints
-from ccd_casadi.codesign.direct import true_objective as objective
+from ccd_casadi.codesign.direct import TrueDesign
 from ccd_casadi.codesign.global_check import global_check
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.outer_mixed import MixedOuter
@@ -93,7 +93,7 @@ def test_a_descent_synthesises_every_design_once(
     quantities = TrueQuantities(case)
     start = at((62.0, 64.0, 500.0, 45.0))
     end = descend(case, quantities, start)
-    J = [objective(case, x, quantities.at(x)) for x in (start, end)]
+    J = [TrueDesign(case, x, quantities.at(x)).objective for x in (start, end)]
     assert J[1] < J[0]
     assert len(calls) == len(quantities.designs)
 

@@ -16,8 +16,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.direct import acceptable
-from ccd_casadi.codesign.direct import true_objective as objective
+from ccd_casadi.codesign.direct import TrueDesign
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.global_check import _starts
@@ -247,10 +246,10 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
     assert (end >= lower).all()
     assert (end <= upper).all()
     found = quantities.at(end)
-    assert acceptable(case, end, found)
+    assert TrueDesign(case, end, found).acceptable
     assert kkt_certificate(case, end, found).stationarity <= SMOOTH
-    J = objective(case, end, found)
-    assert objective(case, start, quantities.at(start)) > J
+    J = TrueDesign(case, end, found).objective
+    assert TrueDesign(case, start, quantities.at(start)).objective > J
     assert len(quantities.designs) < 40
     # another that knows this end stops near it, and goes on past one that is worse than it is
     again, past = TrueQuantities(case), TrueQuantities(case)
@@ -280,10 +279,10 @@ def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:
     for share in ((0.37, 0.66, 0.15, 0.89, 1.0, 1.0), (0.2, 0.6, 0.5, 0.5, 1.0, 1.0)):
         end = descend(case, quantities, lower + (upper - lower) * np.array(share))
         kkt = kkt_certificate(case, end, quantities.at(end))
-        assert acceptable(case, end, quantities.at(end))
+        assert TrueDesign(case, end, quantities.at(end)).acceptable
         assert any(name.startswith("-3 dB") for name in kkt.active)
         assert kkt.stationarity <= KKT_LEVEL
-        ends.append(objective(case, end, quantities.at(end)))
+        ends.append(TrueDesign(case, end, quantities.at(end)).objective)
     assert ends[0] == pytest.approx(ends[1], rel=1e-5)
 
 

@@ -1,12 +1,18 @@
 """The documentation: its size, links to it, every public name, messages as in the code."""
 
 import ast
+import json
 import re
 from collections.abc import Iterator
 from functools import cache
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
+
+from ccd_casadi.__main__ import COMMANDS
+from ccd_casadi.reporting.index import FILES
+from ccd_casadi.support.package_text import package_text
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -68,3 +74,20 @@ def strings() -> str:
 def test_every_message_is_one_of_the_code(message: str) -> None:
     for part in filter(None, map(str.strip, message.split("…"))):
         assert part in strings()
+
+
+def test_the_page_of_commands_has_every_option_file_and_key() -> None:
+    spec = spec_from_file_location("generated", DOCS / "generated.py")
+    assert spec is not None
+    assert spec.loader is not None
+    generated = module_from_spec(spec)
+    spec.loader.exec_module(generated)
+    page = generated.on_page_markdown((DOCS / "commands.md").read_text())
+    assert "<!--" not in page
+    for word in COMMANDS:
+        own = page.partition(f"### ccd {word}\n")[2].partition("\n###")[0]
+        assert f"usage: ccd {word} [-h]" in own
+        assert "Exit codes: 0 done" in own
+    assert "--scheduler ADDRESS" in page.partition("### ccd solve\n")[2].partition("\n###")[0]
+    schema = json.loads(package_text("templates/result.schema.json"))
+    assert all(f"| `{key}` |" in page for key in (*schema["properties"], *FILES))

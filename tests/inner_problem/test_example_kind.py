@@ -24,9 +24,9 @@ from ccd_casadi.codesign.run import OUTERS, solve
 from ccd_casadi.codesign.verdict import State, VerdictLine, search_evidence
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import Bounds
-from ccd_casadi.inner_problem.constraints import violated
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem
 from ccd_casadi.inner_problem.kinds import KINDS, InnerKind
+from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost

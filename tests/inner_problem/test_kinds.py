@@ -40,7 +40,7 @@ SYNTHESISE = [  # every way to a controller
     (structured_bandwidth, "synthesise"), (structured_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design
-    "mixed": (outer_mixed, "kkt_certificate"), "sections": (outer_structured, "worst_case"),
+    "mixed": (outer_mixed, "final_design"), "sections": (outer_structured, "worst_case"),
 }  # fmt: skip
 EVERY = {  # beside the schema's
     "compliance_max", "compliance_words", "cost_unit", "force_step_max", "globality", "iterates",
@@ -142,7 +142,7 @@ def test_what_was_spent_adds_up(run: Run) -> None:
 def schema(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     assert main(["schema", "--result"]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert found["properties"]["format"] == {"const": FORMAT}
+    assert found["properties"]["format"]["const"] == FORMAT
     return found
 
 

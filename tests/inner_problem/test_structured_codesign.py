@@ -13,8 +13,8 @@ from ccd_casadi.codesign import outer_structured
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.codesign.outer_theta import pieces_from
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.theta_direct import pieces_from
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
 from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner

@@ -24,7 +24,6 @@ from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
-from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem import structured_robustness
@@ -305,7 +304,7 @@ def test_no_structure_has_a_stacked_norm_below_gamma_opt() -> None:
         stable = stabilising(inside, at_random(inside, draws, rng))
         assert len(stable) > 3
         for kappa in stable:
-            K = state_space(structure, structure.in_units(kappa, plant.omega_0, plant.force))
+            K = structure.state_space(structure.in_units(kappa, plant.omega_0, plant.force))
             found = measure(plant, K, weights, gamma=UNBOUNDED, omega_low=weights.omega_T)
             stacked = found.certificate.norm if found.certificate.stable else np.inf
             assert stacked >= least * (1.0 - 1e-6)

@@ -96,6 +96,7 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     started.send_signal(signal.SIGKILL)
     page.get_by_role("alert").wait_for(state="visible")
     assert "does not answer" in page.get_by_role("alert").inner_text()
+    assert page.get_by_text("Reconnection").count() == 0  # it does not come back
     with SampleStore(Path(tmp_path) / "samples.sqlite") as store:
         assert tuple(theta) in {sample.theta for sample in store.select()}
 
@@ -237,6 +238,34 @@ def test_without_the_token_every_path_is_refused(tmp_path):
     assert found.pop(f"{token}/{page}") == 200
     assert set(found.values()) <= {403, 404}
     assert root.startswith("http://127.0.0.1:")
+
+
+def test_a_page_from_elsewhere_gets_no_socket(tmp_path):
+    pytest.importorskip("bokeh")
+    from tornado.httpclient import HTTPClientError, HTTPRequest
+    from tornado.websocket import websocket_connect
+
+    from ccd_casadi.explorer.server import Explorer
+
+    explorer = Explorer(Session(load_case("runs/two_mass.toml"), tmp_path), workers=1)
+    own = explorer.url.rpartition(explorer.url.split("/")[3])[0].rstrip("/")
+    elsewhere = ("http://example.org", own.replace("127.0.0.1", "localhost"), f"{own[:-1]}")
+
+    async def refused(origin):
+        place = explorer.url.replace("http", "ws", 1) + "ws"
+        try:
+            (await websocket_connect(HTTPRequest(place, headers={"Origin": origin}))).close()
+        except HTTPClientError as error:
+            return error.code == 403
+        return False
+
+    async def asked():
+        explorer._server.start()
+        return [await refused(origin) for origin in (own, *elsewhere)]
+
+    found = explorer._server.io_loop.run_sync(asked)
+    explorer.close()
+    assert found == [False, True, True, True]
 
 
 def test_a_package_that_is_missing_is_asked_for_before_anything_is_done(

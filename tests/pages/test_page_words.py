@@ -9,12 +9,14 @@ import pytest
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.formulation import Iterate
 from ccd_casadi.deployment.words import against
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.reporting.facts import conclusion, theta_table, theta_words
+from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
@@ -64,12 +66,34 @@ def test_what_varies_is_shown_as_a_range_and_not_as_a_value() -> None:
     assert theta_table(problem, result).rows[-1] == ("at", "mm", "–", -300.0, 300.0, "–", "varies")
 
 
+def test_rounds_are_shown_in_the_units_of_the_page() -> None:
+    problem = problem_of(load_case("runs/rib_stage.toml"))
+    theta = problem.start
+    item = Iterate(theta, HZ * 60.0, HZ * 55.0, -2.0, -1.9, 0.05, 0.1, 0.1)
+    result = {"surrogate_bandwidth_hz": 60.0, "bandwidth_hz": 60.0 * (1.0 - 1e-9), "objective": -2}
+    words, table = history_blocks([item], problem, result, theta, 1e-3, lifted=False)
+    assert table.head[1] == "h (mm)"
+    assert table.rows[0][1] == 1e3 * theta[0]
+    assert (table.rows[0][-1], table.rows[1][-1]) == ("5 %", "under 0.0001 %")
+    assert (
+        "goes from 5 % to under 0.0001 %, in no round within the tolerance of 0.1 %" in words.text
+    )
+
+
+def test_what_is_named_in_a_nyquist_plot_stands_beside_it_and_not_in_a_legend_over_it() -> None:
+    panel = nyquist_panel(np.geomspace(1.0, 10.0, 5), [np.full(5, 0.1 + 0j)], 1.9)
+    assert not any(curve.label for curve in panel.curves)
+    disk, circle = (mark for mark in panel.marks if mark.text in ("S_max 1.9", "|L| = 1"))
+    assert abs(1.0 + complex(disk.x, disk.y)) == pytest.approx(1.0 / 1.9)
+    assert abs(complex(circle.x, circle.y)) == pytest.approx(1.0)
+
+
 def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
     result = result_of()
-    assert "prediction errs by 6.3e-12 of the truth" in conclusion(result)
+    assert "prediction errs by under 0.0001 %" in conclusion(result)
     result["verdict"]["predicted"] |= {"left_out": 0.022}
-    assert "6.3e-12" not in conclusion(result)
-    assert "is missed by 2.2 %" in conclusion(result)
+    assert "prediction errs" not in conclusion(result)
+    assert "a surrogate without it misses ω_b by 2.2 %" in conclusion(result)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +210,7 @@ def test_arrows_of_a_nyquist_plot_point_to_higher_frequencies() -> None:
 
     hz = np.geomspace(0.01, 10.0, 20000)
     panel = nyquist_panel(hz, [L(hz)], 2.0)
-    marks = [mark for mark in panel.marks if mark.text]
+    marks = [mark for mark in panel.marks if mark.text.endswith(" Hz")]
     heads = [curve for curve in panel.curves if len(curve.x) == 3]
     assert len(marks) == len(heads) > 3
     for mark, head in zip(marks, heads, strict=True):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ccd_casadi.drawing.content import Lines
 from ccd_casadi.plants.cad.elements import Body, Material
 from ccd_casadi.plants.cad.modes import reduced
 from ccd_casadi.plants.cad.morph import Morph, read_morph, write_morph
@@ -225,3 +226,22 @@ def test_pictures_show_the_modes_on_a_closed_surface(held: tuple[str, ...]) -> N
         assert (np.abs(mode.displacement[near]).max() == 0.0) == bool(held)
         ends = mode.displacement[far].mean(axis=0)  # of corners, not over the face
         assert abs(abs(ends[2]) - abs(read[0, i])) < 0.05 * size
+
+
+def test_the_drawing_shows_the_edges_of_a_bar_of_both_designs() -> None:
+    """A bar has twelve edges, however many elements it has, and the box around them is its own."""
+    stage = stretched()
+    drawing = plant_of_stage(stage, ("thickness", "length")).drawing
+    assert drawing is not None
+    figure = drawing({"start": (0.019, 0.31), "end": (0.02, 0.3)})
+    assert isinstance(figure.drawing, Lines)
+    for row, up in zip(figure.drawing.rows, (1, 2), strict=True):
+        for panel, theta in zip(row, ((0.31, 0.019), (0.3, 0.02)), strict=True):
+            points = 1e3 * stage.morph.points(theta)
+            (edges,) = panel.curves
+            lines = np.stack([edges.x, edges.y], axis=1).reshape(-1, 3, 2)[:, :2]
+            np.testing.assert_allclose(lines.min(axis=(0, 1)), points[:, [0, up]].min(axis=0))
+            np.testing.assert_allclose(lines.max(axis=(0, 1)), points[:, [0, up]].max(axis=0))
+            assert len(lines) == 4 * (6 + 2 + 2)  # as many elements lie along the edges
+    mass = stage.mass((0.31, 0.019))
+    assert figure.tables[0].rows[0] == ("start", *figure.tables[0].rows[0][1:4], mass)

@@ -11,7 +11,7 @@ from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.theta_direct import pieces_from
+from ccd_casadi.codesign.outer_theta import pieces_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.sampling import sampler as module

@@ -23,11 +23,11 @@ from hypothesis import strategies as st
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure, certify
 from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import composite_problem, kinds_of_rows
+from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
+from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -46,7 +46,7 @@ def as_one(whole: ChannelStructure, sampling: Sampling | None, off: float, theta
     """The stage with a load off centre beside the empty one, never taken apart."""
     members = plant_set([plant(), plant(theta, off)], sampling, whole.decoupling)
     box = whole.bounds((1e-3, 1e4), (1e-6, 1e6))
-    return MatrixProblem(members, whole, with_own(whole), box)
+    return LoopProblem(members, whole, with_own(whole), box)
 
 
 # ---- the constraints ----------------------------------------------------------------------------
@@ -115,7 +115,7 @@ def test_where_plants_fall_apart_the_parts_have_the_rows(sampling: Sampling | No
             assert row.value[0] == pytest.approx(one.value[0], abs=1e-8)
             np.testing.assert_allclose(row.to_kappa[:, part.place], one.to_kappa, atol=1e-7)
             assert row.to_tau[0] == pytest.approx(one.to_tau[0], abs=1e-7)
-    assert {"S_MAX of 1", "S_MAX of 3", "KS of 3"} <= set(kinds_of_rows(apart, peaks))
+    assert {"S_MAX of 1", "S_MAX of 3", "KS of 3"} <= set(apart.kinds_of(peaks))
 
 
 def test_peaks_of_the_rows_are_those_of_dense_grids() -> None:

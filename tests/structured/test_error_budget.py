@@ -24,7 +24,6 @@ from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.loops import Process, noise_of_a_period, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.fixed_structure.structure import state_space, state_spaces
 from ccd_casadi.lti.hold import delay_parts
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -77,7 +76,7 @@ def built(
     P = problem.plants
     kappa = structure.in_units(kappa, P.omega_0, P.force)
     hold = sampling
-    return Loop(plant().plant_si(), state_space(structure, kappa), hold), structure, kappa
+    return Loop(plant().plant_si(), structure.state_space(kappa), hold), structure, kappa
 
 
 @pytest.mark.parametrize("sampling", [None, FAST, SLOW])
@@ -120,7 +119,7 @@ def test_derivatives_to_controller_and_plant(
     budget = ErrorBudget(sources, WINDOW)
     scaled = plant()
     w0 = scaled.omega_0
-    stepped = state_spaces(structure, kappa + 1e-30j * np.eye(len(kappa)))
+    stepped = structure.state_spaces(kappa + 1e-30j * np.eye(len(kappa)))
     changes = [Change(None, StateSpace(*(part[i].imag / 1e-30 for part in stepped)))
                for i in range(len(kappa))]  # fmt: skip
     to_theta = [
@@ -140,7 +139,7 @@ def test_derivatives_to_controller_and_plant(
             for i, part in enumerate(to_theta):
                 x = h * way[len(kappa) + i]
                 G = StateSpace(*(getattr(G, n) + x * getattr(part, n) for n in "ABCD"))
-            K = state_space(structure, kappa + h * way[: len(kappa)])
+            K = structure.state_space(kappa + h * way[: len(kappa)])
             value = variance_slopes(Loop(G, K, made.sampling), budget, [])
             assert value is not None
             return np.log(value.value)

@@ -24,7 +24,7 @@ from helpers import sensitivity_gain
 
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import composite_problem, plants_of_rows
+from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import (
     Decoupling,
     find_decoupling,
@@ -34,7 +34,7 @@ from ccd_casadi.fixed_structure.decoupling import (
 )
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
+from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
 from ccd_casadi.fixed_structure.peak_search import Brackets, split
 from ccd_casadi.support.errors import PlantError
 
@@ -49,11 +49,11 @@ def finer(brackets: Brackets) -> np.ndarray:
     return np.sort(np.concatenate([inside, brackets.start[:, None]], axis=1), axis=1)
 
 
-def whole(problem, sampling: Sampling | None, off: float = 0.3, theta=(1.0, 1.0)) -> MatrixProblem:
+def whole(problem, sampling: Sampling | None, off: float = 0.3, theta=(1.0, 1.0)) -> LoopProblem:
     """The same problem with one plant as a whole, in the units of the stage at θ = (1, 1)."""
     plants = [plant(), plant(theta, off)]
     members = plant_set(plants, sampling, problem.structure.decoupling)
-    return MatrixProblem(members, problem.structure, BOUNDS, problem.box)
+    return LoopProblem(members, problem.structure, BOUNDS, problem.box)
 
 
 def test_the_channels_of_a_stage_are_found() -> None:
@@ -176,7 +176,7 @@ def test_peaks_of_the_whole_are_those_of_dense_grids(off: tuple[float, ...]) -> 
     problem, kappa = loop(2, off)
     peaks = assess(problem, kappa, -1.5).peaks
     assert peaks is not None
-    owner = plants_of_rows(problem, peaks)
+    owner = problem.plants_of(peaks)
     first = plant(off=off[0])
     si = problem.structure.in_units(kappa, first.omega_0, first.force)
     controller = problem.structure.state_space(si)

@@ -18,16 +18,14 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
-from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.certificate import judged
-from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.design import bandwidth_envelope, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
-from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
 from ccd_casadi.lti.state_space import StateSpace
@@ -121,8 +119,8 @@ def test_a_narrow_peak_at_3_db_is_seen_by_the_judge_and_by_the_search(gain: floa
     omega = np.geomspace(20.0, 1100.0, 200_000)
     v = own.variable(omega / own.omega_0)
     G = own.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
-    S = np.abs(1.0 / (1.0 + G * response(structure, scaled, 1j * v)))
-    judged = certify([rigid(12.743)], state_space(structure, kappa), bounds, sampling)
+    S = np.abs(1.0 / (1.0 + G * structure.response(scaled, 1j * v)))
+    judged = certify([rigid(12.743)], structure.state_space(kappa), bounds, sampling)
     first = omega[np.argmax(np.sqrt(2.0) * S > 1.0)]
     assert judged.plants[0].crossing == pytest.approx(first, rel=1e-3)
     bandwidth = 192.05
@@ -143,7 +141,7 @@ def test_a_rigid_body_is_looked_at_far_above_its_suspension() -> None:
     kappa = stabilising(problem, at_random(problem, np.exp(rng.uniform(-2.0, -1.0, 20)), rng))[0]
     peaks = assess(problem, kappa, -2.0, depth=-np.inf).peaks
     unit = problem.plants
-    controller = state_space(SMALL, SMALL.in_units(kappa, unit.omega_0, unit.force))
+    controller = SMALL.state_space(SMALL.in_units(kappa, unit.omega_0, unit.force))
     judged = certify([body], controller, bounds).plants[0]
     found = np.exp(peaks.value[peaks.curve == Curve.S_MAX].max() - problem.margin) * bounds.S_max
     assert found == pytest.approx(judged.S_peak, rel=1e-6)
@@ -174,9 +172,9 @@ def test_a_flat_shelf_is_no_bandwidth() -> None:
     kappa = np.log(np.array([1.0, 0.05 * hz, 3.0 * hz, 1.0, 90.0 * hz, 0.7]))
     at = np.array([20.0 * hz])
     G = problem.plants.responses(np.zeros(1, int), at)[0][:, 0, 0]
-    kappa[0] += np.log(1.1 / np.abs(G * response(structure, kappa, 1j * at)))[0]
+    kappa[0] += np.log(1.1 / np.abs(G * structure.response(kappa, 1j * at)))[0]
     si = structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
-    K = state_space(structure, si)
+    K = structure.state_space(si)
     judged = certify([plant()], K, EASY).plants[0]
     assert judged.stable
     assert certify([plant()], K, replace(EASY, shape=None)).bandwidth == judged.crossing
@@ -198,7 +196,7 @@ def test_the_judge_finds_the_peaks_of_the_search(sampling: Sampling | None) -> N
         peaks = assess(problem, kappa, tau, depth=-60.0).peaks
         assert peaks is not None
         si = problem.structure.in_units(kappa, members.omega_0, members.force)
-        K = state_space(problem.structure, si)
+        K = problem.structure.state_space(si)
         judged = certify([plant(-0.02), plant(0.02)], K, BOUNDS, sampling)
         for i, figures in enumerate(judged.plants):
             over = BOUNDS.shares(figures)

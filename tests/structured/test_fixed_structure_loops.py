@@ -33,7 +33,6 @@ from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import Brackets
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random
-from ccd_casadi.fixed_structure.structure import response, roots, state_space
 from ccd_casadi.kernels import sections
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import in_w, sampled
@@ -56,11 +55,11 @@ def test_state_space_roots_and_response_are_one_controller(structure: Structure)
     for _ in range(10):
         kappa = rng.normal(0.0, 0.8, len(structure.names))
         s = 1j * np.geomspace(0.01, 100.0, 25)
-        K = response(structure, kappa, s)
-        system = state_space(structure, kappa)
+        K = structure.response(kappa, s)
+        system = structure.state_space(kappa)
         solved = np.linalg.solve(s[:, None, None] * np.eye(len(system.A)) - system.A, system.B + 0j)
         np.testing.assert_allclose((system.C @ solved + system.D)[:, 0, 0], K, rtol=1e-9)
-        zeros, poles = roots(structure, kappa)
+        zeros, poles = structure.roots(kappa)
         assert len(poles) == structure.order == len(system.A)
         assert (poles.real < 0.0).sum() == structure.order - structure.integrator
         assert (zeros.real < 0.0).all()
@@ -79,7 +78,7 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
         up, down = (response_and_slopes(structure, kappa + x, s) for x in (step, -step))
         np.testing.assert_allclose(np.log(up[0] / down[0]) / (2 * h), slopes[:, i], atol=1e-7)
         bent.append((up[1] - down[1]) / (2 * h))
-    ends = [response(structure, kappa, s * np.exp(x)) for x in (h, -h)]
+    ends = [structure.response(kappa, s * np.exp(x)) for x in (h, -h)]
     np.testing.assert_allclose(np.log(ends[0] / ends[1]) / (2 * h), slope, atol=1e-7)
     k, alone, ln_slope = np.empty((3, 1), complex)
     own, bend = np.empty(len(kappa), complex), np.empty((len(kappa),) * 2, complex)
@@ -89,7 +88,7 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
         sections.gains_and_slopes(*K, at, k, ln_slope, own)
         sections.gains(*K, at, alone)
         np.testing.assert_allclose(k, alone)
-        np.testing.assert_allclose([k, ln_slope], [[response(structure, kappa, at)], [slope[i]]])
+        np.testing.assert_allclose([k, ln_slope], [[structure.response(kappa, at)], [slope[i]]])
         np.testing.assert_allclose(own, slopes[i], atol=1e-12)
         sections.second_slopes(loop.factors, own, bend)
         np.testing.assert_allclose(bend, np.array(bent)[:, i], atol=1e-6)
@@ -121,7 +120,7 @@ def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
     found = assess(problem, kappa, tau, depth=-3.0)
     si = problem.structure.in_units(kappa, members.omega_0, members.force)
     conversion = Conversion.TUSTIN
-    K = discretise(state_space(problem.structure, si), conversion, sampling.period, sampling.delay)
+    K = discretise(problem.structure.state_space(si), conversion, sampling.period, sampling.delay)
     S = closed_loop(sampled(plant().plant_si(), sampling.period, sampling.delay), K).S
     w = found.poles[0] * 0.5 * members.period
     z = np.sort(np.abs((1.0 + w) / (1.0 - w)))
@@ -150,15 +149,16 @@ def test_peaks_are_the_suprema_of_dense_grids(
     edge = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
     v = np.geomspace(problem.base[0], problem.base[-1], 60001)
     curves = (*problem.curves, Curve.CROSSING)
+    short = dict(zip(problem.curves, problem.short, strict=True))
     dense = by_curve(problem, kappa, tau, curves, np.tile(v, (2, 1)))
     for i in range(2):
         for curve in curves:
             kinds, values = [curve], dense[curve][i] + problem.margin
-            if curve is Curve.CROSSING or problem.ends_at_crossing(curve):
+            if short.get(curve, True):
                 values, kinds = values[v <= edge], [curve, Curve.LEVEL, Curve.CROSSING]
             own = (found.plant == i) & np.isin(found.curve, kinds)
             assert found.value[own].max() >= values.max() - 1e-9
-            if not problem.ends_at_crossing(curve) and curve is not Curve.CROSSING:
+            if not short.get(curve, True):
                 assert found.value[own].max() <= values.max() + 1e-2
 
 
@@ -166,7 +166,7 @@ def test_the_peak_of_s_is_its_h_infinity_norm() -> None:
     for seed in range(5):
         problem, kappa = loop(seed, Structure())
         found = assess(problem, kappa, np.log(0.1), depth=-60.0).peaks
-        G, K = problem.plants.systems[0], state_space(problem.structure, kappa)
+        G, K = problem.plants.systems[0], problem.structure.state_space(kappa)
         A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
         S = StateSpace(A, np.vstack([G.B @ K.D, K.B]),
                        np.hstack([-G.C, np.zeros((1, len(K.A)))]), np.eye(1))  # fmt: skip
@@ -238,9 +238,9 @@ def test_stability_is_that_of_the_closed_loops_characteristic_polynomial() -> No
     member = problem.plants
     verdicts = all_stable(closed_loops(member, structure, kappa))[:, 0]
     for one, verdict in zip(kappa, verdicts, strict=True):
-        zeros, poles = roots(structure, one)
+        zeros, poles = structure.roots(one)
         s0 = np.array([1.3j])
-        lead = (response(structure, one, s0) * np.prod(s0 - poles) / np.prod(s0 - zeros))[0].real
+        lead = (structure.response(one, s0) * np.prod(s0 - poles) / np.prod(s0 - zeros))[0].real
         p, r = member.poles[0], member.residues[0, :, 0, 0]
         above = sum(r[i] * np.poly(np.delete(p, i)) for i in range(len(p)))
         joint = np.polyadd(np.polymul(np.poly(p), np.poly(poles)),

@@ -16,7 +16,6 @@ from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
-from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.plants.plant import mechanics
@@ -35,7 +34,7 @@ KAPPA = np.log(
 
 def figures(sampling: Sampling | None, points: list, bounds: Bounds) -> dict[str, float]:
     """The judge's worst figures over their bounds on these plants."""
-    judge = certify(BOX.plants(points), state_space(STRUCTURE, KAPPA), bounds, sampling)
+    judge = certify(BOX.plants(points), STRUCTURE.state_space(KAPPA), bounds, sampling)
     assert judge.worst, judge.words
     return judge.worst | {"SHAPE": 0.0, "LEVEL": 0.0, "bandwidth": judge.bandwidth}
 

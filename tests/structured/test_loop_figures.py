@@ -14,7 +14,6 @@ from ccd_casadi.analysis.loop_figures import (
     step_figures,
 )
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.fixed_structure.structure import roots, state_space
 from ccd_casadi.lti.hold import tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -27,7 +26,7 @@ def pair(seed: int, sampling: Sampling | None) -> tuple[StateSpace, StateSpace]:
     problem, kappa = loop(seed, Structure(), sampling)
     unit = problem.plants
     si = problem.structure.in_units(kappa, unit.omega_0, unit.force)
-    return plant().plant_si(), state_space(problem.structure, si)
+    return plant().plant_si(), problem.structure.state_space(si)
 
 
 def turned(K: StateSpace, factor: float) -> StateSpace:
@@ -98,8 +97,8 @@ def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
     rng = np.random.default_rng(0)
     for _ in range(10):
         kappa = rng.normal(4.0, 0.8, len(structure.names))
-        K = state_space(structure, kappa)
-        expected = roots(structure, kappa)[0]
+        K = structure.state_space(kappa)
+        expected = structure.roots(kappa)[0]
         found = np.sort(np.abs(K.zeros(50.0)))
         np.testing.assert_allclose(found, np.sort(np.abs(expected)), rtol=1e-5)
     G, K = pair(0, None)

@@ -21,7 +21,6 @@ from ccd_casadi.fixed_structure.measured import (
 from ccd_casadi.fixed_structure.measured_design import design_on_data
 from ccd_casadi.fixed_structure.measured_loop import judge, winding
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
-from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
@@ -46,7 +45,7 @@ def test_the_judge_on_lines_agrees_with_the_one_on_the_model(sampling: Sampling 
     for seed in range(3):
         problem, kappa = loop(seed, PID, sampling)
         P = problem.plants
-        K = state_space(PID, PID.in_units(kappa, P.omega_0, P.force))
+        K = PID.state_space(PID.in_units(kappa, P.omega_0, P.force))
         for factor in (1.0, 30.0):
             own = StateSpace(K.A, K.B, factor * K.C, factor * K.D)
             model = certify([plant()], own, BOUNDS, sampling).plants[0]
@@ -101,7 +100,7 @@ def test_a_resonance_narrower_than_the_lines_is_not_sure() -> None:
     """It may encircle -1 between two lines; what the lines show of it is that the phase falls."""
     whole = measured(None)
     problem, kappa = loop(0, PID)
-    K = state_space(PID, PID.in_units(kappa, problem.plants.omega_0, problem.plants.force))
+    K = PID.state_space(PID.in_units(kappa, problem.plants.omega_0, problem.plants.force))
     L = whole.G * K.response(HZ * whole.hz)[:, 0, 0]
     i = int(np.flatnonzero(np.abs(L) > 0.3)[-1])
     ends, omega = HZ * whole.hz[i : i + 2], HZ * whole.hz
@@ -130,7 +129,7 @@ def test_what_the_data_do_not_show_is_said() -> None:
     whole = measured(None)
     problem, kappa = loop(0, PID)
     P = problem.plants
-    K = state_space(PID, PID.in_units(kappa, P.omega_0, P.force))
+    K = PID.state_space(PID.in_units(kappa, P.omega_0, P.force))
     assert judge(whole, K, BOUNDS).sure
     cut = MeasuredResponse(whole.hz[whole.hz < 20.0], whole.G[whole.hz < 20.0])
     assert "not small" in judge(cut, K, BOUNDS).words

@@ -10,7 +10,6 @@ from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.race import WITHIN, distinct, run_race, started
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
-from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.plants.plant import Mechanics
 
 SMALL = Structure(biquads=1, roll_off=2)
@@ -47,7 +46,7 @@ def test_starts_lift_the_loop_at_an_anti_resonance() -> None:
     assert dip < min(below, above)
     rng = np.random.default_rng(0)
     for starts in (by_rules(problem, np.array([0.3])), at_random(problem, np.full(50, 0.3), rng)):
-        size = np.log(np.abs(response(SMALL, starts.T, 1j * v * np.array([[1.0], [0.5], [2.0]]))))
+        size = np.log(np.abs(SMALL.response(starts.T, 1j * v * np.array([[1.0], [0.5], [2.0]]))))
         lifted = size[0] - 0.5 * (size[1] + size[2])  # ln; 1.6 by the rule, the rest 0.2 and less
         assert lifted.max() > 1.0
 

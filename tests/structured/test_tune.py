@@ -13,6 +13,7 @@ from scipy.signal import cont2discrete
 from test_measured import two_by_two
 
 import ccd_casadi as ccd
+from ccd_casadi import report
 from ccd_casadi.fixed_structure.line_problem import line_problem
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError
@@ -141,6 +142,10 @@ def test_the_command_writes_what_can_be_built(
     subprocess.run(["cc", "-std=c99", "-ffp-contract=off", "-o", "t", "controller.c",
                     "controller_test.c", "-lm"], cwd=out, check=True)  # fmt: skip
     subprocess.run(["./t"], cwd=out, check=True, capture_output=True)
+    (out / "report.html").unlink()
+    assert report.main([str(out)]) == 0  # it has no design over theta, and so no index
+    assert (out / "report.html").read_text() == page
+    assert not (out / "index.html").exists()
 
 
 def test_the_command_says_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

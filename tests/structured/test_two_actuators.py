@@ -16,7 +16,7 @@ from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
+from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
@@ -36,11 +36,11 @@ def one_sensor(theta: tuple[float, float] = (1.0, 1.0), off: float = 0.3) -> Sca
     return replace(whole, B=B, dB=dB, C=C, dC=dC, channels=())
 
 
-def problem(theta: tuple[float, float], sampling: Sampling | None) -> MatrixProblem:
+def problem(theta: tuple[float, float], sampling: Sampling | None) -> LoopProblem:
     """Of the plants at (1, 1) and at θ."""
     first = [one_sensor(), one_sensor(theta, 0.2)]
     box = composite_problem(first[:1], STRUCTURE, BOUNDS, sampling).box
-    return MatrixProblem(plant_set(first, sampling, BOTH), STRUCTURE, BOUNDS, box)
+    return LoopProblem(plant_set(first, sampling, BOTH), STRUCTURE, BOUNDS, box)
 
 
 def start(sampling: Sampling | None) -> np.ndarray:

@@ -15,13 +15,7 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decoupling
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
-from ccd_casadi.fixed_structure.loop_problem import (
-    Constraints,
-    Curve,
-    LoopProblem,
-    MatrixProblem,
-    plant_of_row,
-)
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem
 from ccd_casadi.fixed_structure.peak_search import CLOSINGS, FLAT, NARROW, Brackets
 from ccd_casadi.kernels import loop_rows
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
@@ -103,7 +97,7 @@ def loop(
 
 def gaps(model: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
     """How far each singular value is from the next one of its matrix, relative."""
-    which = plant_of_row(model, rows.plant)
+    which = model.plants_of(rows)
     loop = model.loop(kappa, tau)
     level = loop_rows.levels(rows.curve[:, None], which, rows.v[:, None], loop, -np.inf)[:, 0, 0]
     every, number = np.arange(len(which)), rows.plant // len(model.plants.plants)
@@ -115,7 +109,7 @@ def gaps(model: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Arr
 
 
 def assert_derivatives(
-    problem_at: Callable[[tuple[float, float]], MatrixProblem],
+    problem_at: Callable[[tuple[float, float]], LoopProblem],
     kappa: Array,
     chosen: Callable[[np.ndarray], np.ndarray],
 ) -> set[int]:

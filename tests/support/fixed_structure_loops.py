@@ -9,7 +9,6 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.loop_problem import Curve, Problem
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
-from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
 from ccd_casadi.plants.modal import Perturbation, modal_plant
@@ -78,4 +77,4 @@ def response_and_slopes(
         if kind == PAIR:
             slopes[..., at + 1] = sign * middle / factor
         slope = slope - sign * first / factor
-    return response(structure, kappa, s), slopes, slope
+    return structure.response(kappa, s), slopes, slope

@@ -202,7 +202,7 @@ def assessed(
     scaled_weights = weights.scaled(plant.omega_0)
     low = omega_low / plant.omega_0
     judge(plant.A, plant.B, plant.C, *matrices, scaled_weights, 0.0, gamma, low, row)
-    return figures_from_row(row, weights.omega_S, weights.omega_T, plant.omega_0)
+    return figures_from_row(row, weights, plant.omega_0)
 
 
 # ---- the reference ----------------------------------------------------------------------------

@@ -110,7 +110,7 @@ def test_each_code_of_the_kernels_is_one_outcome(name: str) -> None:
     assert [int(column) for column in Figure] == list(range(int(Figure.COUNT) + 1))
     row = np.zeros(int(Figure.COUNT))
     row[Figure.CODE] = Code[name]
-    figures = figures_from_row(row, 1.0, 1.0, 1.0)
+    figures = figures_from_row(row, PAPER, 1.0)
     assert figures.outcome is Outcome[name]
     assert figures.certificate.passed == (name in ("CERTIFIED", "NO_BANDWIDTH"))
 

@@ -42,7 +42,6 @@ class Pattern:
 class Sector:
     """One symmetry on one mesh: its fold, and patterns for the stiffness and the mass."""
 
-    symmetry: Symmetry
     fold: Fold
     stiffness: Pattern
     mass: Pattern
@@ -157,7 +156,7 @@ def build_sector(assembler: Assembler, symmetry: Symmetry) -> Sector:
     sizes = [3 * len(block.nodes) for block in assembler.blocks]
     stiffness = _pattern(maps, folded, sizes, 1)
     mass = _pattern(maps, folded, sizes, 3)
-    return Sector(symmetry, folded, stiffness, mass, tuple(maps))
+    return Sector(folded, stiffness, mass, tuple(maps))
 
 
 def _pattern(

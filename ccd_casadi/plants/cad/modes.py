@@ -96,16 +96,21 @@ def reduced(
 def mode_shapes(body: Body, count: int, held: np.ndarray) -> ModeShapes:
     """The `count` lowest flexible modes on the body's surface; `held` as in `reduced`."""
     values, vectors = _solved(body, count, held)[-2:]
-    faces = np.concatenate([body.tets[:, list(corners)] for corners in OUTWARD])
-    used, outer = np.unique(outer_faces(faces), return_inverse=True)
+    used, faces = surface(body.tets)
     modes = []
     for i in range(count):
         field = np.zeros(len(held))
         field[~held] = vectors[:, i]
         moved = field.reshape(3, -1).T[used]  # the corners of the elements come first
         modes.append(ModeShape(moved, float(np.sqrt(values[i])) / (2.0 * np.pi), (i + 1,)))
-    faces = outer.reshape(-1, 3)[:, [0, 1, 2, 2]]
     return ModeShapes(body.points[used], faces, tuple(modes))
+
+
+def surface(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (n,) of the points on the surface, and its faces (q, 4) of places among these."""
+    faces = np.concatenate([tets[:, list(corners)] for corners in OUTWARD])
+    used, outer = np.unique(outer_faces(faces), return_inverse=True)
+    return used, outer.reshape(-1, 3)[:, [0, 1, 2, 2]]
 
 
 def _solved(

@@ -1,15 +1,17 @@
 """A stage from CAD as the case file names it: the options of `cad_stage`, and its plant."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.pictures import ModeShapes
+from ccd_casadi.drawing.surface import surface_figure
 from ccd_casadi.plants.cad.elements import Body, Material
-from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced
+from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced, surface
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
 from ccd_casadi.plants.fixed import Ordered
@@ -128,6 +130,12 @@ class CadStage:
         body = Body(self.morph.points(theta), self.morph.tets, self.material)
         return mode_shapes(body, count, self._held(body))
 
+    def drawing(self, thetas: Mapping[str, Sequence[float]]) -> Figure:
+        """Stages by name; θ in the morph's order."""
+        used, faces = surface(self.morph.tets)
+        surfaces = {name: self.morph.points(theta)[used] for name, theta in thetas.items()}
+        return surface_figure(surfaces, faces, [self.mass(theta) for theta in thetas.values()])
+
     def frequencies(self, theta: Sequence[float]) -> Array:
         """Of the flexible modes, in Hz."""
         found = self.modal_model(theta, self.sensors, False)
@@ -168,7 +176,7 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
     evaluate.keep = mass  # CasADi holds no reference to it
     notes = (
         f"the stage is the mesh of {file} moved with theta, {len(morph.tets)} tetrahedra, within "
-        f"{morph.error:.1e} m of the drawing where that was looked at; its first "
+        f"{morph.error:.1e} m of the drawing where that was checked; its first "
         f"{stage.modes} flexible modes",
     )
     return Plant(
@@ -184,6 +192,7 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
         notes=lambda theta: notes,
         domain=(morph.lower[evaluate.place], morph.upper[evaluate.place]),
         shapes=lambda theta, count: stage.shapes(evaluate.own(theta), count),
+        drawing=lambda thetas: stage.drawing({k: evaluate.own(v) for k, v in thetas.items()}),
     )
 
 

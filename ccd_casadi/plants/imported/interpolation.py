@@ -67,21 +67,9 @@ class InterpolatedModes:
         D, dD = np.zeros((r, r)), np.zeros((count, r, r))
         if self.ratio is None:
             D, dD = self._exponential(values[1], np.array([item[1] for item in along]))
-        return Mechanics(
-            np.eye(r),
-            D,
-            K,
-            values[2],
-            values[3],
-            self.ratio,
-            (
-                np.zeros((count, r, r)),
-                dD,
-                dK,
-                np.array([item[2] for item in along]),
-                np.array([item[3] for item in along]),
-            ),
-        )
+        dB, dC = (np.array([item[k] for item in along]) for k in (2, 3))
+        derivatives = (np.zeros((count, r, r)), dD, dK, dB, dC)
+        return Mechanics(np.eye(r), D, K, values[2], values[3], self.ratio, derivatives)
 
     def nearest(self, theta: Sequence[float]) -> tuple[int, float]:
         """The nearest sample, and how far it is (the largest share of the table's range)."""

@@ -6,9 +6,7 @@ names: Matrix Market .mtx, .npz, or .mat with one matrix in it), `damping` (moda
 (row of the matrices, from 0) and `gain`, as many rows a name as it takes.
 """
 
-import csv
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +16,7 @@ from scipy.sparse import csc_array, issparse
 from scipy.sparse import load_npz as load_sparse
 from scipy.sparse.linalg import eigsh, splu
 
+from ccd_casadi.plants.imported.csv_rows import Rows, number_in, read_rows
 from ccd_casadi.plants.imported.modal_table import ModalTable
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -36,14 +35,12 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
     that the compliance at low frequency is that of the full model. Raises PlantError where a file
     is missing, foreign, not symmetric or of another size than its fellows.
     """
-    index, dofs = read_rows(folder / "index.csv"), read_rows(folder / "dofs.csv", COLUMNS)
+    index = read_index(folder, "mass", "stiffness", "damping")
+    dofs = read_dofs(folder, COLUMNS)
     if modes < 1:
         raise PlantError(f"modes = {modes}; keep at least 1")
-    for key in ("mass", "stiffness", "damping"):
-        if key not in index[0]:
-            raise PlantError(f"{folder / 'index.csv'}: has no column {key}; add it")
     found, bases = [], []
-    for row in index:
+    for row in index.values():
         M, K = (_matrix(folder / row[key]) for key in ("mass", "stiffness"))
         if M.shape != K.shape:
             raise PlantError(f"{folder / row['mass']}: is {M.shape}, stiffness {K.shape}")
@@ -58,14 +55,11 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
 
 
 def table_of_samples(
-    folder: Path,
-    index: list[dict[str, str]],
-    dofs: list[dict[str, str]],
-    modes: Sequence[tuple[Array, ...]],
+    folder: Path, index: Rows, dofs: Rows, modes: Sequence[tuple[Array, ...]]
 ) -> ModalTable:
     """The table of ω (r,) in rad/s, inputs, outputs and shapes (r, .) of every sample, of as many
     modes as every one has; the rest is in the rows of `index.csv` and `dofs.csv`."""
-    columns = [name for name in index[0] if name not in KNOWN]
+    columns = [name for name in next(iter(index.values())) if name not in KNOWN]
     names = [name for name in columns if not name.startswith("constraint:")]
     constraints = [name for name in columns if name.startswith("constraint:")]
     r = min(len(omega) for omega, *_ in modes)
@@ -74,9 +68,8 @@ def table_of_samples(
     )
 
     def numbers(*keys: str) -> Array:
-        place = folder / "index.csv"
         return np.array([[number_in(place, key, row.get(key, "0")) for key in keys]
-                         for row in index])  # fmt: skip
+                         for place, row in index.items()])  # fmt: skip
 
     return ModalTable(
         names=tuple(names),
@@ -125,9 +118,9 @@ def modes_of(
     return np.sqrt(np.maximum(lam, 0.0)), basis
 
 
-def _shape_values(folder: Path, dofs: list[dict[str, str]], bases: list[Array]) -> list[Array]:
+def _shape_values(folder: Path, dofs: Rows, bases: list[Array]) -> list[Array]:
     """Shapes at the dofs named for it; else, on one mesh, where they tell the modes best apart."""
-    if any(row["kind"] == "shape" for row in dofs):
+    if any(row["kind"] == "shape" for row in dofs.values()):
         return [basis.T @ _selected(folder, dofs, "shape", len(basis)) for basis in bases]
     if len({len(basis) for basis in bases}) > 1:
         return [np.zeros((basis.shape[1], 0)) for basis in bases]
@@ -136,13 +129,12 @@ def _shape_values(folder: Path, dofs: list[dict[str, str]], bases: list[Array]) 
     return [basis[rows].T for basis in bases]
 
 
-def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) -> Array:
+def _selected(folder: Path, dofs: Rows, kind: str, size: int) -> Array:
     """(n, k) columns that pick the dofs of each name of this kind."""
     names = names_of_kind(folder, dofs, kind)
     found = np.zeros((size, len(names)))
-    for row in dofs:
+    for place, row in dofs.items():
         if row["kind"] == kind:
-            place = folder / "dofs.csv"
             dof, gain = number_in(place, "dof", row["dof"]), number_in(place, "gain", row["gain"])
             if dof != int(dof) or not 0 <= dof < size:
                 words = f"{dof:g} is not a row of a matrix of {size}; count from 0"
@@ -151,9 +143,9 @@ def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) ->
     return found
 
 
-def names_of_kind(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
+def names_of_kind(folder: Path, dofs: Rows, kind: str) -> tuple[str, ...]:
     """Names of this kind in dofs.csv. Raises PlantError where there is no input or no output."""
-    names = tuple(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
+    names = tuple(dict.fromkeys(row["name"] for row in dofs.values() if row["kind"] == kind))
     if kind != "shape" and not names:
         raise PlantError(f"{folder / 'dofs.csv'}: names no {kind}; add a row of kind {kind}")
     return names
@@ -202,35 +194,22 @@ def _from_npz(path: Path) -> object:
     return load_sparse(path)
 
 
-def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
-    """The rows of a small CSV file, with these columns only if given (gain: 1 where missing).
-
-    Raises PlantError where it cannot be read or has other columns.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in file if line.strip() and not line.startswith("#")]
-        reader = csv.DictReader(lines, skipinitialspace=True)
-        rows = [{str(k).strip(): str(v).strip() for k, v in row.items()} for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise PlantError(f"{path}: cannot be read: {error}; add it") from None
-    if not rows or any("None" in row or "None" in row.values() for row in rows):
-        raise PlantError(f"{path}: holds no rows, or other cells than its header; correct it")
-    if columns:
-        for row in rows:
-            row.setdefault("gain", "1")
-            if set(row) != set(columns) or row["kind"] not in ("in", "out", "shape"):
-                words = f"needs the columns {', '.join(columns)}, kind one of in, out, shape"
-                raise PlantError(f"{path}: {words}; see docs/own_finite_elements.md")
-    return rows
+def read_dofs(folder: Path, columns: Sequence[str]) -> Rows:
+    """The rows of dofs.csv (gain: 1 where missing). Raises PlantError where it has others."""
+    path = folder / "dofs.csv"
+    found = {place: {"gain": "1"} | row for place, row in read_rows(path).items()}
+    for row in found.values():
+        if set(row) != set(columns) or row["kind"] not in ("in", "out", "shape"):
+            words = f"needs the columns {', '.join(columns)}, kind one of in, out, shape"
+            raise PlantError(f"{path}: {words}; see docs/own_finite_elements.md")
+    return found
 
 
-def number_in(path: Path, key: str, text: str) -> float:
-    """A cell as a finite number. Raises PlantError."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise PlantError(f"{path}: {key}: {text[:40]!r} is not a number; give one") from None
-    if not math.isfinite(value):
-        raise PlantError(f"{path}: {key}: {text[:40]!r} is not finite; give a number")
-    return value
+def read_index(folder: Path, *columns: str) -> Rows:
+    """The rows of index.csv. Raises PlantError where it lacks one of these columns."""
+    path = folder / "index.csv"
+    found = read_rows(path)
+    for key in columns:
+        if any(key not in row for row in found.values()):
+            raise PlantError(f"{path}: has no column {key}; add it")
+    return found

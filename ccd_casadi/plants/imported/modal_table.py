@@ -7,13 +7,13 @@ only), `modal_mass` (1 where mode shapes are mass-normalised), `hardware_cost`, 
 """
 
 import csv
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from ccd_casadi.plants.imported.csv_rows import number_in, read_rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -45,7 +45,8 @@ class ModalTable:
 
 def read_modal_table(path: Path) -> ModalTable:
     """The table in a CSV file. Raises PlantError naming the line, column and remedy."""
-    header, rows = _read(path)
+    rows = [_mode(place, cells) for place, cells in read_rows(path).items()]
+    header = list(rows[0])
     groups = {prefix: [name for name in header if name.startswith(prefix)] for prefix in PREFIXES}
     theta_names = [name for name in header if name not in KNOWN and not name.startswith(PREFIXES)]
     for name in ("mode", "frequency_hz", "damping"):
@@ -116,41 +117,9 @@ def write_modal_table(path: Path, table: ModalTable) -> None:
                                  *table.constraints[s].tolist()])  # fmt: skip
 
 
-def _read(path: Path) -> tuple[list[str], list[dict[str, float]]]:
-    """Header and rows of numbers; lines that start with # are remarks."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise PlantError(f"{path}: cannot be read: {error}; name a CSV file in UTF-8") from None
-    numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
-    numbered = [(i, line) for i, line in numbered if not line.startswith("#")]
-    try:
-        parsed = list(csv.reader(line for _, line in numbered))
-    except csv.Error as error:
-        raise PlantError(f"{path}: is not a CSV: {error}; separate numbers by commas") from None
-    if len(parsed) < 2:
-        raise PlantError(f"{path}: holds no rows; give a header and one row a mode")
-    header = [name.strip() for name in parsed[0]]
-    if len(set(header)) < len(header) or not all(header):
-        raise PlantError(f"{path}: line {numbered[0][0]}: a column's name is empty or twice there")
-    return header, [
-        _row(path, number, header, cells)
-        for (number, _), cells in zip(numbered[1:], parsed[1:], strict=False)
-    ]
-
-
-def _row(path: Path, number: int, header: list[str], cells: list[str]) -> dict[str, float]:
-    place = f"{path}: line {number}"
-    if len(cells) != len(header):
-        raise PlantError(f"{place}: has {len(cells)} columns, the header {len(header)}; correct it")
-    row = {}
-    for name, cell in zip(header, cells, strict=True):
-        try:
-            row[name] = float(cell)
-        except ValueError:
-            raise PlantError(f"{place}: {name}: {cell[:40]!r} is not a number; give one") from None
-        if not math.isfinite(row[name]):
-            raise PlantError(f"{place}: {name}: {cell[:40]!r} is not finite; give a number")
+def _mode(place: str, cells: dict[str, str]) -> dict[str, float]:
+    """A row as numbers. Raises PlantError where one is none, or out of its range."""
+    row = {name: number_in(place, name, cell) for name, cell in cells.items()}
     if row.get("frequency_hz", 0.0) < 0.0:
         raise PlantError(f"{place}: frequency_hz: is negative; give 0 for a rigid-body mode")
     if not 0.0 <= row.get("damping", 0.0) < 1.0:

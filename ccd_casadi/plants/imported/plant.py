@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import casadi as ca
@@ -12,7 +11,7 @@ from ccd_casadi.plants.imported.entries import fit_entries
 from ccd_casadi.plants.imported.interpolation import InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
-from ccd_casadi.plants.plant import Mechanics, Plant, named_values
+from ccd_casadi.plants.plant import Plant, named_values
 from ccd_casadi.support.errors import PlantError
 
 NEAREST = "the nearest sample as it stands"
@@ -58,7 +57,7 @@ def plant_of_table(
     if not names:
         return _one_sample(table, rigid_below_hz)
     order = [table.names.index(name) for name in names]
-    table = _reordered(table, order)
+    table = replace(table, names=tuple(names), theta=table.theta[:, order])
     try:
         modes = InterpolatedModes(table, 2.0 * np.pi * rigid_below_hz)
     except PlantError as error:
@@ -74,14 +73,10 @@ def plant_of_table(
         hardware=ca.Function("hardware", [theta], [both[0], lam]),
         outputs=table.outputs.shape[2],
         inputs=table.inputs.shape[2],
-        references={NEAREST: partial(_nearest_row, modes)},
-        notes=partial(_notes, modes, tuple(names), source),
+        references={NEAREST: lambda at: row_of(table, modes.rigid, modes.nearest(at)[0])},
+        notes=lambda at: _notes(modes, source, at),
         domain=(table.theta.min(axis=0), table.theta.max(axis=0)),
     )
-
-
-def _nearest_row(modes: InterpolatedModes, theta: Sequence[float]) -> Mechanics:
-    return row_of(modes.table, modes.rigid, modes.nearest(theta)[0])
 
 
 def _one_sample(table: ModalTable, rigid_below_hz: float) -> Plant:
@@ -100,11 +95,9 @@ def _one_sample(table: ModalTable, rigid_below_hz: float) -> Plant:
     )
 
 
-def _notes(
-    modes: InterpolatedModes, names: tuple[str, ...], source: str, theta: Sequence[float]
-) -> tuple[str, ...]:
+def _notes(modes: InterpolatedModes, source: str, theta: Sequence[float]) -> tuple[str, ...]:
     index, distance = modes.nearest(theta)
-    place = named_values(names, modes.table.theta[index])
+    place = named_values(modes.table.names, modes.table.theta[index])
     frequency, response = 100 * modes.left_out.frequency, 100 * modes.left_out.response
     count = len(modes.table.theta)
     here = f"is {100 * distance:.2g} % of the sampled range away from the nearest sample"
@@ -116,8 +109,3 @@ def _notes(
         f"to {frequency:.2g} % in frequency and {response:.2g} % in response at worst",
         f"this theta {here}, {place}; analyse its own finite-element model before it is built",
     )
-
-
-def _reordered(table: ModalTable, order: Sequence[int]) -> ModalTable:
-    names = tuple(table.names[i] for i in order)
-    return replace(table, names=names, theta=table.theta[:, list(order)])

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.plants.imported.matrices import number_in, read_rows, table_of_samples
+from ccd_casadi.plants.imported.csv_rows import Rows, number_in
+from ccd_casadi.plants.imported.matrices import read_dofs, read_index, table_of_samples
 from ccd_casadi.plants.imported.modal_table import ModalTable
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -39,14 +40,13 @@ def results_table(folder: Path) -> ModalTable:
 
     Raises PlantError where a file or node is missing, or a file holds no modes.
     """
-    index = read_rows(folder / "index.csv")
-    dofs = read_rows(folder / "dofs.csv", COLUMNS)
-    for key in ("results", "damping"):
-        if key not in index[0]:
-            raise PlantError(f"{folder / 'index.csv'}: has no column {key}; add it")
+    index, dofs = read_index(folder, "results", "damping"), read_dofs(folder, COLUMNS)
+    found = [read_modes(folder / row["results"]) for row in index.values()]
     kinds = ("in", "out", "shape")
-    modes = [(2.0 * np.pi * one.frequency_hz, *(_picked(folder, dofs, kind, one) for kind in kinds))
-             for one in (read_modes(folder / row["results"]) for row in index)]  # fmt: skip
+    modes = [
+        (2.0 * np.pi * one.frequency_hz, *(_picked(dofs, kind, one) for kind in kinds))
+        for one in found
+    ]
     return table_of_samples(folder, index, dofs, modes)
 
 
@@ -129,12 +129,11 @@ def _float(text: str) -> float:
     return float(re.sub(r"(?<=[\d.])([-+])", r"E\1", text) if "E" not in text.upper() else text)
 
 
-def _picked(folder: Path, dofs: list[dict[str, str]], kind: str, modes: ResultModes) -> Array:
+def _picked(dofs: Rows, kind: str, modes: ResultModes) -> Array:
     """(r, k) displacement along each name of this kind."""
-    names = list(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
+    names = list(dict.fromkeys(row["name"] for row in dofs.values() if row["kind"] == kind))
     found = np.zeros((len(modes.frequency_hz), len(names)))
-    place = folder / "dofs.csv"
-    for row in dofs:
+    for place, row in dofs.items():
         if row["kind"] != kind:
             continue
         node, gain = number_in(place, "node", row["node"]), number_in(place, "gain", row["gain"])
