@@ -37,8 +37,7 @@ def upper_bound(limits: Limits, known: float = np.inf) -> float:
     if known < np.inf and _Search(limits, known, -1).multiplier(known)[0] <= 1.0 + OVER:
         return known
     most = pointwise(limits)
-    zeros = [float(limits.omega(np.array(abs(z)))) for z in limits.beyond]
-    begin = min([BEGIN * most, known, *zeros])
+    begin = min(_first(limits, most), known)
     if not np.isfinite(begin):
         return np.inf
     search = _Search(limits, begin, -1, FEW)  # where to make the basis
@@ -67,14 +66,20 @@ def _certified(limits: Limits, omega_b: float, most: float, size: tuple[int, int
     return 0.0
 
 
-def forbids_most(candidates: Sequence[Limits], omega_b: float) -> Limits:
-    """The one whose discs need the largest scaling at ω_b (rad/s), by small programmes."""
-    return max(candidates, key=lambda one: _small_scaling(one, omega_b))
+def forbids_most(candidates: Sequence[Limits]) -> Limits:
+    """The one whose discs need the largest scaling at one ω_b, by small programmes."""
+    omega_b = _first(candidates[0], pointwise(candidates[0]))
+
+    def scaling(limits: Limits) -> float:
+        found = _Search(limits, omega_b, -1, FEW).multiplier(omega_b)[0]
+        return found if np.isfinite(found) else 0.0  # ∞: a programme not solved
+
+    return max(candidates, key=scaling) if np.isfinite(omega_b) else candidates[0]
 
 
-def _small_scaling(limits: Limits, omega_b: float) -> float:
-    found = _Search(limits, omega_b, -1, FEW).multiplier(omega_b)[0]
-    return found if np.isfinite(found) else 0.0  # ∞: a programme not solved
+def _first(limits: Limits, most: float) -> float:
+    """Where a search begins, rad/s; infinite where nothing says."""
+    return min([BEGIN * most, *(float(limits.omega(np.array(abs(z)))) for z in limits.beyond)])
 
 
 def lower_bound(limits: Limits, most: float) -> float:

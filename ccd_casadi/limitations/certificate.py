@@ -81,7 +81,9 @@ class _Multiplier:
         return np.asarray(self.basis.values(v) @ self.weight)
 
     def _discs(self, low: Array, high: Array) -> tuple[np.ndarray, Array]:
-        return discs(self.limits, low, high, self.omega_b)
+        centres, radii = discs(self.limits, low, high, self.omega_b)
+        radii[0] = np.minimum(radii[0], 1.0 + radii[1])  # |T| <= 1 + |S|
+        return centres, radii
 
     def intervals(
         self, low: Array, high: Array, h_low: np.ndarray, h_high: np.ndarray

@@ -22,12 +22,11 @@ LARGEST = 100.0  # radius of a disc that is used; in the place of others the fir
 def discs(limits: Limits, low: Array, high: Array, omega_b: float) -> tuple[np.ndarray, Array]:
     """Centres and radii (k, N) on the intervals [low, high] of v: T lies in all of them."""
     m_S, m_T = limits.radii(low, high, omega_b)
-    centres, radii = [np.zeros(low.shape), np.ones(low.shape)], [np.minimum(m_T, 1.0 + m_S), m_S]
+    centres, radii = [np.zeros(low.shape), np.ones(low.shape)], [m_T, m_S]
     for other in limits.others:
         m_S, m_T = other.radii(low, high, omega_b)
-        m_T = np.minimum(m_T, 1.0 + m_S)
         r, spread = ratio(limits.row[0], other.row[0], low, high)
-        slack = np.maximum(1.0 - spread * m_T, 1e-9)
+        slack = np.maximum(1.0 - spread * np.minimum(m_T, 1.0 + m_S), 1e-9)  # |T| <= 1 + |S|
         for centre, radius in (
             circle_of_S(r, m_S / slack), circle_of_T(r, m_T * (1.0 + spread) / slack)
         ):  # fmt: skip

@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.limitations.bound import BEGIN, forbids_most, lower_bound, pointwise, upper_bound
+from ccd_casadi.limitations.bound import forbids_most, lower_bound, pointwise, upper_bound
 from ccd_casadi.limitations.limits import Limits, limits_of
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.support.arrays import Array
@@ -89,7 +89,7 @@ def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True
         uncertain_plant(problem, theta), bounds_of(problem), structured_of(problem).sampling,
         integrator=model.integrator,
     )  # fmt: skip
-    limits = forbids_most([model, *pairs], BEGIN * pointwise(model))
+    limits = forbids_most([model, *pairs])
     gap = Gap(upper_bound(limits), plants="the set" if limits.others else MODEL)
     if not within:
         return gap
