@@ -193,6 +193,7 @@ def _where(
     """
     x, low, high, slope = float(np.log(begin)), -np.inf, float(np.log(most)), 0.8
     before: tuple[float, float] | None = None
+    tried: list[float] = []
     for _ in range(SECANTS):
         g, weight = scaling(float(np.exp(x)))
         if solved and not np.isfinite(g):
@@ -204,7 +205,10 @@ def _where(
         if before is not None and x != before[0]:
             slope = float(np.clip((error - before[1]) / (x - before[0]), 0.3, 5.0))
         before = x, error
+        tried.append(x)
+        if low >= high:  # below the aim at `most`
+            break
         x += float(np.clip(-error / slope, -LARGEST, LARGEST))
         if not low < x < high:
-            x = 0.5 * (low + high) if low > -np.inf else high
+            x = high if high not in tried else 0.5 * (low + high)
     return float(np.exp(x)), weight, False
