@@ -21,7 +21,7 @@ import numpy as np
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.theta_direct import SETTLED, pieces_from
+from ccd_casadi.codesign.outer_theta import SETTLED, pieces_from
 from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
