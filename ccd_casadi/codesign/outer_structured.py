@@ -42,6 +42,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     structured_of,
     uncertain_plant,
+    with_structured,
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import (
@@ -95,8 +96,7 @@ def with_initial_search(
 
     Second, in words, why there are no warm starts; empty where there are.
     """
-    own = replace(structured_of(problem), seed=seed)
-    problem = with_range(replace(problem, controller=own))
+    problem = with_range(with_structured(problem, seed=seed))
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
     def searched() -> InitialSearch:
@@ -108,19 +108,14 @@ def with_initial_search(
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
         if made.certified and alone and problem.figure is BANDWIDTH:
             # No plant was found worse: this is the search that an end at the start would ask for.
-            value = value_of_design(anchored, start, plants_of(anchored, start), made, 1)
-            Sampler(anchored, store, Workers(1)).cached(
-                "race", start, StructuredValue, lambda: value
-            )
+            make = partial(value_of_design, anchored, start, plants_of(anchored, start), made, 1)
+            Sampler(anchored, store, Workers(1)).cached("race", start, StructuredValue, make)
         return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
 
     key = sample_key(owner, problem.start, 0.0, 0.0)
     found = store.cached(key, owner, problem.start, InitialSearch, searched)
-    structured = replace(
-        structured_of(problem), warm_starts=found.anchors, scenarios=found.members,
-        error_warm_starts=found.error_anchors,
-    )  # fmt: skip
-    return replace(problem, controller=structured), found.words
+    known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
+    return with_structured(problem, **known, scenarios=found.members), found.words
 
 
 def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
@@ -170,7 +165,7 @@ class StructuredEnd(End):
 
     sampler: Sampler
     best: InnerSample
-    found: StructuredValue
+    inner: StructuredValue
     multistart: StructuredValue | None
     worst: Excess
     scenarios: tuple[Scenario, ...]
@@ -243,37 +238,37 @@ class StructuredOuter(ThetaOuter):
         if end.feasible and not scenarios:
             turns, tell = range(APART, APART + LOOKS), printer("at the end", end.sampler.quiet)
             scenarios = worse_elsewhere(
-                problem, theta, end.found.design, turns, end.sampler.workers, tell
+                problem, theta, end.inner.design, turns, end.sampler.workers, tell
             )
         if not scenarios:
             return None
-        anchored = with_warm_start(problem, end.found.design.kappa)
+        anchored = with_warm_start(problem, end.inner.design.kappa)
         return StructuredOuter(with_scenarios(end.sampler.of(anchored), scenarios))
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
         end = cast(StructuredEnd, end)
-        sampler, best, made, worst = end.sampler, end.best, end.found.design, end.worst
+        sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
         multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
-        assert made.controller is not None
-        loops = loops_of(problem, best.theta, made.controller)
+        assert design.controller is not None
+        loops = loops_of(problem, best.theta, design.controller)
         beside = partial(objectives_beside, problem, best)
         known = is_expensive(problem) and problem.figure is BANDWIDTH
-        kkt = theta_kkt(problem, best, sampler, end.found.envelope, beside if known else None)
+        kkt = theta_kkt(problem, best, sampler, end.inner.envelope, beside if known else None)
         found = checked_whole(
-            problem, best.theta, made, worst, sampler.workers,
+            problem, best.theta, design, worst, sampler.workers,
             (known_gap.__name__, known_gap, problem, best.theta),
         )  # fmt: skip
         (wide, checked), proof = found[certify_lattice.__name__], found[proof_of.__name__]
-        drawn = (
-            None if proof.conclusive else fresh_yield(problem, best.theta, made, sampler.workers)
-        )
+        drawn = None
+        if not proof.conclusive:
+            drawn = fresh_yield(problem, best.theta, design, sampler.workers)
         with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
-            make = partial(costs_of, problem, best.theta, made.kappa)
+            make = partial(costs_of, problem, best.theta, design.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
             told = None
             if problem.figure is MOVE_TIME:
-                told = stated_time(problem, best.theta, made.controller, best.value)
+                told = stated_time(problem, best.theta, design.controller, best.value)
             bar.advance()
         return VerifiedStructured(
             problem=problem,
@@ -283,10 +278,10 @@ class StructuredOuter(ThetaOuter):
             hardware_cost=hardware_cost(plant_of(problem), best.theta),
             kkt=kkt,
             inner_gap=float(max(_gap(problem, best, multistart), 0.0)),
-            feasible=made.certified and not violated(problem, best.theta),
-            survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
+            feasible=design.certified and not violated(problem, best.theta),
+            survival=survived(problem, loops, design.bandwidth)[0] if design.certified else None,
             damping=other_damping(problem, loops),
-            design=made,
+            design=design,
             multistart=multistart,
             wide=wide,
             checked=checked,
@@ -295,7 +290,7 @@ class StructuredOuter(ThetaOuter):
             worst=worst,
             rounds=rounds,
             costs=costs,
-            prices=tolerance_prices(problem, best.theta, made),
+            prices=tolerance_prices(problem, best.theta, design),
             gap=found[known_gap.__name__],
             told=told,
         )
