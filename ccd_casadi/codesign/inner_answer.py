@@ -35,12 +35,7 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, with_structured
-from ccd_casadi.inner_problem.structured_robustness import (
-    certify_lattice,
-    checked_whole,
-    proof_of,
-    worst_case,
-)
+from ccd_casadi.inner_problem.structured_robustness import checked_whole, worst_case
 from ccd_casadi.inner_problem.structured_search import least_from, with_range, with_worst_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
@@ -238,8 +233,7 @@ def structured_answer(
         }
     if worst is None or least is not None:
         worst = worst_case(asked, theta, made)[0]
-    found = checked_whole(asked, theta, made, worst, workers)
-    (wide, checked), proof = found[certify_lattice.__name__], found[proof_of.__name__]
+    wide, checked, proof = checked_whole(asked, theta, made, worst, workers)
     assert made.controller is not None
     passed = wide.passed and not proof.refuted
     figures = head | {

@@ -18,6 +18,7 @@ from typing import cast
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.outer import End, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
@@ -27,6 +28,8 @@ from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
+from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
@@ -46,10 +49,8 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import (
-    certify_lattice,
     checked_whole,
     fresh_yield,
-    proof_of,
     tolerance_prices,
     worse_elsewhere,
     worst_case,
@@ -72,6 +73,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
+from ccd_casadi.support.threads import alongside
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,7 @@ STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
 WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
 LOOKS, APART = 5, 101  # for plants that an end does not keep, each elsewhere in the box
+LOOKS_OF_ELEMENTS = 2  # of these, and in this process, which knows the elements
 TAKEN = 4  # times at most that a search at the end may find a better controller
 
 
@@ -236,10 +239,10 @@ class StructuredOuter(ThetaOuter):
         end = cast(StructuredEnd, end)
         problem, theta, scenarios = end.sampler.problem, end.best.theta, end.scenarios
         if end.feasible and not scenarios:
-            turns, tell = range(APART, APART + LOOKS), printer("at the end", end.sampler.quiet)
-            scenarios = worse_elsewhere(
-                problem, theta, end.inner.design, turns, end.sampler.workers, tell
-            )
+            few, tell = is_expensive(problem), printer("at the end", end.sampler.quiet)
+            turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
+            workers = Workers(1) if few else end.sampler.workers
+            scenarios = worse_elsewhere(problem, theta, end.inner.design, turns, workers, tell)
         if not scenarios:
             return None
         anchored = with_warm_start(problem, end.inner.design.kappa)
@@ -252,23 +255,28 @@ class StructuredOuter(ThetaOuter):
         multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
         assert design.controller is not None
         loops = loops_of(problem, best.theta, design.controller)
-        beside = partial(objectives_beside, problem, best)
         known = is_expensive(problem) and problem.figure is BANDWIDTH
-        kkt = theta_kkt(problem, best, sampler, end.inner.envelope, beside if known else None)
-        found = checked_whole(
-            problem, best.theta, design, worst, sampler.workers,
-            (known_gap.__name__, known_gap, problem, best.theta),
-        )  # fmt: skip
-        (wide, checked), proof = found[certify_lattice.__name__], found[proof_of.__name__]
-        drawn = None
-        if not proof.conclusive:
-            drawn = fresh_yield(problem, best.theta, design, sampler.workers)
-        with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+        beside = partial(objectives_beside, problem, best) if known else None
+        certificate = partial(theta_kkt, problem, best, sampler, end.inner.envelope, beside)
+        kkt = None if known else certificate()  # which spreads values over the workers itself
+
+        def judged() -> tuple[SetCertificate, int, Proof, Yield | None]:
+            whole = checked_whole(problem, best.theta, design, worst, sampler.workers)
+            if whole[-1].conclusive:
+                return *whole, None
+            return *whole, fresh_yield(problem, best.theta, design, sampler.workers)
+
+        with alongside(judged) as result, Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+            kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, design.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
-            told = None
+            gap = known_gap(problem, best.theta)
+            prices = tolerance_prices(problem, best.theta, design)
+            survival = survived(problem, loops, design.bandwidth)[0] if design.certified else None
+            damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, design.controller, best.value)
+            wide, checked, proof, drawn = result()
             bar.advance()
         return VerifiedStructured(
             problem=problem,
@@ -279,8 +287,8 @@ class StructuredOuter(ThetaOuter):
             kkt=kkt,
             inner_gap=float(max(_gap(problem, best, multistart), 0.0)),
             feasible=design.certified and not violated(problem, best.theta),
-            survival=survived(problem, loops, design.bandwidth)[0] if design.certified else None,
-            damping=other_damping(problem, loops),
+            survival=survival,
+            damping=damping,
             design=design,
             multistart=multistart,
             wide=wide,
@@ -290,8 +298,8 @@ class StructuredOuter(ThetaOuter):
             worst=worst,
             rounds=rounds,
             costs=costs,
-            prices=tolerance_prices(problem, best.theta, design),
-            gap=found[known_gap.__name__],
+            prices=prices,
+            gap=gap,
             told=told,
         )
 

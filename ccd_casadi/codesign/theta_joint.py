@@ -47,7 +47,8 @@ from ccd_casadi.support.arrays import Array
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
-TURNS = 25  # times at most that worse plants are looked for and the plants made anew
+TURNS = 25  # times at most that the plants are made anew
+LOOKS = 3  # for worse plants at most in a turn, each after the controller adapts to those before
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 PENALTY = (
     6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
@@ -57,7 +58,8 @@ FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-7  # of w2 ω_b
 LAST, FADED = 12, 0.15  # trials that gain less of all that was gained: made anew, plants tell more
 SETTLED = 3e-4  # of J: less is not worth another set of plants
-ENDINGS, CLOSE, MET = 3, 0.02, 1e-4  # searches on the plants to first order; of the box
+CLOSE, NEAR = 0.02, 2e-3  # of the box: last searches, on plants known near and to first order
+ENDINGS, KEPT = 3, 2e-6  # of these; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
@@ -92,33 +94,26 @@ def joint_search(
     best, known = JointPoint(first.theta, first.kappa, first.bandwidth), [first.theta]
     reach, settled, asked = REACH, False, sampler
     for turn in range(TURNS):
-        models, within = nearby(problem, known, best.theta), LOOSE if turn else WITHIN
-        uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
-        scenarios = violations(
-            problem, uncertain, np.array(best.kappa), best.bandwidth, turn, tell, within
-        )[1]
-        if scenarios:
-            asked = with_scenarios(asked, scenarios)
-            problem = asked.problem
-        best, J = JointModel(problem, models, best, reach).adapted()
+        models = nearby(problem, known, best.theta)
+        within = LOOSE if turn else WITHIN
+        asked, best, J = on_worse_plants(asked, models, best, turn, within, tell)
+        problem = asked.problem
         if not np.isfinite(J):
             break
         make = partial(proposed, problem, models, best, reach)
         found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
             tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
-        promised = found.gain > SETTLED * abs(J) and reach > LEAST
-        if not (scenarios or promised):
-            best = finished(asked, best)
+        if found.gain <= SETTLED * abs(J) or reach <= LEAST:
+            asked, best, _ = on_worse_plants(asked, models, best, TURNS + turn, WITHIN, tell)
+            best, problem = finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
-            scenarios = violations(problem, own, kappa, omega_b, TURNS + turn, tell)[1]
+            scenarios = violations(problem, own, kappa, omega_b, 2 * LOOKS * TURNS + turn, tell)[1]
             settled = not scenarios
             if settled:
                 break
             asked = with_scenarios(asked, scenarios)
-            problem = asked.problem
-        if not promised:
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
         models = ()  # the basis is large: it grows and need not stay
@@ -131,7 +126,7 @@ def joint_search(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = best if settled else finished(asked, best)
+    best = best if settled else finished(asked, models, best)
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
@@ -140,25 +135,53 @@ def joint_search(
     return sampler, first, True
 
 
-def finished(sampler: Sampler, start: JointPoint) -> JointPoint:
-    """The joint optimum near by, on the plants themselves to first order around each end before: so
-    near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
-    problem, (lower, upper) = sampler.problem, box(sampler.problem)
-    models, reach = nearby(problem, (), start.theta), CLOSE
-    best, J = JointModel(problem, models, start, reach).adapted()
-    for number in range(ENDINGS):
-        make = partial(proposed, problem, models, best, reach, LAST_GAIN)
-        at = (*start.theta, start.bandwidth, number)
-        end = sampler.cached("finished", at, Proposal, make).end
-        away = float(np.abs((np.array(end.theta) - best.theta) / (upper - lower)).max())
-        others = nearby(problem, (), end.theta)
-        end, there = JointModel(problem, others, end, reach).adapted()
+def on_worse_plants(
+    sampler: Sampler,
+    models: Sequence[Evaluate],
+    best: JointPoint,
+    turn: int,
+    within: float,
+    tell: Callable[[str], None] | None,
+) -> tuple[Sampler, JointPoint, float]:
+    """The sampler of the problem with the plants on which the controller exceeds a bound, the
+    controller adapted to them until no worse plant is found, and J there."""
+    for look in range(LOOKS):
+        problem = sampler.problem
+        uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
+        scenarios = violations(
+            problem, uncertain, np.array(best.kappa), best.bandwidth, LOOKS * turn + look, tell,
+            within,
+        )[1]  # fmt: skip
+        if scenarios:
+            sampler = with_scenarios(sampler, scenarios)
+        best, J = JointModel(sampler.problem, models, best, 0.0).adapted()
+        if not scenarios or not np.isfinite(J):
+            break
+    return sampler, best, J
+
+
+def finished(sampler: Sampler, models: Sequence[Evaluate], start: JointPoint) -> JointPoint:
+    """The joint optimum near by, on plants known near it and then on the plants themselves to first
+    order: so near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
+
+    def ended(models: Sequence[Evaluate], at: JointPoint, reach: float) -> Proposal:
+        make = partial(proposed, problem, models, at, reach, LAST_GAIN)
+        return sampler.cached("finished", (*at.theta, at.bandwidth, reach), Proposal, make)
+
+    problem, reach = sampler.problem, NEAR
+    best = ended(models, start, CLOSE).end
+    models = nearby(problem, (), best.theta)
+    best, J = JointModel(problem, models, best, reach).adapted()
+    for _ in range(ENDINGS):
+        found = ended(models, best, reach)
+        if found.gain <= KEPT * abs(J):
+            break
+        others = nearby(problem, (), found.end.theta)
+        end, there = JointModel(problem, others, found.end, reach).adapted()
         if there < J:
             best, J, models = end, there, others
         else:
             reach *= 0.1
-        if away < MET:
-            break
     return best
 
 
@@ -195,7 +218,7 @@ def proposed(
     if start is None:
         return Proposal(at, 0.0)
     if least_gain == LEAST_GAIN:
-        model.enough = 2.0 * SETTLED * abs(start.value)
+        model.enough = SETTLED * abs(start.value)
     n, radius = len(start.x), Radius(min(FIRST, reach), NARROWEST, WIDEST)
     end = minimise(
         model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=least_gain

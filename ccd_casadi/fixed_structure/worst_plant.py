@@ -28,12 +28,15 @@ from ccd_casadi.support.arrays import Array
 WITHIN = 1e-4  # ln: by how much a plant of the box may pass a bound and count as within
 UNSTABLE = 10.0  # ln: what an unstable loop counts as
 LATTICE = 200  # plants, evenly over the box
+UNDAMPED = 120  # of more than four parameters, which are not looked through evenly anyway
+EVENLY = 4  # of so many plants one keeps its damping, the others have the least: peaks are sharp
 ALONG = 61  # plants along each theta that varies, at every corner of the rest
 SEARCHES = 6
 ROUNDS = 7  # of a compass search, its step halved each time
 FEW = 4  # parameters up to which every one is moved on its own
-LARGEST = 3  # constraints of a plant that are followed
-STEPS = (1.0, 0.3)  # towards the corner that a constraint points to
+LARGEST = 2  # constraints of a plant that are followed
+STEPS = (1.0, 0.3, 0.1, 0.03)  # towards the corner that a constraint points to: ridges are narrow
+PEAK = 0.1  # ln of the frequency: rows of one bound nearer than that are one peak
 CLIMBS = 4  # rounds of them
 
 
@@ -117,31 +120,15 @@ def worst_plants(
 ) -> tuple[list[Excess], int]:
     """The worst plants found, the worst first, and how many were looked at."""
 
-    def values(points: Sequence[tuple[int, Array]]) -> Array:
-        return excesses(uncertain, points, structure, kappa, bandwidth, bounds, sampling)
-
+    n, loop = len(uncertain.names), (structure, kappa, bandwidth, bounds, sampling)
+    if n > FEW:
+        return _climbed(uncertain, loop, min(count, UNDAMPED), seed)
     points = lattice(uncertain, count, seed)
-    value = values(points)
-    looked, n = len(points), len(uncertain.names)
-    first = np.argsort(-value)[:SEARCHES]
+    value = excesses(uncertain, points, *loop)
+    looked, first = len(points), np.argsort(-value)[:SEARCHES]
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
         return heads, looked
-    if n > FEW:
-        loop = (structure, kappa, bandwidth, bounds, sampling)
-        for _ in range(CLIMBS):
-            steps = _towards_corners(uncertain, heads, loop)
-            if not steps:
-                break
-            ends = values([(heads[row].option, point) for row, point in steps]).tolist()
-            looked += len(steps)
-            better = False
-            for (row, point), end in zip(steps, ends, strict=True):
-                if end > heads[row].value + WITHIN:
-                    heads[row], better = Excess(heads[row].option, point, end), True
-            if not better:
-                break
-        return sorted(heads, key=lambda head: -head.value), looked
     box = uncertain.box
     step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
     for _ in range(ROUNDS):
@@ -151,7 +138,7 @@ def worst_plants(
             for i in range(n)
             for sign in (1.0, -1.0)
         ]
-        found = values(moves).reshape(len(heads), 2 * n)
+        found = excesses(uncertain, moves, *loop).reshape(len(heads), 2 * n)
         looked += len(moves)
         best = np.argmax(found, axis=1)
         for row, k in enumerate(best):
@@ -159,6 +146,41 @@ def worst_plants(
                 option, point = moves[2 * n * row + int(k)]
                 heads[row] = Excess(option, point, float(found[row, k]))
         step = 0.5 * step
+    return sorted(heads, key=lambda head: -head.value), looked
+
+
+def _climbed(
+    uncertain: UncertainPlant, loop: tuple[Any, ...], count: int, seed: int
+) -> tuple[list[Excess], int]:
+    """`worst_plants` of many parameters: ascents from the worst plants of distinct peaks."""
+    own = np.array([name == "damping" for name in uncertain.names])
+    points = [
+        (option, np.where(own & (i % EVENLY > 0), uncertain.box[0], point))
+        for i, (option, point) in enumerate(lattice(uncertain, count, seed))
+    ]
+    value, problem, peaks = _looked_at(uncertain.plants(points), *loop)
+    found = dict[tuple[int, ...], Excess]()
+    for i in np.argsort(-value).tolist():
+        option, point = points[i]
+        key: tuple[int, ...] = (option, -i)
+        if peaks is not None and -np.inf < value[i] < UNSTABLE:
+            rows = np.flatnonzero(problem.plants_of(peaks) == i)
+            row = rows[np.argmax(peaks.value[rows])]
+            key = (option, int(peaks.curve[row]), round(float(np.log(peaks.v[row])) / PEAK))
+        found.setdefault(key, Excess(option, point, float(value[i])))
+    heads, looked = list(found.values())[:SEARCHES], len(points)
+    for _ in range(CLIMBS):
+        steps = _towards_corners(uncertain, heads, loop)
+        if not steps:
+            break
+        tried = [(heads[row].option, point) for row, point in steps]
+        looked, better = looked + len(tried), False
+        for (row, point), end in zip(steps, excesses(uncertain, tried, *loop), strict=True):
+            if end > heads[row].value:
+                better |= bool(end > heads[row].value + WITHIN)
+                heads[row] = Excess(heads[row].option, point, float(end))
+        if not better:
+            break
     return sorted(heads, key=lambda head: -head.value), looked
 
 

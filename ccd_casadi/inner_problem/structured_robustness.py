@@ -190,18 +190,16 @@ def checked_whole(
     made: SectionsDesign,
     worst: Excess,
     workers: Pool,
-    *others: tuple[Any, ...],
-) -> dict[Any, Any]:
-    """`certify_lattice` and `proof_of` by name, and `others` (tasks of `looked`), at one time.
-
-    Of several options, whose proofs are spread over the workers, one after the other.
-    """
+) -> tuple[SetCertificate, int, Proof]:
+    """`certify_lattice` and `proof_of` at one time; of several options, whose proofs are spread
+    over the workers, one after the other."""
     own = {certify_lattice: (made.controller, worst), proof_of: (made,)}
     tasks = [(look.__name__, look, problem, theta, *design) for look, design in own.items()]
     if structured_of(problem).uncertainty.options:
         found = dict(looked((*task, workers)) for task in tasks)
-        return found | dict(workers.map_unordered(looked, others))
-    return dict(workers.map_unordered(looked, [*others, *reversed(tasks)]))
+    else:
+        found = dict(workers.map_unordered(looked, tasks[::-1]))
+    return (*found[certify_lattice.__name__], found[proof_of.__name__])
 
 
 def tolerance_prices(

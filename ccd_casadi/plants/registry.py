@@ -10,8 +10,6 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from ccd_casadi.plants.cad.plant import cad_stage
-from ccd_casadi.plants.imported.plant import modal_table, sampled_matrices
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.plants.two_mass import two_mass_plant
 
@@ -34,12 +32,23 @@ class Model:
     sound: bool = False
 
 
-OWN: dict[str, Model] = {
-    "two_mass": Model(two_mass_plant, theta=("m1", "m2"), sound=True),
-    "modal_table": Model(modal_table, data="table"),
-    "sampled_matrices": Model(sampled_matrices, data="folder"),
-    "cad_stage": Model(cad_stage, data="morph"),
-}
+OWN = ("two_mass", "modal_table", "sampled_matrices", "cad_stage")
+
+
+def _own(name: str) -> Model:
+    """Finite elements and files of many formats take a sixth of a second to import, which a case
+    that names neither does not wait for."""
+    if name == "two_mass":
+        return Model(two_mass_plant, theta=("m1", "m2"), sound=True)
+    if name == "cad_stage":
+        from ccd_casadi.plants.cad.plant import cad_stage
+
+        return Model(cad_stage, data="morph")
+    from ccd_casadi.plants.imported.plant import modal_table, sampled_matrices
+
+    if name == "modal_table":
+        return Model(modal_table, data="table")
+    return Model(sampled_matrices, data="folder")
 
 
 def data_option(name: str | None) -> str:
@@ -61,9 +70,9 @@ def model_names() -> list[str]:
 @cache
 def model_named(name: str | None) -> Model | None:
     """The model of that name; None where there is none."""
-    if name is None or name in OWN:
-        return OWN.get(name or "")
-    if name not in _offered():
+    if name is not None and name in OWN:
+        return _own(name)
+    if name is None or name not in _offered():
         return None
     found = _offered()[name].load()
     return found if isinstance(found, Model) else Model(found)

@@ -71,3 +71,15 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     if count <= 1:
         return [function(item) for item in todo]
     return list(_threads(count).map(function, todo))
+
+
+@contextmanager
+def alongside(function: Callable[[], R]) -> Iterator[Callable[[], R]]:
+    """A thread that runs a function while the block runs; what is given waits for its result.
+
+    For work that processes do: of two that compute here each has the lock half of the time.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(1, "alongside") as one:
+        yield one.submit(function).result

@@ -142,7 +142,7 @@ def test_what_was_spent_adds_up(run: Run) -> None:
 def schema(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     assert main(["schema", "--result"]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert found["properties"]["format"] == {"const": FORMAT}
+    assert found["properties"]["format"]["const"] == FORMAT
     return found
 
 

@@ -136,6 +136,11 @@ def modes_at(stage: RibStage, theta: tuple[float, ...]) -> ModeSet:
     return _spectra[key]
 
 
+def forget_spectra() -> None:
+    """Let the last factorisations go before memory is needed for others."""
+    _spectra.clear()
+
+
 @lru_cache(maxsize=16)
 def _rigid_function(geometry: Geometry, points: tuple[Point, ...]) -> ca.Function:
     return rigid_fields(geometry, points)

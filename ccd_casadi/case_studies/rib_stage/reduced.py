@@ -25,6 +25,7 @@ from ccd_casadi.case_studies.rib_stage.model import (
     RibStage,
     assembled,
     discretisation,
+    forget_spectra,
     points_of,
     rigid_part,
 )
@@ -127,6 +128,7 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> tuple[Basis, ...]:
     if len(_bases) == STAGES:
         del _bases[next(iter(_bases))]
     disc = discretisation(stage)
+    forget_spectra()
     for theta in map(np.array, known[len(have) :]):
         before = made or [_of_rigid(stage, disc, group, theta) for group in SQUARE_GROUPS]
 
