@@ -30,7 +30,7 @@ class Direct:
     Parameters
     ----------
     starts : int
-        The case's own and a Sobol set over the box.
+        The start of the case, and a Sobol set over the box.
     tolerance : float
         Of the inner problem.
     box_points : int

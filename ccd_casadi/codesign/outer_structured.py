@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +20,7 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
-from ccd_casadi.codesign.outer import End, is_expensive
+from ccd_casadi.codesign.outer import End, Place, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
@@ -217,6 +217,22 @@ class StructuredOuter(ThetaOuter):
             theta = [float(result["theta"][name]) for name in problem.names]
             outer.sampler.value_from(theta, sections_kappa(folder, structure_of(problem)))
         return outer
+
+    def local_solve(
+        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
+    ) -> Place | None:
+        """By the joint search where J counts the bandwidth, on the worse plants of its way."""
+        if self.problem.figure is not BANDWIDTH or settled is not None:
+            return super().local_solve(sample, known, settled)
+        tell = printer("local solve", self.sampler.quiet)
+        ends = [(place.x, place.objective) for place in known]
+        sampler, best, ended = joint_search(self.sampler, np.array(sample.theta), tell, ends)
+        J = objective_of(sampler.problem, best)
+        if not np.isfinite(J):
+            return None
+        if best.theta != sample.theta:
+            self.sampler.value_from(best.theta, best.kappa)  # a polish there begins with it
+        return Place(np.array(best.theta), J, ended)
 
     def polished(self, x: Array) -> StructuredEnd:
         sampler, theta = self.sampler, self.theta_of(x)

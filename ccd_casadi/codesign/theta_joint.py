@@ -83,11 +83,17 @@ class Proposal:
 
 
 def joint_search(
-    sampler: Sampler, theta: Array, tell: Callable[[str], None] | None = None
+    sampler: Sampler,
+    theta: Array,
+    tell: Callable[[str], None] | None = None,
+    ends: Sequence[tuple[Array, float]] | None = None,
 ) -> tuple[Sampler, InnerSample, bool]:
     """From θ towards where the joint search promises no more on the worst plants: the sampler of
     the problem that has these and the controller there as its warm start, its true sample, and
-    whether no more is promised."""
+    whether no more is promised.
+
+    With `ends` of other searches (θ, J) it ends near one that it does not improve on, and leaves
+    the last digits to a polish."""
     problem, first = sampler.problem, sampler.values(theta, "polishing")[0]
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
@@ -98,13 +104,18 @@ def joint_search(
         within = LOOSE if turn else WITHIN
         asked, best, J = on_worse_plants(asked, models, best, turn, within, tell)
         problem = asked.problem
+        if _arrived(problem, best, J, ends or ()):
+            return sampler, first, False
         if not np.isfinite(J):
             break
         make = partial(proposed, problem, models, best, reach)
         found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
-            tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
+            tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
+            settled = ends is not None
+            if settled:
+                break
             asked, best, _ = on_worse_plants(asked, models, best, TURNS + turn, WITHIN, tell)
             best, problem = finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
@@ -126,13 +137,24 @@ def joint_search(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = best if settled else finished(asked, models, best)
+    best = best if settled or ends is not None else finished(asked, models, best)
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
     if asked is not sampler or objective_of(problem, last) < objective_of(problem, first):
         return asked, last, settled
     return sampler, first, True
+
+
+def _arrived(
+    problem: CoDesignProblem, best: JointPoint, J: float, ends: Sequence[tuple[Array, float]]
+) -> bool:
+    """Whether a place is that of a known end, and not better."""
+    width = np.subtract(problem.upper, problem.lower)
+    return any(
+        np.abs((best.theta - theta) / width).max() < CLOSE and end - SETTLED * abs(end) < J
+        for theta, end in ends
+    )
 
 
 def on_worse_plants(

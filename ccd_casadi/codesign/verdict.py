@@ -93,7 +93,7 @@ def optimal(
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
         return VerdictLine(State.FAILED, words, figures)
     if kink is None:
-        words = f"KKT residual {residual:.1e} over theta; {known}"
+        words = f"locally optimal, KKT residual {residual:.1e} over theta; {known}"
         if kkt.second_order is not None and kkt.second_order < saddle:
             figures["least_curvature"] = kkt.second_order
             words = f"a stationary point that curves downwards ({kkt.second_order:.2g}): {words}"
@@ -104,8 +104,8 @@ def optimal(
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
         return VerdictLine(State.FAILED, f"{words}; {known}", figures)
     words = (
-        f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
-        f"controller together ({kink.one_gradient:.2g} by the gradient of one side); "
+        f"locally optimal to first order at a kink of J: KKT residual {residual:.1e} over theta "
+        f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
         f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
@@ -136,12 +136,11 @@ def search_evidence(
 ) -> tuple[str, dict[str, Any]]:
     """What IPOPT's starts, the global check over the box and bounds say, in words and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
-    known = f"best of {counted(starts, 'start')}" if starts else ""
+    known = f"best of {counted(starts, 'start')}" if starts else "from one start"
     if optima > 1:
         known += f", {optima} distinct optima"
     if look is None or not look.points:
-        words = (known, "no global check over the box", gap)
-        return ", ".join(part for part in words if part), figures
+        return f"{known}, no global check over the box, {gap}", figures
     figures |= {
         "box_points": look.points,
         "box_feasible": look.feasible,
@@ -154,7 +153,7 @@ def search_evidence(
     said = f"none better at {how}"
     if look.moved:
         said = f"moved by the global check at {how}: the formulation ended at J = {look.before:.6g}"
-    return ", ".join(part for part in (known, said, gap) if part), figures
+    return f"{known}, {said}, {gap}", figures
 
 
 def predicted(

@@ -137,7 +137,7 @@ class Bounds:
                 raise ValueError(f"{words}; give more than 0, at most that of the weights")
 
     def of_channel(self, number: int) -> "Bounds":
-        """What a channel keeps that nothing couples to the others, its own bandwidth for ω_b."""
+        """The bounds of a channel that is not coupled to the others, ω_b being its bandwidth."""
         if not self.channels:
             return self
         own = self.channels[number]
@@ -177,7 +177,7 @@ class Bounds:
         return shares
 
     def channel_shares(self, found: Sequence[ChannelPeaks]) -> dict[str, float]:
-        """The same of the channels' own bounds; `found` as `channels` are."""
+        """The same for the bounds of the channels; `found` in the order of `channels`."""
         shares = {}
         for own, figures in zip(self.channels, found, strict=True):
             if own.S_max is not None:

@@ -91,7 +91,7 @@ def certify(
     plants, controller : sequence of ScaledPlant, StateSpace
         All of the set; e in, u out.
     bounds, integrator : Bounds, bool
-        Of channels with bounds of their own those besides. The shape counts from 0 on, or ω_low.
+        With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
         None: a continuous loop; the plants are spread over them.
 
