@@ -174,15 +174,15 @@ def best_of_lists(
     return replace(best, result=result | {"notes": notes})
 
 
-def _point(found: Solution) -> dict[str, float]:
+def _point(solution: Solution) -> dict[str, float]:
     """θ of a solution and the values that were held, by name."""
-    assert found.problem is not None
-    return found.problem.source.held | found.result["theta"]
+    assert solution.problem is not None
+    return solution.problem.source.held | solution.result["theta"]
 
 
-def _same(problem: CoDesignProblem, found: Solution) -> float:
+def _same(problem: CoDesignProblem, solution: Solution) -> float:
     """By how much J may differ and count as the same."""
-    cost, J = (float(found.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
+    cost, J = (float(solution.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
     share = problem.w1 * cost
     return NO_BETTER * (abs(share) + abs(J - share)) if np.isfinite(J) else 0.0
 

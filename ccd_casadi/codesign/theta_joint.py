@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.decoupling import in_units_of
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
 from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
@@ -273,7 +273,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self.merits: list[float] = []  # before every trial
         # A step that fails is followed by one from the same place.
         self.loops_beside = lru_cache(1)(self._loops_beside)
-        self.all_rows = lru_cache(2)(self._all_rows)
+        self.all_rows = lru_cache(2)(
+            lambda here: all_rows(here.data[0], *self.parts(here.x)[1:], here.data[1])
+        )
         self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
         kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
         self.start = np.concatenate([middle, kappa, [self.tau]])
@@ -363,10 +365,6 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         gained = self.merits[0] - self.merits[-1]
         late = self.merits[-LAST:][0] - self.merits[-1]
         return len(self.merits) > LAST and gained > self.enough and late < FADED * gained
-
-    def _all_rows(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> Constraints:
-        _, kappa, tau = self.parts(here.x)
-        return all_rows(here.data[0], kappa, tau, here.data[1])
 
     def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""
