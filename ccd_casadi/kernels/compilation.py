@@ -66,7 +66,7 @@ def compile_part(part: str) -> None:
             raise SystemExit("the compiled kernels find no controller where there is one")
     else:
         gamma.plant_gain(A, B, C, grid)
-        row = np.empty(int(design.Figure.COUNT))
+        row = np.empty(int(design.Column.COUNT))
         judged = (A, B, C, -np.eye(5), np.ones((5, 1)), np.zeros((1, 5)), none)
         for delta in (0.0, 1.0):
             design.judge(*judged, w, delta, 1e5, 1e-2, row)

@@ -29,7 +29,7 @@ import numpy as np
 
 from ccd_casadi.kernels.bound_peak import bound_gradient, bound_peak
 from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, innovations_plant
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import generalized_plant
@@ -224,11 +224,11 @@ def figure_gradients(
     total = count + made_for.w.size + (made_for.delta > 0.0)
     none = (np.full((len(loops) + 1, total), nan), np.full(count, nan), np.full(len(loops), nan))
     to_gamma = np.full(total, nan)
-    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED]:
+    if row[Column.CODE] != Code.CERTIFIED or row[Column.BALANCED]:
         return *none, to_gamma, True
     with np.errstate(all="ignore"):  # an undefined number is seen in the result
-        posed, gamma_opt, ok = _posed(made_for), float(row[Figure.GAMMA_OPT]), True
-        if row[Figure.LIMITED_BY_BOUND] > 0.5:
+        posed, gamma_opt, ok = _posed(made_for), float(row[Column.GAMMA_OPT]), True
+        if row[Column.LIMITED_BY_BOUND] > 0.5:
             *slopes, to_weights = _bound_gradient(made_for, grid, sigma)
         else:
             *slopes, to_weights, ok = gamma_gradient(posed, gamma_opt)
@@ -258,7 +258,7 @@ def peak_gradients(
     """
     with np.errstate(all="ignore"):
         found, _, _, gains, _, ok = loop_gradients(
-            made_for, _posed(made_for), float(row[Figure.GAMMA_OPT]), gamma_slope, loops
+            made_for, _posed(made_for), float(row[Column.GAMMA_OPT]), gamma_slope, loops
         )
     return found / gains[:, None] if ok else found
 

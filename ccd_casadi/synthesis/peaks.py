@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gradients import LoopAt, MadeFor, peak_gradients
 from ccd_casadi.kernels.sensitivity import sensitivity_gain, sensitivity_gains
@@ -55,7 +55,7 @@ def local_peaks_with_gradients(
     `design`: what `sensitivities` made of the same plant and weights; nothing is made anew.
     """
     made = design.made
-    if made is None or made.row[Figure.CODE] != Code.CERTIFIED or made.row[Figure.BALANCED]:
+    if made is None or made.row[Column.CODE] != Code.CERTIFIED or made.row[Column.BALANCED]:
         return ()
     w0, w = plant.omega_0, weights.scaled(plant.omega_0)
     found = [
