@@ -11,6 +11,7 @@ far the first order may reach. Where no more is promised the conditions of optim
 true plants too, as values and slopes are exact in the middle.
 """
 
+import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -100,8 +101,10 @@ def joint_search(
         problem = asked.problem
         if not np.isfinite(J):
             break
-        make = partial(proposed, problem, models, best, reach)
-        found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
+        found = asked.cached(
+            "together", (*best.theta, reach, turn), Proposal,
+            partial(proposed, problem, models, best, reach),
+        )  # fmt: skip
         if tell is not None:
             tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
@@ -116,7 +119,8 @@ def joint_search(
             asked = with_scenarios(asked, scenarios)
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
-        models = ()  # the basis is large: it grows and need not stay
+        models = ()  # the basis is large: it grows and need not stay,
+        gc.collect()  # nor in the circles of searches before
         models = nearby(problem, known, found.end.theta)
         end, there = JointModel(problem, models, found.end, reach).adapted()
         gained = J - there
