@@ -211,7 +211,8 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     if point.assessment.violation > MARGIN:
         end = ascend(problem, point, iterations=RESTORED, penalty=RESTORING, radius=0.05)
         point, looked = at_its_bandwidth(problem, end.point), looked + end.evaluations
-    return asked, DesignSearch(problem, plants, asked.sampling, seed).designed(point, (), 1, looked)
+    search = DesignSearch(problem, plants, asked.sampling, seed=seed)
+    return asked, search.designed(point, (), 1, looked)
 
 
 def at_its_bandwidth(problem: LoopProblem, point: Point) -> Point:

@@ -28,10 +28,9 @@ from rib_stage_on_the_set import ON_THE_SET
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure import Structure, synthesise_sections
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
-from ccd_casadi.fixed_structure.design import synthesise_sections
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
 from ccd_casadi.inner_problem.structured_plant_set import (

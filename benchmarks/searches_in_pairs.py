@@ -24,7 +24,7 @@ CODE = """
 import json, sys, time
 sys.path.insert(0, sys.argv[1])
 from random_sections import case
-from ccd_casadi.fixed_structure.design import synthesise_sections
+from ccd_casadi.fixed_structure import synthesise_sections
 assert sys.modules["ccd_casadi"].__file__.startswith(sys.argv[2])
 for line in sys.stdin:
     seed = int(line)

@@ -22,7 +22,8 @@ from random_sections import at_its_bandwidth, case
 from scipy.optimize import minimize
 from sections_judge import Case
 
-from ccd_casadi.fixed_structure.design import _pool, problem_for, synthesise_sections
+from ccd_casadi.fixed_structure import synthesise_sections
+from ccd_casadi.fixed_structure.design import _pool, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem

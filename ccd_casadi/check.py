@@ -44,7 +44,7 @@ def text(found: dict[str, Any]) -> str:
     ]
     lines += [
         f"constraint    {item['name']}: {item['value']:.4g} at the start, "
-        + ("met (0 or less)" if item["met"] else "NOT met (it is where it is 0 or less)")
+        + ("met (0 or less)" if item["met"] else "NOT met (required: 0 or less)")
         for item in found["constraints"]
     ]
     lines += [

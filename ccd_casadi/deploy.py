@@ -41,7 +41,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     if status != "verified" and not options.unverified:
         reason = finished.result.get("reason") or "no reason is given"
         words = f"the run is {status}: {reason}"
-        remedy = "solve it better, or give --unverified to look at it all the same"
+        remedy = "solve it again, or give --unverified to deploy it nevertheless"
         say(one_line(f"{options.run}: {words}; {remedy}"), sys.stderr)
         return ExitCode.NOT_VERIFIED
     folder = run_folder(options.run, options.out or options.run / "deploy")

@@ -41,7 +41,7 @@ def problem_of(case: Case) -> CoDesignProblem:
     Raises
     ------
     CaseError
-        The plant is none; the user's own is evaluated over its box.
+        The plant is not valid; a plant function is evaluated over the box.
 
     Examples
     --------

@@ -174,15 +174,15 @@ def best_of_lists(
     return replace(best, result=result | {"notes": notes})
 
 
-def _point(found: Solution) -> dict[str, float]:
+def _point(solution: Solution) -> dict[str, float]:
     """θ of a solution and the values that were held, by name."""
-    assert found.problem is not None
-    return found.problem.source.held | found.result["theta"]
+    assert solution.problem is not None
+    return solution.problem.source.held | solution.result["theta"]
 
 
-def _same(problem: CoDesignProblem, found: Solution) -> float:
+def _same(problem: CoDesignProblem, solution: Solution) -> float:
     """By how much J may differ and count as the same."""
-    cost, J = (float(found.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
+    cost, J = (float(solution.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
     share = problem.w1 * cost
     return NO_BETTER * (abs(share) + abs(J - share)) if np.isfinite(J) else 0.0
 
@@ -272,13 +272,13 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
         far = f"{above:.3g} above" if above > 0.0 else "no worse than"
         there, here = found["nodes"][0]["words"], _made_of(problem, result)
         figures = f" ({there} there, {here} here)" if there else ""
-        free = f"; J is {far} what was found with all values between them allowed{figures}"
+        free = f"; J is {far} the best with any value between them{figures}"
     counts = f"{found['solved']} of {counted(found['combinations'], 'combination')} searched"
     if found["between"]:
-        counts += f", and {counted(found['between'], 'part')} with all values between them allowed"
+        counts += f", and {counted(found['between'], 'part')} with any value between them"
     if found["cut"] and found["least_of_cut"] is not None:
-        counts += f", {found['cut']} cut: the best found of a part that each is in, with all values"
-        counts += f" between allowed, is J {found['least_of_cut']:.6g} or more"
+        counts += f", {found['cut']} excluded: with any value between, the best found in their"
+        counts += f" parts is J {found['least_of_cut']:.6g} or more"
     if found["without_design"]:
         counts += f", {found['without_design']} in parts where no design was found"
     return f"listed values: {named}{free}; {counts}"

@@ -131,14 +131,14 @@ def move_lines(result: Mapping[str, Any]) -> list[str]:
     return [f"move          {words}"]
 
 
-def budget_dict(found: LoopBudget) -> dict[str, Any]:
+def budget_dict(budget: LoopBudget) -> dict[str, Any]:
     """The figures on the model, and the largest of all plants; m, N, s; null where infinite."""
-    model = found.model
+    model = budget.model
     head: dict[str, Any] = {
-        "sampled": found.hold is not None,
-        "plants": found.plants,
-        "error_rms_largest": found.largest_error,
-        "force_rms_largest": found.largest_force,
+        "sampled": budget.hold is not None,
+        "plants": budget.plants,
+        "error_rms_largest": budget.largest_error,
+        "force_rms_largest": budget.largest_force,
     }
     if model is None:
         return head | {"reason": "the loop with the model is not stable", "sources": []}

@@ -30,7 +30,7 @@ class Direct:
     Parameters
     ----------
     starts : int
-        The case's own and a Sobol set over the box.
+        The start of the case, and a Sobol set over the box.
     tolerance : float
         Of the inner problem.
     box_points : int
@@ -48,7 +48,7 @@ class TrueDesign:
 
     problem: CoDesignProblem
     x: Array
-    found: Sensitivities
+    design: Sensitivities
 
     @property
     def theta(self) -> Array:
@@ -58,13 +58,13 @@ class TrueDesign:
     @property
     def acceptable(self) -> bool:
         """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
-        met = self.problem.inner.feasible(self.found.figures)
+        met = self.problem.inner.feasible(self.design.figures)
         return met and not violated(self.problem, self.theta)
 
     @cached_property
     def terms(self) -> tuple[float, float]:
         """Those of J."""
-        return objective_terms(self.problem, self.theta, self.found.figures.bandwidth)
+        return objective_terms(self.problem, self.theta, self.design.figures.bandwidth)
 
     @property
     def objective(self) -> float:
@@ -74,7 +74,7 @@ class TrueDesign:
     @cached_property
     def kkt(self) -> KktCertificate:
         """Its first-order certificate."""
-        return kkt_certificate(self.problem, self.x, self.found)
+        return kkt_certificate(self.problem, self.x, self.design)
 
     @property
     def residual(self) -> float:
@@ -105,7 +105,7 @@ def polish(sampler: Sampler, x: Array) -> TrueDesign:
             here = end
     for _ in range(3 if here.acceptable else 0):
         near = SETTLED < here.kkt.stationarity <= NEWTON
-        if not near or other_peaks(problem, here.x, here.found, ON_EDGE):
+        if not near or other_peaks(problem, here.x, here.design, ON_EDGE):
             break
         step = newton_step(problem, truth, here.x, here.kkt)
         end = here if step is None else at(step)

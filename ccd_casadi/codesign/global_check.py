@@ -15,10 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.codesign.formulation import GlobalCheck
-from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.outer import End, Outer, Place, is_expensive
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from surrogates import design
@@ -35,13 +34,13 @@ TRIES = 4
 def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
     """Look at `points` θ over the box for a J lower than that of an end.
 
-    What the run has solved itself counts among the points; where these are dear no more than `FEW`
-    are made up.
+    What the run has solved itself counts among the points. Where these are dear no more than `FEW`
+    are made up, away from what is known: the way to one optimum says nothing of another.
     """
     problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
     if not outer.global_check_is_cheap:
         points = min(points, FEW)
-    samples = _spread(outer.sampler, points, seed) if points else []
+    samples = _spread(outer, points, seed) if points else []
     able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
     values = np.array([objective_of(problem, sample) for sample in able])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
@@ -61,7 +60,9 @@ def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
 
     lowest, others = _starts(problem, able, values, here)
     starts = [*lowest, *others] if outer.global_check_is_cheap else lowest
-    solve_from(starts[: -(-points // POINTS_A_START)])
+    if outer.global_check_is_cheap or is_expensive(problem):
+        starts = starts[: -(-points // POINTS_A_START)]
+    solve_from(starts)
     ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
         found = outer.sampler.values(ends, "search from the ends of each parameter")
@@ -105,19 +106,25 @@ def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
     return found
 
 
-def _spread(sampler: Sampler, points: int, seed: int) -> list[InnerSample]:
-    """The inner problems that the run has solved, and as many more as make up `points`."""
-    lower, upper = box(sampler.problem)
+def _spread(outer: Outer, points: int, seed: int) -> list[InnerSample]:
+    """The inner problems that the run has solved, and as many more as make up `points`; where these
+    are dear, those of a spread set that none is near."""
+    sampler, (lower, upper) = outer.sampler, box(outer.problem)
     known: list[InnerSample] = []
     for sample in sampler.solved.values():
         away = [np.abs((np.array(sample.theta) - one.theta) / (upper - lower)) for one in known]
         if all(far.max() > CLUSTER for far in away):
             known.append(sample)
-    if len(known) < points:
-        spread = design("sobol", lower, upper, points, seed)[len(known) :]
-        more = [theta for theta in spread if not violated(sampler.problem, theta)]
-        if more:
-            known = [*known, *sampler.values(np.array(more), "global check")]
+    spread = design("sobol", lower, upper, points, seed)
+    if outer.global_check_is_cheap:
+        spread = spread[len(known) :]
+    else:
+        apart, solved = 0.5 * points ** (-1.0 / lower.size), [one.theta for one in known]
+        away = np.abs((spread[:, None] - np.reshape(solved, (-1, lower.size))) / (upper - lower))
+        spread = spread[(away.max(axis=2) > apart).all(axis=1)]
+    more = [theta for theta in spread if not violated(outer.problem, theta)]
+    if more:
+        known = [*known, *sampler.values(np.array(more), "global check")]
     return known
 
 

@@ -34,7 +34,7 @@ from ccd_casadi.inner_problem.problem import (
     true_design,
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import structure_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import checked_whole, worst_case
 from ccd_casadi.inner_problem.structured_search import least_from, with_range, with_worst_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -157,47 +157,47 @@ def measured_answer(
     return answer_of(case, made), made
 
 
-def answer_of(case: MeasuredCase, made: MeasuredDesign) -> InnerAnswer:
+def answer_of(case: MeasuredCase, design: MeasuredDesign) -> InnerAnswer:
     """What a design on the lines of a case says of itself."""
     hz = case.responses[0].hz
     plant = {"file": case.file, "lines": len(hz), "first_hz": hz[0], "last_hz": hz[-1]}
-    figures: dict[str, Any] = {"plant": plant, "theta": {}, "words": made.words, "syntheses": 1}
-    if made.controller is None or made.figures is None:
-        return InnerAnswer("infeasible", figures | {"reason": made.words})
-    f = made.figures
+    figures: dict[str, Any] = {"plant": plant, "theta": {}, "words": design.words, "syntheses": 1}
+    if design.controller is None or design.figures is None:
+        return InnerAnswer("infeasible", figures | {"reason": design.words})
+    f, kappa = design.figures, design.kappa
     figures |= {
-        "reason": "" if made.usable else made.words,
-        "bandwidth_hz": made.bandwidth / HZ,
+        "reason": "" if design.usable else design.words,
+        "bandwidth_hz": design.bandwidth / HZ,
         "sensitivity_peak": f.S_peak,
         "sensitivity_peak_hz": f.S_peak_frequency / HZ,
         "sensitivity_peak_between_lines": f.S_between,
         "sensitivity_low": f.S_low,
         "compliance_max": f.GS,
         "KS_max": f.KS,
-        **_loop_entry(case, made),
+        **_loop_entry(case, design),
         "certificate": {
             "stable": f.stable,
             "sure": f.sure,
             "right_half_plane_poles": f.right_half_plane,
-            "passed": made.usable,
+            "passed": design.usable,
             "figures_over_bounds": case.bounds.shares(f),
         },
-        "controller": sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()},
+        "controller": sections_dict(design.structure, kappa) | {"kappa": kappa.tolist()},
     }
-    controller = sections_controller(
-        made, None if case.period is None else Sampling(1 / case.period)
-    )
-    return InnerAnswer("verified" if made.usable else "not_verified", figures, controller)
+    sampling = None if case.period is None else Sampling(1 / case.period)
+    controller = sections_controller(design, sampling)
+    return InnerAnswer("verified" if design.usable else "not_verified", figures, controller)
 
 
-def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
+def _loop_entry(case: MeasuredCase, design: MeasuredDesign) -> dict[str, Any]:
     """Margins on the lines; nothing of an unstable loop."""
-    if made.controller is None or made.figures is None or not made.figures.stable:
+    K = design.controller
+    if K is None or design.figures is None or not design.figures.stable:
         return {}
-    joints = [(HZ * one.hz, one.matrix @ controller_response(made.controller, one.hz, case.period))
+    joints = [(HZ * one.hz, one.matrix @ controller_response(K, one.hz, case.period))
               for one in case.responses]  # fmt: skip
     loops = [(omega, equivalent_open_loop(L, i)) for omega, L in joints for i in range(L.shape[1])]
-    return measured_entry(loops, made.controller, made.bandwidth, made.figures.S_peak)
+    return measured_entry(loops, K, design.bandwidth, design.figures.S_peak)
 
 
 def structured_answer(
@@ -212,11 +212,10 @@ def structured_answer(
         raise UserError(words)
     begin_at, progress, workers = options.begin_at, options.progress, options.workers
     head = head_of(problem, theta)
-    structured = replace(structured_of(problem), seed=options.seed)
-    asked = replace(with_range(replace(problem, controller=structured)), start=theta)
+    asked = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
-        warm_starts = (sections_kappa(begin_at, structure_of(asked)),)
-        asked = replace(asked, controller=replace(structured_of(asked), warm_starts=warm_starts))
+        kappa = sections_kappa(begin_at, structure_of(asked))
+        asked = with_structured(asked, warm_starts=(kappa,))
     asked, made, worst = with_worst_plant(asked, progress, workers, begin_at is not None)
     fastest = made.bandwidth
     asked, made, least = least_from(asked, theta, made, progress)

@@ -180,9 +180,9 @@ class Outer(ABC):
         `settled`: relative change of J at which it ends.
         """
 
-    def failure_reason(self, found: Solution, share: float | None) -> str:
+    def failure_reason(self, solution: Solution, share: float | None) -> str:
         """Why a solution is not verified; `share` of a robust set that was held on the way."""
-        return str(found.result["reason"])
+        return str(solution.result["reason"])
 
     @abstractmethod
     def verified(self, end: End, rounds: int) -> Verified:

@@ -98,13 +98,13 @@ class MixedOuter(Outer):
             end = onto if onto.acceptable else end
             with sampler.spent.on("checks"):
                 inner = sampler.values(end.theta, "verifying")[0]
-            bandwidth = end.found.figures.bandwidth
+            bandwidth = end.design.figures.bandwidth
             gap = inner.bandwidth / bandwidth - 1.0 if inner.feasible else 0.0
             if gap <= INNER_GAP:
                 break
             x = inner.joint
         J = end.objective if end.acceptable else np.inf
-        return MixedEnd(end.x, bandwidth, J, end.kkt, float(gap), end.found)
+        return MixedEnd(end.x, bandwidth, J, end.kkt, float(gap), end.design)
 
     def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
         if inputs < end.x.size:
@@ -127,8 +127,8 @@ class MixedOuter(Outer):
                 return Place(x, made.objective, made.kkt.stationarity <= BASIN)
         return None
 
-    def failure_reason(self, found: Solution, share: float | None) -> str:
-        return failure_words(self.sampler, found, share)
+    def failure_reason(self, solution: Solution, share: float | None) -> str:
+        return failure_words(self.sampler, solution, share)
 
     def verified(self, end: End, rounds: int) -> VerifiedDesign:
         end = cast(MixedEnd, end)

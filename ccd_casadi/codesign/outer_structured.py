@@ -9,7 +9,7 @@ are kept in the store of samples: a run that goes on from its store repeats none
 """
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +20,7 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
-from ccd_casadi.codesign.outer import End, is_expensive
+from ccd_casadi.codesign.outer import End, Place, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
@@ -45,6 +45,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     structured_of,
     uncertain_plant,
+    with_structured,
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import (
@@ -97,8 +98,7 @@ def with_initial_search(
 
     Second, in words, why there are no warm starts; empty where there are.
     """
-    own = replace(structured_of(problem), seed=seed)
-    problem = with_range(replace(problem, controller=own))
+    problem = with_range(with_structured(problem, seed=seed))
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
     def searched() -> InitialSearch:
@@ -110,19 +110,14 @@ def with_initial_search(
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
         if made.certified and alone and problem.figure is BANDWIDTH:
             # No plant was found worse: this is the search that an end at the start would ask for.
-            value = value_of_design(anchored, start, plants_of(anchored, start), made, 1)
-            Sampler(anchored, store, Workers(1)).cached(
-                "race", start, StructuredValue, lambda: value
-            )
+            make = partial(value_of_design, anchored, start, plants_of(anchored, start), made, 1)
+            Sampler(anchored, store, Workers(1)).cached("race", start, StructuredValue, make)
         return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
 
     key = sample_key(owner, problem.start, 0.0, 0.0)
     found = store.cached(key, owner, problem.start, InitialSearch, searched)
-    structured = replace(
-        structured_of(problem), warm_starts=found.anchors, scenarios=found.members,
-        error_warm_starts=found.error_anchors,
-    )  # fmt: skip
-    return replace(problem, controller=structured), found.words
+    known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
+    return with_structured(problem, **known, scenarios=found.members), found.words
 
 
 def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
@@ -173,7 +168,7 @@ class StructuredEnd(End):
 
     sampler: Sampler
     best: InnerSample
-    found: StructuredValue
+    inner: StructuredValue
     multistart: StructuredValue | None
     worst: Excess
     scenarios: tuple[Scenario, ...]
@@ -218,6 +213,22 @@ class StructuredOuter(ThetaOuter):
             outer.sampler.value_from(theta, sections_kappa(folder, structure_of(problem)))
         return outer
 
+    def local_solve(
+        self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
+    ) -> Place | None:
+        """By the joint search where J counts the bandwidth, on the worse plants of its way."""
+        if self.problem.figure is not BANDWIDTH or settled is not None:
+            return super().local_solve(sample, known, settled)
+        tell = printer("local solve", self.sampler.quiet)
+        ends = [(place.x, place.objective) for place in known]
+        sampler, best, ended = joint_search(self.sampler, np.array(sample.theta), tell, ends)
+        J = objective_of(sampler.problem, best)
+        if not np.isfinite(J):
+            return None
+        if best.theta != sample.theta:
+            self.sampler.value_from(best.theta, best.kappa)  # a polish there begins with it
+        return Place(np.array(best.theta), J, ended)
+
     def polished(self, x: Array) -> StructuredEnd:
         sampler, theta = self.sampler, self.theta_of(x)
         for _ in range(TAKEN):
@@ -247,40 +258,40 @@ class StructuredOuter(ThetaOuter):
             few, tell = is_expensive(problem), printer("at the end", end.sampler.quiet)
             turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
             workers = Workers(1) if few else end.sampler.workers
-            scenarios = worse_elsewhere(problem, theta, end.found.design, turns, workers, tell)
+            scenarios = worse_elsewhere(problem, theta, end.inner.design, turns, workers, tell)
         if not scenarios:
             return None
-        anchored = with_warm_start(problem, end.found.design.kappa)
+        anchored = with_warm_start(problem, end.inner.design.kappa)
         return StructuredOuter(with_scenarios(end.sampler.of(anchored), scenarios))
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
         end = cast(StructuredEnd, end)
-        sampler, best, made, worst = end.sampler, end.best, end.found.design, end.worst
+        sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
         multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
-        assert made.controller is not None
-        loops = loops_of(problem, best.theta, made.controller)
+        assert design.controller is not None
+        loops = loops_of(problem, best.theta, design.controller)
         known = is_expensive(problem) and problem.figure is BANDWIDTH
         beside = partial(objectives_beside, problem, best) if known else None
-        certificate = partial(theta_kkt, problem, best, sampler, end.found.envelope, beside)
+        certificate = partial(theta_kkt, problem, best, sampler, end.inner.envelope, beside)
         kkt = None if known else certificate()  # which spreads values over the workers itself
 
         def judged() -> tuple[SetCertificate, int, Proof, Yield | None]:
-            whole = checked_whole(problem, best.theta, made, worst, sampler.workers)
+            whole = checked_whole(problem, best.theta, design, worst, sampler.workers)
             if whole[-1].conclusive:
                 return *whole, None
-            return *whole, fresh_yield(problem, best.theta, made, sampler.workers)
+            return *whole, fresh_yield(problem, best.theta, design, sampler.workers)
 
         with alongside(judged) as result, Progress(1, "what limits it", quiet=sampler.quiet) as bar:
             kkt = kkt or certificate()
-            make = partial(costs_of, problem, best.theta, made.kappa)
+            make = partial(costs_of, problem, best.theta, design.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
-            prices = tolerance_prices(problem, best.theta, made)
-            survival = survived(problem, loops, made.bandwidth)[0] if made.certified else None
+            prices = tolerance_prices(problem, best.theta, design)
+            survival = survived(problem, loops, design.bandwidth)[0] if design.certified else None
             damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
-                told = stated_time(problem, best.theta, made.controller, best.value)
+                told = stated_time(problem, best.theta, design.controller, best.value)
             wide, checked, proof, drawn = result()
             bar.advance()
         return VerifiedStructured(
@@ -291,10 +302,10 @@ class StructuredOuter(ThetaOuter):
             hardware_cost=hardware_cost(plant_of(problem), best.theta),
             kkt=kkt,
             inner_gap=float(max(_gap(problem, best, multistart), 0.0)),
-            feasible=made.certified and not violated(problem, best.theta),
+            feasible=design.certified and not violated(problem, best.theta),
             survival=survival,
             damping=damping,
-            design=made,
+            design=design,
             multistart=multistart,
             wide=wide,
             checked=checked,

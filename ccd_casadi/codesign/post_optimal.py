@@ -152,11 +152,11 @@ def _responses(
     kkt: KktCertificate,
     here: ActiveSet,
     hessian: Callable[[], Array | None],
-    own: Sequence[_Parameter],
+    parameters: Sequence[_Parameter],
     slope_b: Array,
 ) -> PostOptimal:
     """Responses at x within `bounds`, which begins with θ; ∇²L by `hessian` where directions are
-    left (None: not known), ω_b with `slope_b` (n,); `own`: w2 and the bounds on the loop."""
+    left (None: not known), ω_b with `slope_b` (n,); `parameters`: w2 and the bounds on the loop."""
     n, count, width = x.size, len(problem.names), bounds[1] - bounds[0]
     strong = _strong(kkt)
     held = [here.labels.index(name) for name in strong]
@@ -171,7 +171,7 @@ def _responses(
     to_theta = hardware_slopes(plant_of(problem), x[:count])[0]
     slope_f = np.pad(to_theta, (0, n - count)) * width  # ω_S and ω_T cost nothing
     responses = []
-    for parameter in _parameters(problem, x, bounds, slope_f, own):
+    for parameter in _parameters(problem, x, bounds, slope_f, parameters):
         dz = np.full(n, np.nan)
         if determined:
             level = [_level(parameter, name) for name in strong]
@@ -204,12 +204,12 @@ def _parameters(
     x: Array,
     bounds: tuple[Array, Array],
     slope_f: Array,
-    own: Sequence[_Parameter],
+    parameters: Sequence[_Parameter],
 ) -> Iterator[_Parameter]:
-    """w1, `own` (w2 and the bounds on the loop), the level of each λ, and the bounds of x."""
+    """w1, `parameters` (w2, bounds on the loop), the level of each λ, and the bounds of x."""
     none, count, plant = np.zeros(x.size), len(problem.names), plant_of(problem)
     yield _Parameter("w1", problem.w1, slope_f, cost=hardware_cost(plant, x[:count]))
-    yield from own
+    yield from parameters
     for name in plant.constraint_names:
         yield _Parameter(f"{name} <= 0", 0.0, none, {name: -1.0})
     names = (*problem.names, "omega_S", "omega_T")[: x.size]

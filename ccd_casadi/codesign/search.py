@@ -60,9 +60,9 @@ def search_outer(
         outer, known = more, end.x if goes_on else None
 
 
-def _looked(found: SearchResult, formulation: Formulation, seed: int) -> SearchResult:
+def _looked(search: SearchResult, formulation: Formulation, seed: int) -> SearchResult:
     """After the global check over the box, and a last try where the end is not stationary."""
-    outer, outcome, end = found.outer, found.outcome, found.end
+    outer, outcome, end = search.outer, search.outcome, search.end
     assert end is not None
     with outer.sampler.spent.on("box_look"):
         look = global_check(outer, end, formulation.box_points, seed)
@@ -79,7 +79,7 @@ def _looked(found: SearchResult, formulation: Formulation, seed: int) -> SearchR
         outcome = outer.with_training_sample(
             outcome, end
         )  # left out, it tells how they support the design
-    return replace(found, outcome=outcome, end=end, look=look)
+    return replace(search, outcome=outcome, end=end, look=look)
 
 
 def _missed(outcome: FormulationResult, end: End) -> float:
@@ -87,29 +87,29 @@ def _missed(outcome: FormulationResult, end: End) -> float:
     return abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
 
 
-def best_end(found: Sequence[End], level: float, tolerance: float) -> End:
+def best_end(ends: Sequence[End], level: float, tolerance: float) -> End:
     """The least J of those that are feasible; within the tolerance of it one that is stationary.
 
     A better design that is not stationary is kept: to call a worse one optimal would be untrue.
     """
-    least = min(item.objective for item in found)
+    least = min(item.objective for item in ends)
     if not np.isfinite(least):
-        return found[0]
-    near = [item for item in found if item.objective <= least + tolerance * abs(least)]
+        return ends[0]
+    near = [item for item in ends if item.objective <= least + tolerance * abs(least)]
     stationary = [item for item in near if item.kkt.stationarity <= level]
     return min(stationary or near, key=lambda item: item.objective)
 
 
-def conclude(found: SearchResult, terms: Terms) -> Solution:
+def conclude(search: SearchResult, terms: Terms) -> Solution:
     """The design judged, and result.json."""
-    outcome, sampler = found.outcome, found.outer.sampler
+    outcome, sampler = search.outcome, search.outer.sampler
     spent = sampler.spent
-    if found.end is None:
+    if search.end is None:
         return Solution(infeasible_dict(terms, outcome.message, spent.by_purpose), outcome, None)
     with spent.on("checks"):
-        verified = found.outer.verified(found.end, found.rounds)
+        verified = search.outer.verified(search.end, search.rounds)
     quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
-    result = result_dict(terms, outcome, verified, spent.by_purpose, quality, found.look)
+    result = result_dict(terms, outcome, verified, spent.by_purpose, quality, search.look)
     return Solution(result, outcome, verified, quality)
 
 

@@ -30,10 +30,10 @@ WORST = 1.0 + 1e-5  # figure over bound up to which the judge counts a bound as 
 
 
 def design_dict(
-    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
 ) -> dict[str, Any]:
     """A certified design's figures under the contract's keys, the worst of its plants."""
-    judged = made.certificate
+    judged = design.certificate
     assert judged is not None
     highest = max(judged.plants, key=lambda plant: plant.S_peak)
     sampling = problem.sampling
@@ -44,9 +44,9 @@ def design_dict(
     return {
         "omega_S_hz": None,
         "omega_T_hz": None,
-        "outcome": made.outcome.name.lower(),
-        "reason": "" if made.certified else made.words,
-        "bandwidth_hz": made.bandwidth / HZ,
+        "outcome": design.outcome.name.lower(),
+        "reason": "" if design.certified else design.words,
+        "bandwidth_hz": design.bandwidth / HZ,
         "gamma_opt": None,
         "gamma": None,
         "gamma_lower_bound": None,
@@ -60,7 +60,7 @@ def design_dict(
             problem.inner.omega_low / HZ,
         ),
         "KS_max": max(plant.KS for plant in judged.plants),
-        **_loop_entry(problem, theta, made, highest.S_peak),
+        **_loop_entry(problem, theta, design, highest.S_peak),
         **_channel_entry(bounds_of(problem), judged),
         "certificate": {
             "stable": all(plant.stable for plant in judged.plants),
@@ -71,35 +71,35 @@ def design_dict(
             "plants": len(judged.plants),
             "figures_over_bounds": ratios,
         },
-        "controller": sections_dict(made.structure, made.kappa)
+        "controller": sections_dict(design.structure, design.kappa)
         | {
-            "kappa": made.kappa.tolist(),
+            "kappa": design.kappa.tolist(),
             "local_optima": [
                 {"bandwidth_hz": item.bandwidth / HZ, "searches": item.count}
-                for item in made.local_optima
+                for item in design.local_optima
             ],
-            "multipliers": made.multipliers,
-            "at_range": [f"{name} {end}" for name, end, _ in made.at_box],
-            "kkt_residual": made.kkt_residual,
+            "multipliers": design.multipliers,
+            "at_range": [f"{name} {end}" for name, end, _ in design.at_box],
+            "kkt_residual": design.kkt_residual,
         },
     }
 
 
 def _loop_entry(
-    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign, peak: float
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, peak: float
 ) -> dict[str, Any]:
     """Margins and steps on the plants of the set; nothing of an unstable loop."""
-    assert made.certificate is not None
-    assert made.controller is not None
-    if not all(plant.stable for plant in made.certificate.plants):
+    assert design.certificate is not None
+    assert design.controller is not None
+    if not all(plant.stable for plant in design.certificate.plants):
         return {}
     plants = [plant.plant_si() for plant in plants_of(problem, theta)]
-    return loop_entry(plants, made.controller, problem.sampling, made.bandwidth, peak)
+    return loop_entry(plants, design.controller, problem.sampling, design.bandwidth, peak)
 
 
-def active_of(made: SectionsDesign) -> list[str]:
+def active_of(design: SectionsDesign) -> list[str]:
     """What binds the controller."""
-    return bound_words(name for name, mu in made.multipliers.items() if mu > 1e-6)
+    return bound_words(name for name, mu in design.multipliers.items() if mu > 1e-6)
 
 
 def bound_words(names: Iterable[str]) -> list[str]:
@@ -170,11 +170,11 @@ def proof_dict(proof: Proof) -> dict[str, Any]:
 
 
 def sections_controller(
-    made: SectionsDesign | MeasuredDesign, sampling: Sampling | None
+    design: SectionsDesign | MeasuredDesign, sampling: Sampling | None
 ) -> dict[str, Any]:
     """controller.json: the state space in SI, the sections, and how they run."""
-    assert made.controller is not None
-    words = sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()}
+    assert design.controller is not None
+    words = sections_dict(design.structure, design.kappa) | {"kappa": design.kappa.tolist()}
     if sampling is not None:
         words["loop"] = vars(sampling) | {"method": "tustin"}
-    return controller_dict(made.controller) | {"sections": words}
+    return controller_dict(design.controller) | {"sections": words}

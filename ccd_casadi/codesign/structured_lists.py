@@ -86,16 +86,14 @@ class ListedStructured:
             return _nothing("no theta within the constraints was found")
         return _climbed(sampler.of(carried(known, problem, self.scenarios)), theta)
 
-    def judge(self, sampler: Sampler, found: Solution) -> Solution:
+    def judge(self, sampler: Sampler, solution: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
-        near = _start(found)
-        begun = replace(sampler.problem, start=near.start)
-        solution = self.solve(
-            sampler.of(carried(near, begun, self.scenarios)), np.array(near.start)
-        )
-        if solution.verified is not None:
-            self.scenarios = structured_of(solution.verified.problem).scenarios
-        return solution
+        near = _start(solution)
+        begun = carried(near, replace(sampler.problem, start=near.start), self.scenarios)
+        whole = self.solve(sampler.of(begun), np.array(near.start))
+        if whole.verified is not None:
+            self.scenarios = structured_of(whole.verified.problem).scenarios
+        return whole
 
 
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
@@ -132,20 +130,21 @@ def carried(
     return with_structured(problem, **moved)
 
 
-def _start(found: Solution) -> CoDesignProblem:
+def _start(solution: Solution) -> CoDesignProblem:
     """The problem of a solution with its θ as the start and its controller as the warm start."""
-    if found.verified is None:
-        assert found.problem is not None
-        return found.problem
-    made = cast(VerifiedStructured, found.verified)
-    return _at(made.problem, made.theta, tuple(map(float, made.design.kappa)))
+    if solution.verified is None:
+        assert solution.problem is not None
+        return solution.problem
+    verified = cast(VerifiedStructured, solution.verified)
+    return _at(verified.problem, verified.theta, tuple(map(float, verified.design.kappa)))
 
 
 def _at(
     problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
 ) -> CoDesignProblem:
-    own = replace(structured_of(problem), warm_starts=(kappa,), error_warm_starts=())
-    return replace(problem, controller=own.with_warm_start(kappa, 1), start=theta)
+    alone = with_structured(problem, warm_starts=(kappa,), error_warm_starts=())
+    own = structured_of(alone).with_warm_start(kappa, 1)
+    return replace(alone, controller=own, start=theta)
 
 
 def _nothing(words: str) -> Solution:

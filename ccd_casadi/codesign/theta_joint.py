@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.decoupling import in_units_of
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
 from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
@@ -84,11 +84,17 @@ class Proposal:
 
 
 def joint_search(
-    sampler: Sampler, theta: Array, tell: Callable[[str], None] | None = None
+    sampler: Sampler,
+    theta: Array,
+    tell: Callable[[str], None] | None = None,
+    ends: Sequence[tuple[Array, float]] | None = None,
 ) -> tuple[Sampler, InnerSample, bool]:
     """From θ towards where the joint search promises no more on the worst plants: the sampler of
     the problem that has these and the controller there as its warm start, its true sample, and
-    whether no more is promised."""
+    whether no more is promised.
+
+    With `ends` of other searches (θ, J) it ends near one that it does not improve on, and leaves
+    the last digits to a polish."""
     problem, first = sampler.problem, sampler.values(theta, "polishing")[0]
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
@@ -99,6 +105,8 @@ def joint_search(
         within = LOOSE if turn else WITHIN
         asked, best, J = on_worse_plants(asked, models, best, turn, within, tell)
         problem = asked.problem
+        if _arrived(problem, best, J, ends or ()):
+            return sampler, first, False
         if not np.isfinite(J):
             break
         found = asked.cached(
@@ -106,8 +114,11 @@ def joint_search(
             partial(proposed, problem, models, best, reach),
         )  # fmt: skip
         if tell is not None:
-            tell(f"J {J:.6g}, a step promises {found.gain:.2g} less")
+            tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
+            settled = ends is not None
+            if settled:
+                break
             asked, best, _ = on_worse_plants(asked, models, best, TURNS + turn, WITHIN, tell)
             best, near, problem = *finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
@@ -131,13 +142,24 @@ def joint_search(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = best if settled else finished(asked, models, best)[0]
+    best = best if settled or ends is not None else finished(asked, models, best)[0]
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
     if asked is not sampler or objective_of(problem, last) < objective_of(problem, first):
         return asked, last, settled
     return sampler, first, True
+
+
+def _arrived(
+    problem: CoDesignProblem, best: JointPoint, J: float, ends: Sequence[tuple[Array, float]]
+) -> bool:
+    """Whether a place is that of a known end, and not better."""
+    width = np.subtract(problem.upper, problem.lower)
+    return any(
+        np.abs((best.theta - theta) / width).max() < CLOSE and end - SETTLED * abs(end) < J
+        for theta, end in ends
+    )
 
 
 def on_worse_plants(
@@ -259,7 +281,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self.merits: list[float] = []  # before every trial
         # A step that fails is followed by one from the same place.
         self.loops_beside = lru_cache(1)(self._loops_beside)
-        self.all_rows = lru_cache(2)(self._all_rows)
+        self.all_rows = lru_cache(2)(
+            lambda here: all_rows(here.data[0], *self.parts(here.x)[1:], here.data[1])
+        )
         self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
         kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
         self.start = np.concatenate([middle, kappa, [self.tau]])
@@ -347,10 +371,6 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         gained = self.merits[0] - self.merits[-1]
         late = self.merits[-LAST:][0] - self.merits[-1]
         return len(self.merits) > LAST and late < FADED * max(gained, self.enough)
-
-    def _all_rows(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> Constraints:
-        _, kappa, tau = self.parts(here.x)
-        return all_rows(here.data[0], kappa, tau, here.data[1])
 
     def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""

@@ -224,9 +224,9 @@ def _peak(G: StateSpace, K: StateSpace | None) -> tuple[float, float]:
     return norm, float(2.0 / G.period * np.arctan(0.5 * v * G.period))
 
 
-def _finer(found: MeasuredResponse, G: StateSpace, omega: list[float]) -> MeasuredResponse:
+def _finer(response: MeasuredResponse, G: StateSpace, omega: list[float]) -> MeasuredResponse:
     """With lines where |S| was too large between two, and nearby."""
     more = (np.array(omega)[:, None] * NEARBY).ravel() / HZ
-    hz = np.unique(np.append(found.hz, more[(more > found.hz[0]) & (more < found.hz[-1])]))
+    hz = np.unique(np.append(response.hz, more[(more > response.hz[0]) & (more < response.hz[-1])]))
     hz = hz[np.append(True, np.diff(hz) > APART * hz[1:])]
-    return replace(found, hz=hz, G=G.response(HZ * hz).reshape(len(hz), *found.G.shape[1:]))
+    return replace(response, hz=hz, G=G.response(HZ * hz).reshape(len(hz), *response.G.shape[1:]))

@@ -93,7 +93,7 @@ def optimal(
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
         return VerdictLine(State.FAILED, words, figures)
     if kink is None:
-        words = f"KKT residual {residual:.1e} over theta; {known}"
+        words = f"locally optimal, KKT residual {residual:.1e} over theta; {known}"
         if kkt.second_order is not None and kkt.second_order < saddle:
             figures["least_curvature"] = kkt.second_order
             words = f"a stationary point that curves downwards ({kkt.second_order:.2g}): {words}"
@@ -104,8 +104,8 @@ def optimal(
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
         return VerdictLine(State.FAILED, f"{words}; {known}", figures)
     words = (
-        f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
-        f"controller together ({kink.one_gradient:.2g} by the gradient of one side); "
+        f"locally optimal to first order at a kink of J: KKT residual {residual:.1e} over theta "
+        f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
         f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
@@ -136,12 +136,11 @@ def search_evidence(
 ) -> tuple[str, dict[str, Any]]:
     """What IPOPT's starts, the global check over the box and bounds say, in words and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
-    known = f"best of {counted(starts, 'start')}" if starts else ""
+    known = f"best of {counted(starts, 'start')}" if starts else "from one start"
     if optima > 1:
         known += f", {optima} distinct optima"
     if look is None or not look.points:
-        words = (known, "no global check over the box", gap)
-        return ", ".join(part for part in words if part), figures
+        return f"{known}, no global check over the box, {gap}", figures
     figures |= {
         "box_points": look.points,
         "box_feasible": look.feasible,
@@ -154,7 +153,7 @@ def search_evidence(
     said = f"none better at {how}"
     if look.moved:
         said = f"moved by the global check at {how}: the formulation ended at J = {look.before:.6g}"
-    return ", ".join(part for part in (known, said, gap) if part), figures
+    return f"{known}, {said}, {gap}", figures
 
 
 def predicted(
@@ -207,7 +206,7 @@ def predicted(
 
 
 def survives(
-    found: Survival | None,
+    survival: Survival | None,
     *,
     S_max: float,
     robust: bool | None = None,
@@ -221,24 +220,24 @@ def survives(
     `other_damping`: what that set does not keep, in words; `closer` models of the plant by name:
     stable, and the peak of S; `figures`: more of them.
     """
-    if found is None:
+    if survival is None:
         if robust is False:
             return VerdictLine(State.FAILED, robust_words, figures or {})
         return VerdictLine(State.UNKNOWN, "the loop could not be perturbed", figures or {})
     state, said = State.PASSED, []
-    low, high = found.stable_shift
+    low, high = survival.stable_shift
     said.append(f"stable for resonances {_range(low, high)}")
     if low > -LEAST_SHIFT or high < LEAST_SHIFT:
         state = State.WARNED
         said[-1] += f", less than +-{100 * LEAST_SHIFT:g} %"
-    said.append(f"within S_max {_range(*found.S_max_shift)}")
-    damping = found.stable_damping
+    said.append(f"within S_max {_range(*survival.S_max_shift)}")
+    damping = survival.stable_damping
     if damping[0] > LEAST_FACTORS[0] or damping[1] < LEAST_FACTORS[1]:
         state = State.WARNED
         said.append(f"unstable where damping is not between {damping[0]:.3g} and {damping[1]:.3g}")
-    if found.unstable_poles_hz:
+    if survival.unstable_poles_hz:
         state = State.WARNED
-        at = ", ".join(f"{hz:.4g}" for hz in found.unstable_poles_hz[:3])
+        at = ", ".join(f"{hz:.4g}" for hz in survival.unstable_poles_hz[:3])
         said.append(f"K itself is unstable (poles at {at} Hz)")
     for name, stable, peak in closer:
         if stable and peak > (1.0 + CLOSER_PEAK) * S_max:
@@ -250,7 +249,7 @@ def survives(
     said[:0] = [words for words in (robust_words, other_damping) if words]
     if robust is False:
         state = State.FAILED
-    rest = found.statics
+    rest = survival.statics
     if rest.differentiates:
         said.append(
             f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
@@ -258,16 +257,16 @@ def survives(
         )
     figures = {
         **(figures or {}),
-        "stable_shift": list(found.stable_shift),
-        "S_max_shift": list(found.S_max_shift),
+        "stable_shift": list(survival.stable_shift),
+        "S_max_shift": list(survival.S_max_shift),
         "shift_followed_to": REACH,
         "least_shift": LEAST_SHIFT,
-        "stable_damping": list(found.stable_damping),
+        "stable_damping": list(survival.stable_damping),
         "damping_followed_to": list(FACTORS),
-        "gain_margin": list(found.gain),
-        "phase_margin_deg": found.phase_deg,
-        "modulus_margin": found.modulus,
-        "unstable_controller_poles_hz": list(found.unstable_poles_hz),
+        "gain_margin": list(survival.gain),
+        "phase_margin_deg": survival.phase_deg,
+        "modulus_margin": survival.modulus,
+        "unstable_controller_poles_hz": list(survival.unstable_poles_hz),
         "static_stiffness": rest.stiffness,
         "static_compliance": rest.compliance,
         "static_share": rest.share,
@@ -277,11 +276,11 @@ def survives(
     return VerdictLine(state, "; ".join(said), figures)
 
 
-def deployable(found: Survival | None, sampling: Sampling | None = None) -> VerdictLine:
+def deployable(survival: Survival | None, sampling: Sampling | None = None) -> VerdictLine:
     """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
     figures: dict[str, float] = {}
-    if found is not None:
-        figures = {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
+    if survival is not None:
+        figures = {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}
     if sampling is not None:
         words = (
             f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "
@@ -289,11 +288,11 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Verd
         )
         figures |= {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
         return VerdictLine(State.PASSED, words, figures)
-    if found is None or not math.isfinite(found.delay):
+    if survival is None or not math.isfinite(survival.delay):
         return VerdictLine(State.UNKNOWN, "run deploy", figures)
-    rate = DELAY_PERIODS / found.delay
+    rate = DELAY_PERIODS / survival.delay
     words = (
-        f"run deploy; the loops' least delay margin is {with_unit(found.delay, 's')}, and below "
+        f"run deploy; the loops' least delay margin is {with_unit(survival.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     ).replace("µ", "u")
     return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})

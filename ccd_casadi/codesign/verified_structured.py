@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from ccd_casadi.analysis.yield_bound import Yield
@@ -24,8 +24,11 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, structured_value
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_plant_set import (
+    structured_of,
+    uncertain_plant,
+    with_structured,
+)
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
@@ -46,17 +49,14 @@ class Costs:
 
 def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> Costs:
     """The climbs from a certified design with parameters κ (SI)."""
-    structured = replace(structured_of(problem), minimise="bandwidth")
     model = tuple(map(float, uncertain_plant(problem, theta).nominal))
 
-    def climbed(easier: StructuredProblem) -> float:
-        value = structured_value(with_warm_start(replace(problem, controller=easier), kappa), theta)
+    def climbed(**easier: object) -> float:
+        eased = with_structured(problem, minimise="bandwidth", **easier)
+        value = structured_value(with_warm_start(eased, kappa), theta)
         return value.bandwidth if value.feasible else float("nan")
 
-    return Costs(
-        climbed(replace(structured, scenarios=((0, model),))),
-        climbed(replace(structured, sampling=None)),
-    )
+    return Costs(climbed(scenarios=((0, model),)), climbed(sampling=None))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,7 +44,7 @@ class Standing(StrEnum):
 
     KEPT = "certified, keeps its bounds"
     MISSED = "certified, misses a bound"
-    NEAR = "not certified yet: the plant is not the model's own"
+    NEAR = "not certified yet: the plant is approximated"
     REFUSED = "not certified"
 
 
@@ -57,7 +57,7 @@ class Elements:
 
     system: Mechanics
     error: float = 0.0
-    words: str = "the model's own"
+    words: str = "exact"
 
     @property
     def exact(self) -> bool:

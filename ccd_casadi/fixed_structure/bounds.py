@@ -137,7 +137,7 @@ class Bounds:
                 raise ValueError(f"{words}; give more than 0, at most that of the weights")
 
     def of_channel(self, number: int) -> "Bounds":
-        """What a channel keeps that nothing couples to the others, its own bandwidth for ω_b."""
+        """The bounds of a channel that is not coupled to the others, ω_b being its bandwidth."""
         if not self.channels:
             return self
         own = self.channels[number]
@@ -166,20 +166,20 @@ class Bounds:
             channels=tuple(replace(own, S_max=times(own.S_max)) for own in self.channels),
         )
 
-    def shares(self, found: LoopPeaks) -> dict[str, float]:
+    def shares(self, peaks: LoopPeaks) -> dict[str, float]:
         """Every bound's figure over the bound; above 1 where it is not met."""
-        shares = {"S_max": found.S_peak / self.S_max, "S_low": found.S_low / self.S_low}
+        shares = {"S_max": peaks.S_peak / self.S_max, "S_low": peaks.S_low / self.S_low}
         if self.weighted_level is not None:
-            shares["KS"] = found.weighted_KS / self.weighted_level
-            shares["T"] = found.weighted_T / self.weighted_level
+            shares["KS"] = peaks.weighted_KS / self.weighted_level
+            shares["T"] = peaks.weighted_T / self.weighted_level
         if self.compliance_max is not None:
-            shares["GS"] = found.GS / self.compliance_max
+            shares["GS"] = peaks.GS / self.compliance_max
         return shares
 
-    def channel_shares(self, found: Sequence[ChannelPeaks]) -> dict[str, float]:
-        """The same of the channels' own bounds; `found` as `channels` are."""
+    def channel_shares(self, peaks: Sequence[ChannelPeaks]) -> dict[str, float]:
+        """The same for the bounds of the channels; `peaks` in the order of `channels`."""
         shares = {}
-        for own, figures in zip(self.channels, found, strict=True):
+        for own, figures in zip(self.channels, peaks, strict=True):
             if own.S_max is not None:
                 shares[f"S_max of {own.name}"] = figures.S_peak / own.S_max
             if own.M_K is not None and self.weighted_level is not None:

@@ -91,7 +91,7 @@ def certify(
     plants, controller : sequence of ScaledPlant, StateSpace
         All of the set; e in, u out.
     bounds, integrator : Bounds, bool
-        Of channels with bounds of their own those besides. The shape counts from 0 on, or ω_low.
+        With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
         None: a continuous loop; the plants are spread over them.
 
@@ -220,7 +220,7 @@ def judged(
 
 
 def _rows(
-    own: ChannelBounds,
+    bounds: ChannelBounds,
     loops: Sequence[StateSpace],
     table: LoopTable,
     grid: Array,
@@ -229,17 +229,17 @@ def _rows(
     integrator: bool,
 ) -> tuple[list[ChannelFigures], np.ndarray]:
     """The figures of one channel's row on every plant, and whether its peak is confirmed."""
-    if not own.given:
-        return [ChannelFigures(own.name)] * len(grid), np.ones(len(grid), bool)
-    curve, u = f"S of {own.name}", np.array([own.output])
+    if not bounds.given:
+        return [ChannelFigures(bounds.name)] * len(grid), np.ones(len(grid), bool)
+    curve, u = f"S of {bounds.name}", np.array([bounds.output])
     rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
     norm, confirmed = norms(rows, table.period, *tops[curve])
-    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, own.output)
+    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, bounds.output)
     missing = np.full(len(grid), np.nan)
-    weighted = tops.get(f"weighted KS of {own.name}", (missing, missing))[0]
+    weighted = tops.get(f"weighted KS of {bounds.name}", (missing, missing))[0]
     columns = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1).tolist()
     names = ("S_peak", "S_peak_frequency", "bandwidth", "weighted_KS")
-    found = [ChannelFigures(own.name, **dict(zip(names, row, strict=True))) for row in columns]
+    found = [ChannelFigures(bounds.name, **dict(zip(names, row, strict=True))) for row in columns]
     return found, confirmed
 
 

@@ -10,19 +10,19 @@ sensors (fewer outputs than channels) it starts from random controllers that are
 
 from collections.abc import Sequence
 from dataclasses import replace
+from time import perf_counter
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike, composite_problem
+from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
-from ccd_casadi.fixed_structure.design import synthesise_sections
+from ccd_casadi.fixed_structure.design import of_one_channel, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.race import LocalOptimum, run_race, started
 from ccd_casadi.fixed_structure.sections_design import (
-    MARGIN,
     DesignSearch,
     Progress,
     SectionsDesign,
@@ -54,86 +54,44 @@ def synthesise(
     progress: Progress | None = None,
     workers: Pool | None = None,
 ) -> SectionsDesign:
-    """max ω_b over κ on a set of plants, of one channel or of several; see `synthesise_sections`.
+    """max ω_b over the parameters of a structure, with every bound on every plant.
 
-    With several `initial` are stacked parameters κ in SI.
+    `initial`: parameters κ in SI, of several channels stacked, that start beside `starts` others by
+    rules and at random, or alone with `only_initial`. `frequencies` as in `problem_for`: give them
+    where designs at several θ are compared. The searches are spread over `workers`; their number
+    changes nothing else. Raises PlantError for plants that cannot be in a set.
     """
-    if isinstance(structure, Structure):
-        return synthesise_sections(
-            plants, structure, bounds, sampling=sampling, starts=starts, seed=seed,
-            initial=initial, only_initial=only_initial, frequencies=frequencies, progress=progress,
-            workers=workers,
-        )  # fmt: skip
-    problem = composite_problem(plants, structure, bounds, sampling, frequencies, MARGIN)
-    search = DesignSearch(problem, plants, sampling, seed, progress)
-    alike = [in_units_of(plant, plants[0]) for plant in plants]
-    span = span_of(problem)
+    problem = problem_for(plants, structure, bounds, sampling, frequencies)
+    search = DesignSearch(problem, plants, sampling, starts, seed, initial, only_initial, progress,
+                          workers)  # fmt: skip
+    if isinstance(problem, CompositeProblem):
+        return _of_several(search, problem)
+    return of_one_channel(search)
 
-    def channels(
-        share: float | None = None, before: Sequence[SectionsDesign] = ()
-    ) -> list[SectionsDesign]:
-        """A design for each channel, on its entry of every plant; one for all that are alike.
 
-        One for those that share their parameters too, on the entries of all of them. With a share
-        of the room that its S_max leaves above 1. Climbs from `before`, the same with wider limits,
-        if it is given.
-        """
-        found: list[SectionsDesign] = []
-        own_plants: list[list[ScaledPlant]] = []
-        own_limits = [bounds.of_channel(i) for i in range(len(structure.structures))]
-        if share is not None:
-            own_limits = [replace(one, S_max=1.0 + share * (one.S_max - 1.0)) for one in own_limits]
-        for i, own in enumerate(structure.structures):
-            members = [channel_plant(plant, structure.decoupling, i) for plant in alike]
-            if structure.owner(i) != i:
-                own_plants.append(members)
-                found.append(found[structure.owner(i)])
-                continue
-            for j in range(i + 1, len(structure.structures)):
-                if structure.owner(j) == i:
-                    others = [channel_plant(plant, structure.decoupling, j) for plant in alike]
-                    members += [other for other, one in zip(others, members, strict=False)
-                                if not answer_alike([one], [other])]  # fmt: skip
-            begins = [np.asarray(kappa, float)[structure.slices[i]] for kappa in initial]
-            again = bool(before) and bool(np.isfinite(before[i].kappa).all())
-            if again:
-                begins = [before[i].kappa]
-            own_plants.append(members)
-            same = [j for j in range(i)
-                    if structure.structures[j] == own and own_limits[j] == own_limits[i]
-                    and answer_alike(members, own_plants[j])]  # fmt: skip
-            if same and (not begins or again):
-                found.append(found[same[0]])
-                continue
-            name = structure.decoupling.names[i]
-            found.append(
-                synthesise_sections(
-                    members, own, own_limits[i], sampling=sampling, starts=starts, seed=seed,
-                    initial=begins, only_initial=only_initial or again, frequencies=span,
-                    workers=workers, progress=titled(search.tell, f"channel {name}"),
-                )
-            )  # fmt: skip
-        return found
-
+def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesign:
+    """Each channel on its own, and then, where they are coupled, the whole loop."""
+    structure, only_initial = problem.structure, search.only_initial
+    alike = [in_units_of(plant, search.plants[0]) for plant in search.plants]
     if problem.separable:
-        made = channels()
+        made = _of_channels(search, problem, alike)
         short = [(name, one) for name, one in zip(structure.decoupling.names, made, strict=True)
                  if not one.certified]  # fmt: skip
         if short:
             name, one = short[0]
             return search.failed(one.outcome, f"channel {name}: {one.words}")
         return _joined(search, problem, made)
-    field = _stable(problem, search.inside(initial))
-    evaluations, known = len(initial), len(field)
+    field = _stable(problem, search.inside(search.initial))
+    evaluations, known = len(search.initial), len(field)
     shared = len(structure.decoupling.outputs) < len(structure.structures)
     if shared and not only_initial:
-        rng = np.random.default_rng(seed)
-        field += actuator_starts(problem, structure, alike, sampling, starts, rng)
+        rng = np.random.default_rng(search.seed)
+        field += actuator_starts(problem, structure, alike, search.sampling, search.starts, rng)
         evaluations += len(field)
     elif not field or not only_initial:
         before: list[SectionsDesign] = []
         for share in TIGHTENED:
-            before = channels(share, before)
+            before = _of_channels(search, problem, alike, share, before)
             stack = _stacked(structure, before)
             evaluations += 1
             fresh = _stable(problem, search.inside([stack])) if np.isfinite(stack).all() else []
@@ -143,28 +101,77 @@ def synthesise(
     if not field:
         return search.failed()
     tell = titled(search.tell, "whole loop")
-    runners = run_race(problem, np.array(field), tell, workers, known=known)
+    runners = run_race(problem, np.array(field), tell, search.workers, known=known)
     return search.concluded(runners, len(field), evaluations)
 
 
+def _of_channels(
+    search: DesignSearch,
+    problem: CompositeProblem,
+    alike: Sequence[ScaledPlant],
+    share: float | None = None,
+    before: Sequence[SectionsDesign] = (),
+) -> list[SectionsDesign]:
+    """A design for each channel, on its entry of every plant; one for all that are alike.
+
+    One for those that share their parameters too, on the entries of all of them. With a share of
+    the room that its S_max leaves above 1. Climbs from `before`, the same with wider limits, if it
+    is given. `alike`: the plants in the units of the first.
+    """
+    structure, found = problem.structure, list[SectionsDesign]()
+    own_plants: list[list[ScaledPlant]] = []
+    own_limits = [problem.bounds.of_channel(i) for i in range(len(structure.structures))]
+    if share is not None:
+        own_limits = [replace(one, S_max=1.0 + share * (one.S_max - 1.0)) for one in own_limits]
+    for i, own in enumerate(structure.structures):
+        members = [channel_plant(plant, structure.decoupling, i) for plant in alike]
+        if structure.owner(i) != i:
+            own_plants.append(members)
+            found.append(found[structure.owner(i)])
+            continue
+        for j in range(i + 1, len(structure.structures)):
+            if structure.owner(j) == i:
+                others = [channel_plant(plant, structure.decoupling, j) for plant in alike]
+                members += [other for other, one in zip(others, members, strict=False)
+                            if not answer_alike([one], [other])]  # fmt: skip
+        begins = [np.asarray(kappa, float)[structure.slices[i]] for kappa in search.initial]
+        again = bool(before) and bool(np.isfinite(before[i].kappa).all())
+        if again:
+            begins = [before[i].kappa]
+        own_plants.append(members)
+        same = [j for j in range(i)
+                if structure.structures[j] == own and own_limits[j] == own_limits[i]
+                and answer_alike(members, own_plants[j])]  # fmt: skip
+        if same and (not begins or again):
+            found.append(found[same[0]])
+            continue
+        alone = problem_for(members, own, own_limits[i], search.sampling, span_of(problem))
+        title = f"channel {structure.decoupling.names[i]}"
+        found.append(of_one_channel(replace(
+            search, problem=alone, plants=members, initial=begins, began=perf_counter(),
+            only_initial=search.only_initial or again, progress=titled(search.tell, title),
+        )))  # fmt: skip
+    return found
+
+
 def _joined(
-    search: DesignSearch, problem: CompositeProblem, made: Sequence[SectionsDesign]
+    search: DesignSearch, problem: CompositeProblem, designs: Sequence[SectionsDesign]
 ) -> SectionsDesign:
     """The channels' designs as one, with the bandwidth of the slowest."""
-    kappa = _stacked(problem.structure, made)
+    kappa = _stacked(problem.structure, designs)
     inside = in_problem_units(problem, kappa)
-    leads = (problem.bounds.lead(i) for i in range(len(made)))
-    slowest = min(one.bandwidth / np.exp(lead) for one, lead in zip(made, leads, strict=True))
+    leads = (problem.bounds.lead(i) for i in range(len(designs)))
+    slowest = min(one.bandwidth / np.exp(lead) for one, lead in zip(designs, leads, strict=True))
     tau = float(np.log(slowest / problem.plants.omega_0))
     point = Point(inside, tau, assess(problem, inside, tau))
     optima = (LocalOptimum(slowest, 1, tuple(map(float, kappa))),)
-    starts = sum(one.starts for one in made)
-    return search.designed(point, optima, starts, sum(one.evaluations for one in made))
+    starts = sum(one.starts for one in designs)
+    return search.designed(point, optima, starts, sum(one.evaluations for one in designs))
 
 
-def _stacked(structure: ChannelStructure, made: Sequence[SectionsDesign]) -> Array:
+def _stacked(structure: ChannelStructure, designs: Sequence[SectionsDesign]) -> Array:
     """The channels' parameters in SI as one κ."""
-    return np.concatenate([made[i].kappa for i in structure.free])
+    return np.concatenate([designs[i].kappa for i in structure.free])
 
 
 def _stable(problem: CompositeProblem, pool: Sequence[Array]) -> list[Array]:

@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Places,
     Problem,
 )
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -85,12 +86,12 @@ class CompositeProblem(LoopProblem):
             found.append((part, at, inside))
         return found
 
-    def kinds_of(self, found: Constraints) -> list[str]:
+    def kinds_of(self, constraints: Constraints) -> list[str]:
         """As `LoopProblem` has them, of channels with bounds of their own by channel."""
-        names = super().kinds_of(found)
+        names = super().kinds_of(constraints)
         if not self.bounds.channels:
             return names
-        for part, at, inside in self.split(found):
+        for part, at, inside in self.split(constraints):
             for j, row in zip(at.tolist(), inside.plant.tolist(), strict=True):
                 channel = part.channel
                 if channel is None:
@@ -103,10 +104,10 @@ class CompositeProblem(LoopProblem):
                     names[j] += f" of {own.name}"
         return names
 
-    def plants_of(self, found: Constraints) -> np.ndarray:
+    def plants_of(self, constraints: Constraints) -> np.ndarray:
         """Of all."""
-        out = np.zeros(len(found.v), int)
-        for part, at, own in self.split(found):
+        out = np.zeros(len(constraints.v), int)
+        for part, at, own in self.split(constraints):
             out[at] = part.members[part.problem.plants_of(own)]
         return out
 
@@ -127,15 +128,8 @@ def composite_problem(
     alike = [in_units_of(plant, first) for plant in plants]
     apart = np.array([is_decoupled(plant, structure.decoupling) for plant in alike])
     together = np.flatnonzero(~apart)
-    if frequencies is None:
-        fastest = 30.0 * max(1.0, *(float(np.abs(np.linalg.eigvals(p.A)).max()) for p in alike))
-        if sampling is not None:
-            fastest = min(fastest, 2.0 / (sampling.period * first.omega_0))
-        span = (min(1e-3, 0.01 * fastest), fastest)
-    else:
-        span = (frequencies[0] / first.omega_0, frequencies[1] / first.omega_0)
-    box = structure.bounds(span, (1e-6, 1e6))
-    parts = []
+    poles = np.concatenate([np.linalg.eigvals(plant.A) for plant in alike])
+    box, parts = box_of(structure, poles, first.omega_0, sampling, frequencies), []
     if apart.any():
         members = np.flatnonzero(apart)
         singles: list[list[ScaledPlant]] = []
@@ -155,6 +149,23 @@ def composite_problem(
         parts.append(Part(whole, place, together))
     plant_units = parts[0].problem.plants
     return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
+
+
+def box_of(
+    structure: Structure | ChannelStructure,
+    poles: np.ndarray,
+    omega_0: float,
+    sampling: Sampling | None,
+    frequencies: tuple[float, float] | None,
+) -> Array:
+    """Bounds (2, n) of κ in units of ω₀, as `problem_for` has them; `poles` of all plants there."""
+    fastest = 30.0 * max(1.0, float(np.abs(poles).max()))
+    if sampling is not None:
+        fastest = min(fastest, 2.0 / (sampling.period * omega_0))
+    span = (min(1e-3, 0.01 * fastest), fastest)
+    if frequencies is not None:
+        span = (frequencies[0] / omega_0, frequencies[1] / omega_0)
+    return structure.bounds(span, (1e-6, 1e6))
 
 
 @assess.register
@@ -206,10 +217,10 @@ def _(
 
 
 @to_theta.register
-def _(problem: CompositeProblem, kappa: Array, found: Constraints) -> Array:
+def _(problem: CompositeProblem, kappa: Array, constraints: Constraints) -> Array:
     count = problem.plants.plants[0].dA.shape[0]
-    out = np.zeros((len(found.v), count))
-    for part, at, own in problem.split(found):
+    out = np.zeros((len(constraints.v), count))
+    for part, at, own in problem.split(constraints):
         out[at] = to_theta(part.problem, kappa[part.place], own)
     return out
 

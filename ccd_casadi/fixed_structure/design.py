@@ -11,7 +11,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.composite import box_of, composite_problem
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop import plant_set
@@ -21,7 +21,6 @@ from ccd_casadi.fixed_structure.race import SAME, distinct, run_race
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
     DesignSearch,
-    Progress,
     SectionsDesign,
     in_problem_units,
 )
@@ -30,7 +29,6 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
 
 LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
@@ -54,48 +52,24 @@ def problem_for(
     if isinstance(structure, ChannelStructure):
         return composite_problem(plants, structure, bounds, sampling, frequencies, MARGIN)
     family = plant_set(plants, sampling)
-    fastest = 30.0 * max(1.0, float(np.abs(family.poles).max()))
-    if family.period is not None:
-        fastest = min(fastest, 2.0 / family.period)
-    slowest = min(1e-3, 0.01 * fastest)
-    if frequencies is not None:
-        slowest, fastest = (frequency / family.omega_0 for frequency in frequencies)
-    return Problem(family, structure, bounds, structure.bounds((slowest, fastest), (1e-6, 1e6)),
-                   MARGIN)  # fmt: skip
+    box = box_of(structure, family.poles, family.omega_0, sampling, frequencies)
+    return Problem(family, structure, bounds, box, MARGIN)
 
 
-def synthesise_sections(
-    plants: Sequence[ScaledPlant],
-    structure: Structure,
-    bounds: Bounds,
-    *,
-    sampling: Sampling | None = None,
-    starts: int = 12,
-    seed: int = 0,
-    initial: Sequence[Array] = (),
-    only_initial: bool = False,
-    frequencies: tuple[float, float] | None = None,
-    progress: Progress | None = None,
-    workers: Pool | None = None,
-) -> SectionsDesign:
-    """max ω_b over the parameters of a structure, with every bound on every SISO plant.
-
-    `initial`: parameters κ in SI that start beside `starts` others by rules and at random, or alone
-    with `only_initial`. `frequencies` as in `problem_for`: give them where designs at several θ are
-    compared. The searches are spread over `workers`; their number changes nothing else. Raises
-    PlantError for plants that cannot be in a set.
-    """
-    problem = cast(Problem, problem_for(plants, structure, bounds, sampling, frequencies))
-    search = DesignSearch(problem, plants, sampling, seed, progress)
-    rng = np.random.default_rng(seed)
-    pool = stabilising(problem, np.reshape(search.inside(initial), (-1, len(structure.names))))
+def of_one_channel(search: DesignSearch) -> SectionsDesign:
+    """The best of searches from its initial controllers and, unless these are all, from others by
+    rules and at random, then from the best ends with one section of each drawn anew."""
+    problem, starts, workers = cast(Problem, search.problem), search.starts, search.workers
+    rng, names = np.random.default_rng(search.seed), problem.structure.names
+    pool = stabilising(problem, np.reshape(search.inside(search.initial), (-1, len(names))))
     known = len(pool)
-    if not only_initial:
+    if not search.only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     if not len(pool):
         return search.failed()
-    runners = run_race(problem, pool, search.tell, workers, known=known, last=only_initial)
-    for _ in range(0 if only_initial else REDRAWS):
+    last = search.only_initial
+    runners = run_race(problem, pool, search.tell, workers, known=known, last=last)
+    for _ in range(0 if last else REDRAWS):
         best = runners[0].merit
         count = max(starts // 2, 1)
         fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)

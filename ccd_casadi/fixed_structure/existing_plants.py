@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import design
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.sections_design import Progress, SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
@@ -89,7 +89,7 @@ def synthesise_sections(
             scale = _scale(system, bounds) if scale is None else scale
             system = plant_from_control(system, scale)
         scaled.append(system)
-    return design.synthesise_sections(
+    return synthesise(
         scaled, structure, bounds, sampling=sampling, starts=starts, seed=seed, initial=initial,
         progress=progress,
     )  # fmt: skip

@@ -110,16 +110,16 @@ def evaluate_rows(
 
 
 @singledispatch
-def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
+def to_theta(problem: LoopProblem, kappa: Array, constraints: Constraints) -> Array:
     """∂c/∂θ (M, n_θ) at fixed κ and τ."""
-    plants, v = problem.plants, found.v
+    plants, v = problem.plants, constraints.v
     out = np.zeros((len(v), plants.plants[0].dA.shape[0]))
-    *_, x, y, right = evaluate_rows(problem, kappa, 0.0, found.curve, found.plant, v)
-    which = problem.plants_of(found)
+    *_, x, y, right = evaluate_rows(problem, kappa, 0.0, constraints.curve, constraints.plant, v)
+    which = problem.plants_of(constraints)
     for i in np.unique(which):
         own = np.flatnonzero(which == i)
         out[own] = plants.form_to_theta(int(i), v[own], x[own], y[own]).real
-        own = own[found.curve[own] == Curve.GS]
+        own = own[constraints.curve[own] == Curve.GS]
         if len(own):
             free = plants.form_to_theta(int(i), v[own], -x[own], right[own], free=True)
             out[own] += free.real

@@ -265,10 +265,11 @@ def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarr
 
 
 @hessians.register
-def _(problem: LineProblem, kappa: Array, tau: float, found: Constraints) -> Array:
+def _(problem: LineProblem, kappa: Array, tau: float, constraints: Constraints) -> Array:
     """At fixed lines."""
-    n, P = len(kappa), problem.plants.count
-    out = np.zeros((len(found.v), n + 1, n + 1))
+    n = len(kappa)
+    out = np.zeros((len(constraints.v), n + 1, n + 1))
+    number, i = np.divmod(constraints.plant, problem.plants.count)
     loop = problem.loop(kappa, tau)
-    out[:, :n, :n] = second(found.curve, found.plant // P, found.plant % P, found.v, loop)
+    out[:, :n, :n] = second(constraints.curve, number, i, constraints.v, loop)
     return out

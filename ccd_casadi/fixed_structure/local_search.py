@@ -67,7 +67,9 @@ class LoopModel(Model[Assessment]):
     ) -> None:
         self.problem, self.goal, self.reward = problem, goal, reward
         # A step that fails is followed by one from the same place.
-        self.all_rows = lru_cache(2)(self._all_rows)
+        self.all_rows = lru_cache(2)(
+            lambda here: all_rows(problem, here.x[:-1], float(here.x[-1]), here.data)
+        )
         # Where nothing bounds ω_b it stops at the end of the grid instead of running away.
         top = float(np.log(problem.plants.frequency(problem.base[-1])))
         self.low = np.append(problem.box[0], floor)
@@ -87,9 +89,6 @@ class LoopModel(Model[Assessment]):
             return None
         x, gradient = np.append(kappa, tau), np.append(slope, -self.reward)
         return Iterate(x, value - self.reward * tau, gradient, found.violation, found)
-
-    def _all_rows(self, here: Iterate[Assessment]) -> Constraints:
-        return all_rows(self.problem, here.x[:-1], float(here.x[-1]), here.data)
 
     def rows(self, here: Iterate[Assessment], radius: float) -> Rows:
         """Peaks with their curvature, and the grid near them without."""

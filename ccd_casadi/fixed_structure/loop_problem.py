@@ -175,13 +175,13 @@ class LoopProblem:
         found[1] = np.linalg.inv(into)[:count]
         return found
 
-    def plants_of(self, found: "Constraints") -> np.ndarray:
+    def plants_of(self, constraints: "Constraints") -> np.ndarray:
         """The number of the plant that each row is of: several rows of a plant are numbered on."""
-        return found.plant % self.plants.count
+        return constraints.plant % self.plants.count
 
-    def kinds_of(self, found: "Constraints") -> list[str]:
+    def kinds_of(self, constraints: "Constraints") -> list[str]:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
-        return [Curve(int(code)).name for code in found.curve]
+        return [Curve(int(code)).name for code in constraints.curve]
 
     def loop(self, kappa: Array, tau: float) -> Loop:
         """What the kernels take at κ and τ."""

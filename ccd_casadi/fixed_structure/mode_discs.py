@@ -53,7 +53,7 @@ def discs_of(
     return held, bare if free else held, damped
 
 
-def _fill(found: Discs, i: int, rows: list[int], first: Pair, second: Pair) -> None:
+def _fill(discs: Discs, i: int, rows: list[int], first: Pair, second: Pair) -> None:
     """Mode i's disc: of both poles as one form, since far above a resonance they nearly cancel, or
     a disc of each."""
     (D, N), (E, M) = first, second
@@ -61,10 +61,10 @@ def _fill(found: Discs, i: int, rows: list[int], first: Pair, second: Pair) -> N
     one, two = quotient(N, D), quotient(M, E)
     radius, apart = whole.reach + whole.rest, one[1] + two[1]
     near = ~(radius <= apart)
-    found.middle[i] = np.where(near, one[0] + two[0], whole.centre)
-    found.radius[i] = np.where(near, apart, radius) * (1.0 + 1e-12)
+    discs.middle[i] = np.where(near, one[0] + two[0], whole.centre)
+    discs.radius[i] = np.where(near, apart, radius) * (1.0 + 1e-12)
     moves = np.abs(one[0]) * one[2] + np.abs(two[0]) * two[2]
-    found.shares[i, rows] = np.where(near, moves, np.abs(whole.slope))
+    discs.shares[i, rows] = np.where(near, moves, np.abs(whole.slope))
 
 
 def quotient(N: Affine, D: Affine) -> tuple[np.ndarray, Array, Array]:

@@ -117,22 +117,22 @@ def optimality(
 
 
 def envelope_of(
-    problem: LoopProblem, kappa: Array, found: Optimality, direct: Array | None = None
+    problem: LoopProblem, kappa: Array, optimality: Optimality, direct: Array | None = None
 ) -> Envelope | None:
     """That of ln ω_b*(θ), or of a value made small whose slope at a fixed κ is `direct` (n_θ,).
 
     None where the conditions of optimality do not hold.
     """
-    if found.residual > RESIDUAL or found.violation > ACTIVE:
+    if optimality.residual > RESIDUAL or optimality.violation > ACTIVE:
         return None
-    near, count = found.near, len(found.kinds)
-    slopes = np.concatenate([to_theta(problem, kappa, part) for part in (found.active, near)])
+    near, count = optimality.near, len(optimality.kinds)
+    slopes = np.concatenate([to_theta(problem, kappa, part) for part in (optimality.active, near)])
     if direct is None:
         direct, slopes = np.zeros(slopes.shape[1]), -slopes
     at = np.full(len(near.v), count)  # behind those that bind, before the ends of the box
-    rows = np.insert(found.rows, at, np.column_stack([near.to_kappa, near.to_tau]), axis=0)
+    rows = np.insert(optimality.rows, at, np.column_stack([near.to_kappa, near.to_tau]), axis=0)
     return Envelope(
-        (*found.kinds, *problem.kinds_of(near)), direct, slopes, rows, found.goal,
-        np.insert(found.multipliers, at, 0.0),
-        np.insert(np.zeros(len(found.rows)), at, np.abs(near.value)),
+        (*optimality.kinds, *problem.kinds_of(near)), direct, slopes, rows, optimality.goal,
+        np.insert(optimality.multipliers, at, 0.0),
+        np.insert(np.zeros(len(optimality.rows)), at, np.abs(near.value)),
     )  # fmt: skip

@@ -117,14 +117,14 @@ def hidden_peaks(curves: np.ndarray, v: Array, value: Array) -> Brackets:
 
 
 def split(
-    found: Brackets, near: np.ndarray, inside: Array, level: Array, P: int, first: int
+    brackets: Brackets, near: np.ndarray, inside: Array, level: Array, P: int, first: int
 ) -> Brackets:
     """Brackets with those `near` narrowed by the levels (N, k, numbers) inside, (N, k) in v;
     several maxima in one come apart.
 
     A maximum of σ_k+1 where smooth ones cross has one of σ_k beside it, which the grid may miss.
     """
-    known = found.only(near)
+    known = brackets.only(near)
 
     def tops(row: np.ndarray) -> np.ndarray:
         own = level[np.arange(len(near)), :, row // P]
@@ -135,15 +135,15 @@ def split(
         return Brackets(known.curve[i], row[i], inside[i, m + 1], inside[i, m], inside[i, m + 2])
 
     own = tops(known.row)
-    kept = np.setdiff1d(np.arange(len(found.row)), near[own.any(axis=1)])
+    kept = np.setdiff1d(np.arange(len(brackets.row)), near[own.any(axis=1)])
     crossed = (known.row >= P) & (known.row < first * P)
     above = np.where(crossed, known.row - P, known.row)
     beside = tops(above) & crossed[:, None]
     # no maximum twice
-    same = (above[:, None] == found.row) & (known.curve[:, None] == found.curve)
+    same = (above[:, None] == brackets.row) & (known.curve[:, None] == brackets.curve)
     x = inside[:, 1:-1, None]
-    beside &= ~(same[:, None] & (found.low <= x) & (x <= found.high)).any(axis=2)
-    return found.only(kept).and_those(bracketed(known.row, own), bracketed(above, beside))
+    beside &= ~(same[:, None] & (brackets.low <= x) & (x <= brackets.high)).any(axis=2)
+    return brackets.only(kept).and_those(bracketed(known.row, own), bracketed(above, beside))
 
 
 def closed_on_peaks(loop: Loop, peaks: Brackets) -> tuple[Array, np.ndarray]:

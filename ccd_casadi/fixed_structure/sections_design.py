@@ -19,6 +19,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
@@ -106,14 +107,18 @@ def span_of(problem: LoopProblem) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class DesignSearch:
-    """A search for controllers on plants: what its randomness began with, where its lines of
-    progress go, and when it `began` (s of `perf_counter`)."""
+    """A search for controllers on plants, with the options of `channel_design.synthesise`, and when
+    it `began` (s of `perf_counter`)."""
 
     problem: LoopProblem
     plants: Sequence[ScaledPlant]
     sampling: Sampling | None
+    starts: int = 0
     seed: int = 0
+    initial: Sequence[Array] = ()
+    only_initial: bool = False
     progress: Progress | None = None
+    workers: Pool | None = None
     began: float = field(default_factory=perf_counter)
 
     def tell(self, words: str) -> None:

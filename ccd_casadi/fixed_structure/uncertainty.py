@@ -139,6 +139,11 @@ class UncertainPlant:
         """The plants of (option, point) pairs."""
         return [self.plant(point, option) for option, point in points]
 
+    def drawn(self, rng: np.random.Generator, count: int) -> list[ScaledPlant]:
+        """So many plants, uniformly from the box, the options alike often."""
+        option, (low, high) = rng.integers(len(self.options), size=count).tolist(), self.box
+        return self.plants([*zip(option, rng.uniform(low, high, (count, len(low))), strict=True)])
+
     def corners(self) -> list[tuple[int, Array]]:
         """The model of every option, then the corners of its box.
 

@@ -133,20 +133,29 @@ def worst_plants(
     step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
     for _ in range(ROUNDS):
         moves = [
-            (head.option, np.clip(head.point + sign * step * np.eye(n)[i], *box))
-            for head in heads
-            for i in range(n)
+            (row, np.clip(head.point + sign * step * unit, *box))
+            for row, head in enumerate(heads)
+            for unit in np.eye(n)
             for sign in (1.0, -1.0)
         ]
-        found = excesses(uncertain, moves, *loop).reshape(len(heads), 2 * n)
-        looked += len(moves)
-        best = np.argmax(found, axis=1)
-        for row, k in enumerate(best):
-            if found[row, k] > heads[row].value:
-                option, point = moves[2 * n * row + int(k)]
-                heads[row] = Excess(option, point, float(found[row, k]))
-        step = 0.5 * step
+        # At an end of the box half of them lead nowhere.
+        moves = [(row, point) for row, point in moves if (point != heads[row].point).any()]
+        _tried(uncertain, heads, moves, loop)
+        looked, step = looked + len(moves), 0.5 * step
     return sorted(heads, key=lambda head: -head.value), looked
+
+
+def _tried(
+    uncertain: UncertainPlant, heads: list[Excess], steps: Sequence[tuple[int, Array]],
+    loop: tuple[Any, ...],
+) -> bool:  # fmt: skip
+    """Moves heads by steps (a head's number, a point) that raise them; whether one by `WITHIN`."""
+    before = [head.value for head in heads]
+    points = [(heads[row].option, point) for row, point in steps]
+    for (row, point), end in zip(steps, excesses(uncertain, points, *loop).tolist(), strict=True):
+        if end > heads[row].value:
+            heads[row] = Excess(heads[row].option, point, end)
+    return any(head.value > value + WITHIN for head, value in zip(heads, before, strict=True))
 
 
 def _climbed(
@@ -173,13 +182,8 @@ def _climbed(
         steps = _towards_corners(uncertain, heads, loop)
         if not steps:
             break
-        tried = [(heads[row].option, point) for row, point in steps]
-        looked, better = looked + len(tried), False
-        for (row, point), end in zip(steps, excesses(uncertain, tried, *loop), strict=True):
-            if end > heads[row].value:
-                better |= bool(end > heads[row].value + WITHIN)
-                heads[row] = Excess(heads[row].option, point, float(end))
-        if not better:
+        looked += len(steps)
+        if not _tried(uncertain, heads, steps, loop):
             break
     return sorted(heads, key=lambda head: -head.value), looked
 

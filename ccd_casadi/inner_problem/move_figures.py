@@ -90,8 +90,6 @@ def stated_time(
     told = max(value, float(on_set.max()), latest_plant(problem, theta, K, seed + FRESH_SEED)[0])
     if not uncertain.names:
         return told, None
-    rng, (low, high) = np.random.default_rng((seed, FRESH_SEED)), uncertain.box
-    option = rng.integers(len(uncertain.options), size=FRESH).tolist()
-    points = list(zip(option, rng.uniform(low, high, (FRESH, len(low))), strict=True))
-    times = exact_times(problem, motion, uncertain.plants(points), K)
+    fresh = uncertain.drawn(np.random.default_rng((seed, FRESH_SEED)), FRESH)
+    times = exact_times(problem, motion, fresh, K)
     return told, Yield(int((times <= told).sum()), FRESH)

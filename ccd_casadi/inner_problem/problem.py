@@ -215,8 +215,8 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
     Parameters
     ----------
     problem, theta : CoDesignProblem, sequence
-        θ in SI, in the order of `problem.names`. The best design plant is taken where a robust
-        problem leaves its own open.
+        θ in SI, in the order of `problem.names`. A robust problem without a design plant takes
+        the best one.
 
     Returns
     -------
@@ -271,7 +271,7 @@ def true_design(
     Raises
     ------
     ValueError
-        The problem leaves open what plant the controller is made on.
+        The problem has no design plant for the controller.
 
     Examples
     --------

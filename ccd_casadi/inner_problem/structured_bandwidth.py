@@ -96,23 +96,22 @@ def value_of_design(
     problem: CoDesignProblem,
     theta: Sequence[float],
     plants: Sequence[ScaledPlant],
-    made: SectionsDesign,
+    design: SectionsDesign,
     spent: int,
 ) -> StructuredValue:
     """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least of another
     figure."""
     point = tuple(float(v) for v in theta)
     error, envelope = np.nan, None
-    if made.certified and problem.figure is not BANDWIDTH:
-        made, error, envelope = _least(problem, theta, plants, made)
-    elif made.certified:
-        sampling = structured_of(problem).sampling
-        envelope = bandwidth_envelope(plants, bounds_of(problem), made, sampling)
-    bandwidth = made.bandwidth if made.certified else np.nan
+    if design.certified and problem.figure is not BANDWIDTH:
+        design, error, envelope = _least(problem, theta, plants, design)
+    elif design.certified:
+        envelope = bandwidth_envelope(plants, bounds_of(problem), design, problem.sampling)
+    bandwidth = design.bandwidth if design.certified else np.nan
     gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
     slope = tuple(map(float, gradient))
     return StructuredValue(
-        point, float(bandwidth), slope, made, spent, envelope, error=float(error)
+        point, float(bandwidth), slope, design, spent, envelope, error=float(error)
     )
 
 
@@ -123,22 +122,22 @@ def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
         raise UserError(f'inner.minimise: is "{problem.figure.key}", and {words}')
 
 
-def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
+def too_slow(problem: CoDesignProblem, design: SectionsDesign) -> SectionsDesign:
     """The design, no longer a certified one where what is minimised asks for more bandwidth."""
     least = structured_of(problem).bandwidth_least
-    if made.bandwidth >= least:
-        return made
-    words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
+    if design.bandwidth >= least:
+        return design
+    words = f"no controller was found above {design.bandwidth / HZ:.4g} Hz"
     words += f", inner.bandwidth_least_hz requires {least / HZ:.4g} Hz"
-    short = {"bandwidth_least_hz": least / made.bandwidth}
-    return replace(made, outcome=SectionsOutcome.BOUND_NOT_MET, words=words, short=short)
+    short = {"bandwidth_least_hz": least / design.bandwidth}
+    return replace(design, outcome=SectionsOutcome.BOUND_NOT_MET, words=words, short=short)
 
 
 def goal_of(
     problem: CoDesignProblem, theta: Sequence[float], plants: Sequence[ScaledPlant]
 ) -> Goal:
     """What is made small besides -ω_b, on the plants of the problem's set at θ."""
-    structure, sampling = structure_of(problem), structured_of(problem).sampling
+    structure, sampling = structure_of(problem), problem.sampling
     assert isinstance(structure, Structure)
     if problem.figure is RMS_ERROR:
         assert problem.budget is not None
@@ -152,16 +151,16 @@ def _least(
     problem: CoDesignProblem,
     theta: Sequence[float],
     plants: Sequence[ScaledPlant],
-    made: SectionsDesign,
+    design: SectionsDesign,
 ) -> tuple[SectionsDesign, float, Envelope | None]:
     """The design of the least value, that in SI, and its gradients to θ."""
     structured, bounds = structured_of(problem), bounds_of(problem)
-    made = too_slow(problem, made)
-    if not made.certified:
-        return made, np.nan, None
+    design = too_slow(problem, design)
+    if not design.certified:
+        return design, np.nan, None
     started = with_structured(problem, warm_starts=structured.error_warm_starts)
     found = least_value(
-        plants, bounds, made, goal_of(problem, theta, plants), sampling=structured.sampling,
+        plants, bounds, design, goal_of(problem, theta, plants), sampling=structured.sampling,
         least_bandwidth=structured.bandwidth_least,
         initial=warm_starts_at(started, structure_of(problem), plants, bounds),
     )  # fmt: skip

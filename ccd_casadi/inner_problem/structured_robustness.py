@@ -47,7 +47,7 @@ FRESH_SEED = 2000  # apart from those of the search and of the lattice
 def worst_case(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    made: SectionsDesign,
+    design: SectionsDesign,
     turn: int = 0,
     progress: Progress | None = None,
 ) -> tuple[Excess, tuple[Scenario, ...]]:
@@ -56,11 +56,11 @@ def worst_case(
     Where a move's time counts the plant that settles latest besides, if it is later than v.
     """
     uncertain = uncertain_plant(problem, theta)
-    worst, found = violations(problem, uncertain, made.kappa, made.bandwidth, turn, progress)
-    if problem.figure is MOVE_TIME and made.controller is not None:
-        value = float(np.exp(goal_of(problem, theta, ()).at(made.kappa)[0]))
+    worst, found = violations(problem, uncertain, design.kappa, design.bandwidth, turn, progress)
+    if problem.figure is MOVE_TIME and design.controller is not None:
+        value = float(np.exp(goal_of(problem, theta, ()).at(design.kappa)[0]))
         seed = structured_of(problem).seed + turn
-        time, option, point = latest_plant(problem, theta, made.controller, seed)
+        time, option, point = latest_plant(problem, theta, design.controller, seed)
         if progress is not None:
             progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
         if time > value:
@@ -102,7 +102,7 @@ def violations(
 def worse_elsewhere(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    made: SectionsDesign,
+    design: SectionsDesign,
     turns: range,
     workers: Pool,
     progress: Progress,
@@ -111,7 +111,7 @@ def worse_elsewhere(
     at a time as there are workers."""
     for first in turns[:: workers.count]:
         own = range(first, min(first + workers.count, turns.stop))
-        tasks = [(turn, worst_case, problem, theta, made, turn) for turn in own]
+        tasks = [(turn, worst_case, problem, theta, design, turn) for turn in own]
         found = dict(workers.map_unordered(looked, tasks))
         largest = max(worst.value for worst, _ in found.values())
         progress(f"{100.0 * np.exp(largest):.6g} % of a bound at most, searched from elsewhere")
@@ -142,7 +142,7 @@ def certify_lattice(
 def fresh_yield(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    made: SectionsDesign,
+    design: SectionsDesign,
     workers: Pool | None = None,
 ) -> Yield | None:
     """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
@@ -150,15 +150,12 @@ def fresh_yield(
     The options are drawn alike often. None where there is no box to draw from.
     """
     structured, uncertain = structured_of(problem), uncertain_plant(problem, theta)
-    if not uncertain.names or made.controller is None:
+    if not uncertain.names or design.controller is None:
         return None
     count = FRESH if plant_of(problem).outputs == 1 else FRESH_OF_SEVERAL
-    rng, (low, high) = np.random.default_rng((structured.seed, FRESH_SEED)), uncertain.box
-    option = rng.integers(len(uncertain.options), size=count).tolist()
-    point = rng.uniform(low, high, (count, len(low)))
-    plants = uncertain.plants(list(zip(option, point, strict=True)))
-    found = _judged(problem, plants, made.controller, workers).plants
-    bounds, least = bounds_of(problem).looser(LOOSE), made.bandwidth * (1.0 - LOOSE)
+    plants = uncertain.drawn(np.random.default_rng((structured.seed, FRESH_SEED)), count)
+    found = _judged(problem, plants, design.controller, workers).plants
+    bounds, least = bounds_of(problem).looser(LOOSE), design.bandwidth * (1.0 - LOOSE)
     kept = [
         one.stable and one.confirmed and one.bandwidth >= least
         and max((bounds.shares(one) | bounds.channel_shares(one.channels)).values())
@@ -171,14 +168,13 @@ def fresh_yield(
 def proof_of(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    made: SectionsDesign,
+    design: SectionsDesign,
     workers: Pool | None = None,
 ) -> Proof:
     """Branch and bound over the whole box of plants at θ."""
-    structured = structured_of(problem)
     return prove(
-        uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
-        bounds_of(problem), structured.sampling, workers=workers,
+        uncertain_plant(problem, theta), design.structure, design.kappa, design.bandwidth,
+        bounds_of(problem), problem.sampling, workers=workers,
     )  # fmt: skip
 
 
@@ -207,7 +203,7 @@ def checked_whole(
 
 
 def tolerance_prices(
-    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
 ) -> dict[str, float]:
     """dω_b*/d ln t in rad/s of every tolerance t of [robust], at an optimal design.
 
@@ -223,8 +219,7 @@ def tolerance_prices(
         further = (np.array(point) - uncertain.nominal)[:, None, None]
         slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
         plants.append(replace(plant, **slopes))
-    sampling = structured_of(problem).sampling
-    found = bandwidth_envelope(plants, bounds_of(problem), made, sampling)
+    found = bandwidth_envelope(plants, bounds_of(problem), design, problem.sampling)
     gradient = [] if found is None else found.gradient.tolist()
     return dict(zip(uncertain.names, gradient, strict=False))
 
@@ -243,9 +238,7 @@ def _judged(
     controller: StateSpace,
     workers: Pool | None = None,
 ) -> SetCertificate:
-    structured, bounds = structured_of(problem), bounds_of(problem)
-    integrator = structure_of(problem).integrator
     return certify(
-        plants, controller, bounds.looser(LOOSE), structured.sampling, integrator=integrator,
-        workers=workers,
+        plants, controller, bounds_of(problem).looser(LOOSE), problem.sampling,
+        integrator=structure_of(problem).integrator, workers=workers,
     )  # fmt: skip

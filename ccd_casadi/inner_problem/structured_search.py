@@ -127,22 +127,22 @@ def with_worst_plant(
 
 
 def _wider(
-    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign, turn: int,
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, turn: int,
     progress: Progress | None,
 ) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
     """The worst plant, and the problem with those that are worse than its own, if there are any."""
-    worst, found = worst_case(problem, theta, made, turn, progress)
+    worst, found = worst_case(problem, theta, design, turn, progress)
     scenarios = (*structured_of(problem).scenarios, *found)
     return worst, with_structured(problem, scenarios=scenarios) if found else None
 
 
-def _warm_starts(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
+def _warm_starts(design: SectionsDesign) -> tuple[tuple[float, ...], ...]:
     """The certified design's κ first, then those of the other local optima near it."""
-    own = tuple(map(float, made.kappa))
+    own, omega_b = tuple(map(float, design.kappa)), design.bandwidth
     others = [
         optimum.kappa
-        for optimum in made.local_optima
-        if (1.0 - DISTINCT) * made.bandwidth <= optimum.bandwidth < (1.0 - 1e-3) * made.bandwidth
+        for optimum in design.local_optima
+        if (1.0 - DISTINCT) * omega_b <= optimum.bandwidth < (1.0 - 1e-3) * omega_b
     ]
     return (own, *others)[:MOST_WARM_STARTS]
 
@@ -157,7 +157,7 @@ def with_warm_start(problem: CoDesignProblem, kappa: Sequence[float] | Array) ->
 def least_from(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    made: SectionsDesign,
+    design: SectionsDesign,
     progress: Progress | None = None,
 ) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:
     """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
@@ -166,16 +166,16 @@ def least_from(
     The problem has the plants then that were found worse on the way, and that design as the first
     of its warm starts.
     """
-    if problem.figure is not BANDWIDTH and made.certified:
-        made = too_slow(problem, made)
-    if problem.figure is BANDWIDTH or not made.certified:
-        return problem, made, None
+    if problem.figure is not BANDWIDTH and design.certified:
+        design = too_slow(problem, design)
+    if problem.figure is BANDWIDTH or not design.certified:
+        return problem, design, None
     wider = problem
     for turn in range(ROUNDS_OF_ERROR):
         problem, structured = wider, structured_of(wider)
         plants = plants_of(problem, theta)
         found = least_value(
-            plants, bounds_of(problem), made, goal_of(problem, theta, plants),
+            plants, bounds_of(problem), design, goal_of(problem, theta, plants),
             sampling=structured.sampling, least_bandwidth=structured.bandwidth_least,
             initial=[np.array(kappa) for kappa in structured.error_warm_starts], progress=progress,
         )  # fmt: skip

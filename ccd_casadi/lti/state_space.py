@@ -104,7 +104,7 @@ class StateSpace:
     def zeros(self, unit: float = 1.0) -> np.ndarray:
         """Finite invariant zeros of a square system, |z| < 1e5 `unit`; none of another.
 
-        The eigenvalues of [[A, B], [C, D]] - z [[1, 0], [0, 0]], each part made about one.
+        The eigenvalues of [[A, B], [C, D]] - z [[1, 0], [0, 0]], each part scaled to about one.
         """
         n, m = self.B.shape
         if len(self.C) != m or n == 0:

@@ -215,7 +215,7 @@ class DifferencedModel:
             words = (
                 f"the derivative of {label} to {self.names[i]} is {100 * worst:.0f} % wrong at "
                 f"theta = {named_values(self.names, theta)}: two difference formulas disagree, so "
-                "the plant function leaps or bends there; usual causes are eigenvectors whose sign "
+                "the plant function jumps or bends there; usual causes are eigenvectors whose sign "
                 "or order changes between points (fix the sign, sort by shape), `if`, `abs`, "
                 "`round`, or an iteration that stops early"
             )

@@ -60,11 +60,11 @@ def _words(error: Array, lost: int, tolerance: float, lifted: bool) -> str:
         words += f", in no round within the tolerance of {100.0 * tolerance:g} %"
     words += ". "
     if lost:
-        words += f"{lost} of the promised θ had no feasible design. "
+        words += f"{lost} of the predicted θ had no feasible design. "
     if lifted:
         words += (
             "In the rounds the error is the largest of those of ω_b (relative), ln‖S‖∞ and "
-            "ln|S(ω_low)|; at the verified design, of ω_b alone. A round may promise a design just "
+            "ln|S(ω_low)|; at the verified design, of ω_b alone. A round may predict a design just "
             "outside S_max, so its true J may lie below the final one."
         )
     return words.strip()

@@ -117,7 +117,7 @@ def caption_landscape(land: Landscape, best_hz: float) -> str:
     """What the colours and the dots are, and what the field leaves out."""
     if not land.bandwidth_hz.size:
         return (
-            "No surrogate is of ω_b*(θ) alone: the large dots are the θ where a synthesis met "
+            "No surrogate was fitted to ω_b*(θ): the large dots are the θ where a synthesis met "
             "S_max and S_low, in the colour of the best ω_b found there (ω_b* is at least "
             f"that), {len(land.truths)} of them; at the {len(land.designs)} small ones none did. "
             f"The verified design (★) has {number(best_hz)} Hz."

@@ -73,7 +73,7 @@ def _caption(spans: dict[str, tuple[float, float]], many: bool, best_hz: float) 
     words += f" ({number(best_hz)} Hz there, dashed line); dots: true values"
     words += f" within {100 * NEARBY:.0f} % of the box." if many else "."
     if not spans:
-        return words + " No surrogate is of ω_b*(θ) alone: the dots are the run's own designs."
+        return words + " No surrogate was fitted to ω_b*(θ): the dots are designs of the run."
     most = max(spans, key=lambda name: spans[name][0])
     return (
         f"{words} It changes {'most ' if many else ''}along {most}, by "

@@ -152,22 +152,22 @@ def loop_of(run: FinishedRun) -> Loop:
     return run.loop_on(run.plant.plant_si())
 
 
-def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
+def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:
     """robustness.json: SI, and Hz where the name says so; shifts and tolerances are relative."""
-    bound, hard, d = found.structured, found.tolerances, found.demands
+    bound, hard, d = study.structured, study.tolerances, study.demands
     peaks = [item.peak for item in hard.judged if item.stable]
     quantiles = np.quantile(peaks, [0.5, 0.95, 1.0]) if peaks else ()
-    margins, at, S_max = found.margins, found.statics, run.problem.inner.S_max
+    margins, at, S_max = study.margins, study.statics, run.problem.inner.S_max
     noise = {
         "sensor_density": d.sensor, "force_density": d.disturbance,
-        **{f"rms_{key}": value.tolist() for key, value in vars(found.noise).items()},
+        **{f"rms_{key}": value.tolist() for key, value in vars(study.noise).items()},
     }  # fmt: skip
     structured = None if bound is None else {
         "modes": bound.modes, "mu": 1.0 / bound.stiffness, "mu_complex": float(bound.mu.max()),
         "hz": bound.worst_hz, "stiffness": bound.stiffness, "shift": bound.shift,
     }  # fmt: skip
     return {
-        "survives": found.survives,
+        "survives": study.survives,
         "S_max": S_max,
         "bandwidth_hz": run.figures.bandwidth / HZ,
         "sensitivity_peak": run.figures.sensitivity_peak,
@@ -178,17 +178,17 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
         },
         "gains": {
             name: {"peak": peak, "peak_hz": omega / HZ}
-            for name, (peak, omega) in zip(("S", "T", "GS", "KS"), found.peaks, strict=True)
+            for name, (peak, omega) in zip(("S", "T", "GS", "KS"), study.peaks, strict=True)
         },
         "static_stiffness": at.stiffness,
         "static_compliance": at.compliance,
         "static_share": at.share,
         "period": None if run.sampling is None else run.sampling.period,
         "noise": noise,
-        "resonance_shift": _line(found.shift, "shift"),
-        "damping": _line(found.damping, "factor"),
-        "single_modes": [_judged(item, "hz", "shift") for item in found.modes],
-        "worst_shift_and_damping": _judged(found.box, "shift", "damping"),
+        "resonance_shift": _line(study.shift, "shift"),
+        "damping": _line(study.damping, "factor"),
+        "single_modes": [_judged(item, "hz", "shift") for item in study.modes],
+        "worst_shift_and_damping": _judged(study.box, "shift", "damping"),
         "tolerances": {
             "tolerance": hard.tolerance,
             "samples": len(hard.judged) + hard.failed,
@@ -203,22 +203,22 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
         "structured": structured,
         "move": {
             "limits": vars(d.limits) | {"window": d.window, "axis": d.axis + 1},
-            "duration": found.setpoint.duration,
+            "duration": study.setpoint.duration,
             "reached": {
-                key: getattr(found.setpoint, key) for key in ("velocity", "acceleration", "jerk")
+                key: getattr(study.setpoint, key) for key in ("velocity", "acceleration", "jerk")
             },
-            "without_suspension": found.moves[0].free,
-            "runs": [_move(move) for move in found.moves],
+            "without_suspension": study.moves[0].free,
+            "runs": [_move(move) for move in study.moves],
         },
     }
 
 
-def survival_line(run: FinishedRun, found: Study) -> VerdictLine:
+def survival_line(run: FinishedRun, study: Study) -> VerdictLine:
     """`survives` of the run's verdict: what the solve said, and what the study adds to it."""
-    before, hard, d = at_solve(run.result, "survives"), found.tolerances, found.demands
+    before, hard, d = at_solve(run.result, "survives"), study.tolerances, study.demands
     lost = hard.unstable
     said = []
-    low, high = found.shift.stable
+    low, high = study.shift.stable
     ends = [f"below {100.0 * low:+.2g} %"] * (low > -d.shift)
     ends += [f"above {100.0 * high:+.2g} %"] * (high < d.shift)
     if ends:
@@ -231,17 +231,17 @@ def survival_line(run: FinishedRun, found: Study) -> VerdictLine:
         f"hardware within +-{100 * d.tolerance:g} %"
     )
     words = f"robustness: stable on all plants tried ({tried})"
-    if not found.survives:
+    if not study.survives:
         words = f"robustness: {'; '.join(said) or f'not stable on all plants tried ({tried})'}"
     state = State(before.get("state", State.UNKNOWN))
-    if not found.survives and state is not State.FAILED:
+    if not study.survives and state is not State.FAILED:
         state = State.WARNED
     elif state is State.UNKNOWN:
         state = State.PASSED
     figures = {key: value for key, value in before.items() if key not in ("state", "words")}
     figures["robustness"] = {
-        "stable_on_all": found.survives,
-        "stable_between": list(found.shift.stable),
+        "stable_on_all": study.survives,
+        "stable_between": list(study.shift.stable),
         "hardware": {
             "tolerance": hard.tolerance, "plants": len(hard.judged), "unstable": lost,
             "worst_stable": hard.worst.stable,

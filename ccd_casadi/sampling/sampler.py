@@ -192,8 +192,7 @@ class Sampler:
                 progress.advance(len(samples))
         before = len(self.trace)
         for x, key in zip(points, keys, strict=True):
-            sample = known[key]
-            self._spend(key, 1, x[:count], sample.bandwidth if self._meets(sample) else np.nan)
+            self._spend(key, 1, x[:count], self._worth(known[key]))
         self.report(before)
         inner = self.problem.inner
         return [quantity_sample(x, known[k], inner) for x, k in zip(points, keys, strict=True)]
@@ -216,7 +215,7 @@ class Sampler:
         sample = sample_of(key, point[:-2], design.figures, 0.0, design)
         self.store.put([sample], self.hash)
         before = len(self.trace)
-        self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
+        self._spend(key, 1, sample.theta, self._worth(sample))
         if self.spent.purpose != "polish":  # which reports its end
             self.report(before)
         return design
@@ -251,8 +250,10 @@ class Sampler:
             with suppress(OSError, ValueError):  # a stream that fails ends the printing
                 say(f"best so far: J {J[best]:.6g}, {bandwidth:.4g} Hz", sys.stderr)
 
-    def _meets(self, sample: Sample) -> bool:
-        return sample.certified and self.problem.inner.excess(sample) <= 0.0
+    def _worth(self, sample: Sample) -> float:
+        """The bandwidth of a design that meets the bounds, else NaN."""
+        meets = sample.certified and self.problem.inner.excess(sample) <= 0.0
+        return sample.bandwidth if meets else np.nan
 
     @property
     def _size(self) -> int:

@@ -39,22 +39,22 @@ def measure(
     return figures_from_row(row, weights, w0)
 
 
-def recertified_in_si(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
+def recertified_in_si(plant: ScaledPlant, design: Design, omega_low: float) -> Design:
     """The design, no longer certified where the numbers of its controller in SI do not carry it.
 
     What is certified in a synthesis is the controller in the plant's own units. Where the loop
     hangs on digits that doubles do not have (a plant of gain 10¹², for instance), the controller
     that a user gets is another one: it is certified again as it is given away.
     """
-    if not made.figures.certified:
-        return made
-    gamma = made.figures.gamma * (1.0 + ROUNDING)
+    if not design.figures.certified:
+        return design
+    gamma = design.figures.gamma * (1.0 + ROUNDING)
     rng = np.random.default_rng(0)  # the way to SI and back alone may change no digit at all
-    K = made.controller
+    K = design.controller
     rounded = StateSpace(
         *(X * (1.0 + EPS * rng.choice([-1.0, 1.0], X.shape)) for X in (K.A, K.B, K.C, K.D))
     )
-    again = measure(plant, rounded, made.weights, gamma=gamma, omega_low=omega_low)
-    if again.certified and abs(again.bandwidth / made.figures.bandwidth - 1.0) <= ROUNDING:
-        return made
-    return replace(made, figures=replace(made.figures, outcome=Outcome.LOST_IN_ROUNDING))
+    again = measure(plant, rounded, design.weights, gamma=gamma, omega_low=omega_low)
+    if again.certified and abs(again.bandwidth / design.figures.bandwidth - 1.0) <= ROUNDING:
+        return design
+    return replace(design, figures=replace(design.figures, outcome=Outcome.LOST_IN_ROUNDING))

@@ -27,9 +27,9 @@ from ccd_casadi.fixed_structure import (
 )
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
-from ccd_casadi.fixed_structure.design import Progress, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, descend
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.sections_design import Progress, in_problem_units
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.process_pool import Workers
 

@@ -226,7 +226,7 @@ def test_a_kink_is_an_optimum_where_both_sides_rise() -> None:
     assert along == pytest.approx((0.0, 0.0), abs=1e-3)
     said = line(found)
     assert said.state is State.PASSED
-    assert "first-order optimal at a kink" in said.words
+    assert "locally optimal to first order at a kink" in said.words
     assert "on both sides of 2 directions" in said.words
 
 

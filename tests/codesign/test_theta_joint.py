@@ -10,6 +10,8 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
+from ccd_casadi.codesign.outer import Place
+from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.theta_joint import (
     JointModel,
     JointPoint,
@@ -121,6 +123,29 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         told = objectives_beside(problem, best, there)
         true = [objective_of(problem, one) for one in sampler.values(there)]
         assert told == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
+
+
+def test_a_local_solve_takes_joint_steps_and_stops_where_another_has_ended(tmp_path: Path) -> None:
+    problem = built()
+    with SampleStore(tmp_path / "samples.sqlite") as store:
+        sampler = Sampler(problem, store, Workers(1))
+        outer = StructuredOuter(sampler)
+        first, near = sampler.values(np.array([[58.0, 57.0], [55.2, 55.1]]))
+        place = outer.local_solve(first, ())
+        assert place is not None
+        assert place.stationary
+        assert place.objective < objective_of(problem, first)
+        assert place.x == pytest.approx((55.0, 55.0), abs=0.02 * 15.0)
+        # The controller is known where it ended, for a polish that goes on there.
+        assert objective_of(problem, sampler.values(place.x)[0]) <= 0.999 * place.objective
+        again = outer.local_solve(near, [place])
+        assert again is not None
+        assert again.x == pytest.approx(near.theta)
+        assert again.objective == objective_of(problem, near)
+        better = [Place(place.x, 0.9 * place.objective, True)]  # an end that it improves on
+        beyond = outer.local_solve(near, better)
+        assert beyond is not None
+        assert beyond.objective < again.objective
 
 
 def test_a_step_to_where_masses_are_no_longer_positive_is_no_step() -> None:

@@ -123,7 +123,7 @@ def draw_morph(
     if error > MOST_ERROR * size:
         raise PlantError(
             f"a polynomial of degree {degree} is {error:.1e} m off the solid; raise `degree`, "
-            "narrow the bounds, or look for a face that leaps"
+            "narrow the bounds, or find the face that jumps"
         )
     morph = Morph(
         names, lower, upper, exponents,
