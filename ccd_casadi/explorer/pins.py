@@ -72,8 +72,8 @@ class Pins:
                   for name, title, form, width, _ in FIGURES]  # fmt: skip
         self.table = DataTable(
             name="pins", source=self.source, height=HEIGHT, index_position=None, editable=True,
-            sizing_mode="stretch_width", reorderable=False, stylesheets=[DARK] if dark else [],
-            columns=[_column(*head) for head in heads],
+            sizing_mode="stretch_width", autosize_mode="none", reorderable=False,
+            columns=[_column(*head) for head in heads], stylesheets=[DARK] if dark else [],
         )  # fmt: skip
         self._show()
 

@@ -1,22 +1,23 @@
-"""The largest ω_b that any controller of any order has on one plant: from outside and inside.
+"""The largest ω_b that any controller of any order has: from outside and inside.
 
 A larger ω_b only shrinks the discs of `limits`, so both searches are for the ω_b at which the least
 scaling of the discs is one. Outside only what `certificate` has shown counts.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy import sparse
 from scipy.optimize import brentq
 
 from ccd_casadi.limitations.basis import Basis
 from ccd_casadi.limitations.certificate import rules_out
+from ccd_casadi.limitations.conic import greatest_multiplier, least_scaling
+from ccd_casadi.limitations.discs import discs
 from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
 REAL, REALS = 2.0, (10.0, 30.0, 100.0)  # of the basis, over ω_b: one many times, and others
-MANY, FEW = (60, 120), (16, 40)  # how many times, and frequencies of a grid in a decade
+MANY, COARSE, FEW = (60, 120), (60, 80), (16, 40)  # how many times, and frequencies in a decade
 CORNERS = {-1: 100.0, 1: 5.0}  # of its roll-off, for h and for T
 FINE = 1500  # frequencies in a decade: of what is made of a programme
 OVER = 0.002  # by how much the scaling is above one where the certificate is tried
@@ -36,29 +37,56 @@ def upper_bound(limits: Limits, known: float = np.inf) -> float:
     if known < np.inf and _Search(limits, known, -1).multiplier(known)[0] <= 1.0 + OVER:
         return known
     most = pointwise(limits)
-    zeros = [float(limits.omega(np.array(abs(z)))) for z in limits.beyond]
-    begin = min([BEGIN * most, known, *zeros])
+    begin = min(_first(limits, most), known)
     if not np.isfinite(begin):
         return np.inf
-    for size in (FEW, MANY):  # where to make the basis; small programmes are not always solved
-        search = _Search(limits, begin, -1, size)
-        omega_b, _, met = _where(search.multiplier, begin, most, 1.0 + OVER)
-        if met:
-            break
-    search = _Search(limits, omega_b, -1)
-    omega_b, weight, _ = _where(search.multiplier, omega_b, most, 1.0 + OVER)
-    for number in range(TRIES):
+    search = _Search(limits, begin, -1, FEW)  # where to make the basis
+    omega_b, _, met = _where(search.multiplier, begin, most, 1.0 + OVER, solved=True)
+    if not met:
+        search = _Search(limits, begin, -1)
+        omega_b = _where(search.multiplier, begin, most, 1.0 + OVER)[0]
+    found = _certified(limits, omega_b, most, COARSE) if met else 0.0
+    return min(found or _certified(limits, omega_b, most, MANY) or most, known)
+
+
+def _certified(limits: Limits, omega_b: float, most: float, size: tuple[int, int]) -> float:
+    """The least ω_b that a certificate was found for, next to `omega_b`; 0: none below `most`.
+
+    Coarse programmes are not always solved, or certified.
+    """
+    search, coarse = _Search(limits, omega_b, -1, size), size != MANY
+    omega_b, weight, met = _where(search.multiplier, omega_b, most, 1.0 + OVER, solved=coarse)
+    for number in range(TRIES if met or not coarse else 0):
         if omega_b >= most:
             break
         if rules_out(limits, search.basis, weight, omega_b, _grid(limits, omega_b, MANY[1])):
-            return min(omega_b, known)
+            return omega_b
         omega_b = min(omega_b * (1.0 + OVER * 2.0 ** (number + 1)), most)
         weight = search.multiplier(omega_b)[1]
-    return min(most, known)
+    return 0.0
+
+
+def forbids_most(candidates: Sequence[Limits]) -> Limits:
+    """The one whose discs need the largest scaling at one ω_b, by small programmes."""
+    omega_b = _first(candidates[0], pointwise(candidates[0]))
+
+    def scaling(limits: Limits) -> float:
+        found = _Search(limits, omega_b, -1, FEW).multiplier(omega_b)[0]
+        return found if np.isfinite(found) else 0.0  # ∞: a programme not solved
+
+    return max(candidates, key=scaling) if np.isfinite(omega_b) else candidates[0]
+
+
+def _first(limits: Limits, most: float) -> float:
+    """Where a search begins, rad/s; infinite where nothing says."""
+    return min([BEGIN * most, *(float(limits.omega(np.array(abs(z)))) for z in limits.beyond)])
 
 
 def lower_bound(limits: Limits, most: float) -> float:
-    """The ω_b (rad/s) of a T that keeps every bound on a fine grid, near `most`; 0: none found."""
+    """The ω_b (rad/s) of a T that keeps every bound on a fine grid, near `most`; 0: none found.
+
+    Of one plant without others: the discs leave out what others forbid besides.
+    """
     if not most < np.inf:
         return 0.0
     search = _Search(limits, most, 1)
@@ -140,106 +168,47 @@ class _Search:
         width = np.gradient(v)
         width[0] += v[0]
         values = self.basis.values(v) * np.sqrt(self.unit)
-        radii = self.limits.radii(v, v, omega_b)
-        return greatest_multiplier(values, width / self.unit, *radii)
+        return greatest_multiplier(values, width / self.unit, *discs(self.limits, v, v, omega_b))
 
     def controller(self, omega_b: float) -> tuple[float, Array]:
         """The scaling that some T needs, on a finer grid, and its coefficients."""
         v = _grid(self.limits, omega_b, self.grid)
-        g, weight = least_scaling(self.basis.values(v), *self.limits.radii(v, v, omega_b))
+        g, weight = least_scaling(self.basis.values(v), *discs(self.limits, v, v, omega_b))
         v = _grid(self.limits, omega_b, FINE)
-        m_S, m_T = self.limits.radii(v, v, omega_b)
-        T = self.basis.values(v) @ weight
-        shares = np.maximum(np.abs(T) / m_T, np.abs(1.0 - T) / m_S)
+        centres, radii = discs(self.limits, v, v, omega_b)
+        shares = np.abs(self.basis.values(v) @ weight - centres) / radii
         return max(g, float(shares.max())), weight
 
 
 def _where(
-    scaling: Callable[[float], tuple[float, Array]], begin: float, most: float, aim: float
+    scaling: Callable[[float], tuple[float, Array]],
+    begin: float,
+    most: float,
+    aim: float,
+    solved: bool = False,
 ) -> tuple[float, Array, bool]:
-    """The ω_b at which the scaling is as aimed at, and whether it is; secants in ln, bracketed."""
+    """The ω_b at which the scaling is as aimed at, and whether it is; secants in ln, bracketed.
+
+    `solved`: give up at a programme that is not solved, which is infinite.
+    """
     x, low, high, slope = float(np.log(begin)), -np.inf, float(np.log(most)), 0.8
     before: tuple[float, float] | None = None
+    tried: list[float] = []
     for _ in range(SECANTS):
         g, weight = scaling(float(np.exp(x)))
-        error = float(np.log(np.clip(g / aim, 0.1, 10.0)))  # ∞: a programme not solved
+        if solved and not np.isfinite(g):
+            break
+        error = float(np.log(np.clip(g / aim, 0.1, 10.0)))
         if abs(error) < CLOSE:
             return float(np.exp(x)), weight, True
         low, high = (max(low, x), high) if error < 0.0 else (low, min(high, x))
         if before is not None and x != before[0]:
             slope = float(np.clip((error - before[1]) / (x - before[0]), 0.3, 5.0))
         before = x, error
+        tried.append(x)
+        if low >= high:  # below the aim at `most`
+            break
         x += float(np.clip(-error / slope, -LARGEST, LARGEST))
         if not low < x < high:
-            x = 0.5 * (low + high) if low > -np.inf else high
+            x = high if high not in tried else 0.5 * (low + high)
     return float(np.exp(x)), weight, False
-
-
-COST = 1e-5  # of the length of h's coefficients, in g
-SOLVED = ("Solved", "AlmostSolved")
-
-
-def least_scaling(functions: np.ndarray, m_S: Array, m_T: Array) -> tuple[float, Array]:
-    """g and the coefficients of T, from the basis on the grid (N, n)."""
-    N, n = functions.shape
-    rows, right = np.zeros((2, N, 3, n + 1)), np.zeros((2, N, 3))
-    for i, (m, sign) in enumerate(((m_T, -1.0), (m_S, 1.0))):
-        size = np.sqrt(m)  # between rows that are ill scaled and discs that are
-        rows[i, :, 0, -1] = -m / size
-        rows[i, :, 1, :n] = sign * functions.real / size[:, None]
-        rows[i, :, 2, :n] = sign * functions.imag / size[:, None]
-    right[1, :, 1] = 1.0 / np.sqrt(m_S)
-    aim = np.append(np.zeros(n), 1.0)
-    x = _solved(aim, sparse.csc_matrix(rows.reshape(-1, n + 1)), right.ravel(), 0, 0)
-    return (np.inf, np.zeros(n)) if x is None else (float(x[-1]), x[:n])
-
-
-def greatest_multiplier(
-    functions: np.ndarray, width: Array, m_S: Array, m_T: Array
-) -> tuple[float, Array]:
-    """The same g from the other side and the coefficients of h; `width` are the grid's cells.
-
-    The length of the coefficients costs a little: where T is small h may be anything, and large
-    ones that cancel leave no certificate.
-    """
-    N, n = functions.shape
-    one, none = sparse.identity(N), sparse.csr_matrix((N, N))
-    free = sparse.csr_matrix((N, n))
-    re, im = (sparse.csr_matrix(-part) for part in (functions.real, functions.imag))
-    # unknowns: coefficients, Re h₂, Im h₂, bounds of |h - h₂| and of |h₂|
-    parts = [
-        [free, none, none, -one, none], [re, one, none, none, none], [im, none, one, none, none],
-        [free, none, none, none, -one], [free, -one, none, none, none],
-        [free, none, -one, none, none],
-    ]  # fmt: skip
-    stacked = sparse.vstack([sparse.hstack(part) for part in parts]).tocsr()
-    order = np.arange(6 * N).reshape(2, 3, N).transpose(0, 2, 1).ravel()
-    budget = np.concatenate([np.zeros(n + 2 * N), width * m_T, width * m_S])
-    cones = sparse.vstack([sparse.csr_matrix(budget[None]), stacked[order]])
-    # the last unknown: the length of the coefficients, a cone of its own
-    length = sparse.coo_matrix(
-        (-np.ones(n + 1), (np.arange(n + 1), [n + 4 * N, *range(n)])), (n + 1, n + 4 * N + 1)
-    )
-    none = sparse.csr_matrix((1 + 6 * N, 1))
-    rows = sparse.vstack([sparse.hstack([cones, none]), length]).tocsc()
-    right = np.append(1.0, np.zeros(6 * N + n + 1))
-    aim = np.concatenate([np.zeros(n), -width, np.zeros(3 * N), [COST]])
-    x = _solved(aim, rows, right, 1, n + 1)
-    return (np.inf, np.zeros(n)) if x is None else (float(-aim[:-1] @ x[:-1]), x[:n])
-
-
-def _solved(
-    aim: Array, rows: sparse.csc_matrix, right: Array, linear: int, last: int
-) -> Array | None:
-    """min aim·x where right - rows x is >= 0 in its `linear` first rows, then in cones of three,
-    and in one cone of its `last` rows."""
-    import clarabel  # slow to import
-
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    cones = [clarabel.NonnegativeConeT(linear)] if linear else []
-    cones += [clarabel.SecondOrderConeT(3)] * ((len(right) - linear - last) // 3)
-    cones += [clarabel.SecondOrderConeT(last)] if last else []
-    none = sparse.csc_matrix((len(aim), len(aim)))
-    answer = clarabel.DefaultSolver(none, aim, rows, right, cones, settings).solve()
-    return np.array(answer.x) if str(answer.status) in SOLVED else None

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.limitations.basis import Basis
+from ccd_casadi.limitations.discs import discs
 from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
@@ -32,6 +33,7 @@ INTERVAL = [
     *((name, float) for name in ("low", "middle", "high", "upper", "loss", "size")),
     *((name, complex) for name in ("h_low", "h_middle", "h_high")),
 ]
+NEAR = 1e-6  # centres nearer than that, over the radii, are one
 TAIL = 1e13  # where the last interval ends, over the largest root of h
 
 
@@ -51,6 +53,23 @@ def support(h: np.ndarray, m_S: Array, m_T: Array) -> Array:
     return np.where(m_S + m_T < 1.0, -np.inf, found)
 
 
+def support_of(h: np.ndarray, centres: np.ndarray, radii: Array) -> Array:
+    """max Re(-h T) in all discs (k, N), or more: the least that two of them leave.
+
+    It is exact where some T is in all: in the plane no more than two discs hold a maximum.
+    """
+    found = (radii * np.abs(h) - (h * centres).real).min(axis=0)
+    for i in range(len(radii)):
+        for j in range(i):
+            d = centres[j] - centres[i]
+            size = np.abs(d)
+            apart = size > NEAR * (radii[i] + radii[j])
+            size = np.where(apart, size, 1.0)
+            both = support(h * d, radii[j] / size, radii[i] / size) - (h * centres[i]).real
+            found = np.where(apart, np.minimum(found, both), found)
+    return found
+
+
 @dataclass(frozen=True)
 class _Multiplier:
     limits: Limits
@@ -61,9 +80,10 @@ class _Multiplier:
     def at(self, v: Array) -> np.ndarray:
         return np.asarray(self.basis.values(v) @ self.weight)
 
-    def _radii(self, low: Array, high: Array) -> tuple[Array, Array]:
-        m_S, m_T = self.limits.radii(low, high, self.omega_b)
-        return m_S, np.minimum(m_T, 1.0 + m_S)  # |T| <= 1 + |S|
+    def _discs(self, low: Array, high: Array) -> tuple[np.ndarray, Array]:
+        centres, radii = discs(self.limits, low, high, self.omega_b)
+        radii[0] = np.minimum(radii[0], 1.0 + radii[1])  # |T| <= 1 + |S|
+        return centres, radii
 
     def intervals(
         self, low: Array, high: Array, h_low: np.ndarray, h_high: np.ndarray
@@ -71,14 +91,15 @@ class _Multiplier:
         """A row of `INTERVAL` for each."""
         w, middle = high - low, 0.5 * (low + high)
         h = self.at(middle)
-        m_S, m_T = self._radii(low, high)
-        line = 0.5 * (support(h_low, m_S, m_T) + support(h_high, m_S, m_T))
+        where = self._discs(low, high)
+        m_T = where[1][0]
+        line = 0.5 * (support_of(h_low, *where) + support_of(h_high, *where))
         curved = self.basis.most_curved(low, high, self.weight) * w**2 / 8.0
         found = np.empty(len(low), INTERVAL)
         found["low"], found["high"], found["middle"] = low, high, middle
         found["h_low"], found["h_high"], found["h_middle"] = h_low, h_high, h
         found["upper"], found["size"] = w * (line + m_T * curved), w * m_T * np.abs(h)
-        value = w * support(h, *self._radii(middle, middle))
+        value = w * support_of(h, *self._discs(middle, middle))
         found["loss"] = found["upper"] - np.maximum(value, -found["size"])
         return found
 

@@ -29,18 +29,26 @@ ROOT_HALF = np.sqrt(0.5)
 
 
 @dataclass(frozen=True)
-class Magnitude:
-    """|g(jv)| by poles and zeros, `value` at `at`; between two frequencies each factor has an
-    exact range."""
+class Response:
+    """g(jv) by poles and zeros, `value` at `at`; between two frequencies each factor has an
+    exact range of its size."""
 
     zeros: np.ndarray
     poles: np.ndarray
     at: float
-    value: float
+    value: complex
+
+    def values(self, v: Array) -> np.ndarray:
+        """g(jv)."""
+        found = np.full(v.shape, complex(self.value))
+        for roots, sign in ((self.zeros, 1), (self.poles, -1)):
+            for r in roots:
+                found = found * ((1j * v - r) / (1j * self.at - r)) ** sign
+        return found
 
     def range(self, low: Array, high: Array) -> tuple[Array, Array]:
         """The least and the largest that |g| can be on the intervals, FAITHFUL included."""
-        least, most = (np.full(low.shape, np.log(self.value)) for _ in range(2))
+        least, most = (np.full(low.shape, np.log(abs(self.value))) for _ in range(2))
         for roots, sign in ((self.zeros, 1.0), (self.poles, -1.0)):
             for r in roots:
                 near = np.maximum(np.maximum(low - r.imag, r.imag - high), 0.0)
@@ -54,7 +62,7 @@ class Magnitude:
         return np.exp(least) * (1.0 - FAITHFUL), np.exp(most) * (1.0 + FAITHFUL)
 
 
-def magnitude(system: StateSpace) -> Magnitude | None:
+def response_of(system: StateSpace) -> Response | None:
     """Of one input and output, continuous or sampled; there in v, delays as zeros at 2/T.
 
     None where the input does not reach the output, as between axes that are apart.
@@ -79,10 +87,10 @@ def magnitude(system: StateSpace) -> Magnitude | None:
     top = 2.0 / T if T else float(np.median(np.abs(poles)))
     v = top * np.geomspace(1e-3, 3.0, 25)
     omega = v if not T else 2.0 / T * np.arctan(0.5 * v * T)
-    response = np.abs(system.response(omega)[:, 0, 0])
-    found = Magnitude(zeros, poles, float(v[12]), float(response[12]))
-    error = np.abs(found.range(v, v)[1] / response - 1.0).max()
-    if not error <= 1.5 * FAITHFUL:
+    response = system.response(omega)[:, 0, 0]
+    found = Response(zeros, poles, float(v[12]), complex(response[12]))
+    error = np.abs(found.values(v) / response - 1.0).max()
+    if not error <= 0.5 * FAITHFUL:
         words = "its poles and zeros do not give its response"
         raise PlantError(f"no bound on every controller: {words} (off by {error:.1e})")
     return found
@@ -100,18 +108,20 @@ def _reached(A: Array, B: Array) -> np.ndarray:
 class Limits:
     """The loop in one direction of outputs: ‖uᵀG‖ as held, |G| without hold (one channel), bounds.
 
+    `others`: one channel's, of other plants that the same controller serves.
     `ratio`: its bandwidth over ω_b. `integrator`: the shape counts from 0 on, else from ω_low.
     `beyond`: zeros of G in the right half plane, in v, which T has for every controller.
     """
 
     name: str
     bounds: Bounds
-    row: tuple[Magnitude, ...]
-    free: Magnitude | None
+    row: tuple[Response, ...]
+    free: Response | None
     period: float
     beyond: tuple[complex, ...] = ()
     ratio: float = 1.0
     integrator: bool = True
+    others: tuple["Limits", ...] = ()
 
     def omega(self, v: Array) -> Array:
         """ω in rad/s."""
@@ -127,8 +137,9 @@ class Limits:
 
     @cached_property
     def roots(self) -> np.ndarray:
-        """Poles and zeros of the plant, in v."""
-        return np.concatenate([part for g in self.row for part in (g.poles, g.zeros)])
+        """Poles and zeros of the plants, in v."""
+        rows = [g for one in (self, *self.others) for g in one.row]
+        return np.concatenate([part for g in rows for part in (g.poles, g.zeros)])
 
     def radii(self, low: Array, high: Array, omega_b: float) -> tuple[Array, Array]:
         """m_S and m_T on the intervals [low, high] of v: no S, no T is larger anywhere on them."""
@@ -175,12 +186,14 @@ def limits_of(
         held, period = sampled(plant, sampling.period, sampling.delay), sampling.period
     u = np.ones((1, 1)) if direction is None else np.asarray(direction)[None, :]
     parts = (
-        magnitude(StateSpace(held.A, held.B[:, [j]], u @ held.C, u @ held.D[:, [j]], period=period))
+        response_of(
+            StateSpace(held.A, held.B[:, [j]], u @ held.C, u @ held.D[:, [j]], period=period)
+        )
         for j in range(held.B.shape[1])
     )
     row = tuple(part for part in parts if part is not None)
     one = plant.B.shape[1] == 1 and len(plant.C) == 1
     zeros = row[0].zeros if one else np.empty(0, complex)
     beyond = zeros[zeros.real > OUTSIDE * np.abs(zeros)]
-    free = magnitude(plant) if one and bounds.compliance_max is not None else None
+    free = response_of(plant) if one and bounds.compliance_max is not None else None
     return Limits(name, bounds, row, free, period, tuple(beyond.tolist()), ratio, integrator)

@@ -1,12 +1,15 @@
 """The bound on every controller for a structured problem, at one θ."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -16,30 +19,37 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.limitations.bound import lower_bound, pointwise, upper_bound
+from ccd_casadi.limitations.bound import forbids_most, lower_bound, pointwise, upper_bound
 from ccd_casadi.limitations.limits import Limits, limits_of
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ
+
+MODEL = "the model"
 
 
 @dataclass(frozen=True)
 class Gap:
-    """ω_b in rad/s: no controller that keeps the bounds on the model has `upper_bound` (infinite:
-    nothing bounds it), some controller has `lower_bound` (0: not computed); `channel` binds."""
+    """ω_b in rad/s: no controller that keeps the bounds on `plants` has `upper_bound` (infinite:
+    nothing bounds it), none on the model `model_bound`, some one on the model has `lower_bound`
+    (both 0: not computed); `channel` binds."""
 
     upper_bound: float
-    lower_bound: float
+    lower_bound: float = 0.0
     channel: str = ""
+    plants: str = MODEL
+    model_bound: float = 0.0
 
     def words(self, bandwidth: float) -> str:
         """Of the verdict, with a design's ω_b in rad/s."""
         if not np.isfinite(self.upper_bound):
             return "no bound on every controller, gap not known"
         return (
-            f"no controller of any order exceeds {self.upper_bound / HZ:.2f} Hz on the model here "
-            f"(gap at most {100.0 * (self.upper_bound / bandwidth - 1.0):.0f} %), gap over theta "
-            "not known"
+            f"no controller of any order exceeds {self.upper_bound / HZ:.2f} Hz on {self.plants} "
+            f"here (gap at most {100.0 * (self.upper_bound / bandwidth - 1.0):.0f} %), gap over "
+            "theta not known"
         )
 
     def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:
@@ -49,6 +59,8 @@ class Gap:
         """
         found = {
             "bandwidth_bound_hz": self.upper_bound / HZ,
+            "plants": self.plants,
+            "model_bound_hz": self.model_bound / HZ or np.nan,
             "inside_hz": self.lower_bound / HZ or np.nan,
             "relative": self.upper_bound / bandwidth - 1.0,
             "channel": self.channel,
@@ -59,17 +71,53 @@ class Gap:
 
 
 def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> Gap:
-    """The bound from outside on the model at θ; `within`, of one channel, from inside besides.
+    """The bound from outside at θ; `within`, of one channel, on the model from both sides besides.
 
-    It holds for every set that holds the model. Raises UserError for a problem of another kind.
+    On the model it holds for every set that has the model in it. Raises UserError for a problem of
+    another kind.
     """
-    found, channel = np.inf, ""
     loops = sorted(limits_of_problem(problem, theta), key=pointwise)
-    for limits in loops:
-        bound = upper_bound(limits, found)
-        if bound < found:
-            found, channel = bound, limits.name
-    return Gap(found, lower_bound(loops[0], found) if within and len(loops) == 1 else 0.0, channel)
+    if loops[0].name:
+        found, channel = np.inf, ""
+        for limits in loops:
+            bound = upper_bound(limits, found)
+            if bound < found:
+                found, channel = bound, limits.name
+        return Gap(found, channel=channel)
+    (model,) = loops
+    pairs = opposite_corners(
+        uncertain_plant(problem, theta), bounds_of(problem), structured_of(problem).sampling,
+        integrator=model.integrator,
+    )  # fmt: skip
+    limits = forbids_most([model, *pairs])
+    gap = Gap(upper_bound(limits), plants="the set" if limits.others else MODEL)
+    if not within:
+        return gap
+    most = upper_bound(model)
+    return replace(gap, model_bound=most, lower_bound=lower_bound(model, most))
+
+
+def opposite_corners(
+    uncertain: UncertainPlant, bounds: Bounds, sampling: Sampling | None, integrator: bool
+) -> list[Limits]:
+    """Of one input and output: each corner of the box with the least damping, and the one opposite.
+
+    One controller serves both, so that both plants' bounds count; T is the first one's.
+    """
+
+    def limits(point: Array) -> Limits:
+        return limits_of(uncertain.plant(point).plant_si(), bounds, sampling, integrator=integrator)
+
+    found: list[Limits] = []
+    box, several = uncertain.box, uncertain.options[0].B.shape[1] > 1
+    damping = np.array([name == "damping" for name in uncertain.names], bool)
+    for option, point in uncertain.corners()[len(uncertain.options) :]:
+        if option or several or (point > box[0])[damping].any():
+            continue
+        opposite = np.where(damping, point, box.sum(axis=0) - point)
+        with suppress(PlantError):
+            found.append(replace(limits(point), others=(limits(opposite),)))
+    return found
 
 
 def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:

@@ -159,7 +159,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
         for name, each, _, colour in same:
             error = scale * np.array([_over(time, e, _error(e)) for e in each])
             curves.append(c.Curve(ms, error[0], name, colour))
-            force.append(c.Curve(ms, _over(time, each[0], each[0].force[:, 0]), "", colour))
+            force.append(c.Curve(ms, _over(time, each[0], each[0].force[:, 0]), name, colour))
             if len(each) > 1:
                 bands.append(c.Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
         if curves:
@@ -167,7 +167,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
                                 levels=(end,)))  # fmt: skip
             end = replace(end, text="")  # said once
     heights = (*[2.6] * len(panels), 2.2)
-    panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
+    panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,), legend=None))
     lines = c.Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
     rows = tuple(
         (name, *(max(map(read, each)) for read in FIGURES.values())) for name, each in ways.items()

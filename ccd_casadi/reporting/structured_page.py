@@ -75,7 +75,7 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
     whole = f"{counted(result['certificate']['plants'], 'plant')} of the set"
     bound = hz(gap.get("bandwidth_bound_hz"))
     rows = [
-        ("no controller of any order exceeds", "the model alone", loop, bound),
+        ("no controller of any order exceeds", gap.get("plants", "the model"), loop, bound),
         ("sections", "the model alone", loop, hz(costs["on_model_hz"])),
         *([("sections", whole, "continuous", hz(costs["continuous_hz"]))] if sampled else []),
         ("sections: the design", whole, loop, hz(result["bandwidth_hz"])),

@@ -122,7 +122,7 @@ def test_a_differentiator_is_said_to_be_one() -> None:
     soft = replace(SOUND, statics=replace(SOUND.statics, share=1e-3, compliance=4e-5))
     words = v.survives(soft, S_max=2.0).words
     assert "differentiator" in words
-    assert "40 um" in words
+    assert "40 µm" in words
     assert "differentiator" not in v.survives(SOUND, S_max=2.0).words
 
 

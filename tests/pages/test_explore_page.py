@@ -109,6 +109,7 @@ def test_pins_outlive_a_reload_and_a_change_to_dark(browser, server):
     slider.press("PageDown")
     page.get_by_role("button", name="Pin this design").click()
     page.wait_for_function(f"{pinned}.design.length == 1")
+    assert page.locator(".slick-header-column").last.bounding_box()["width"] > 250  # its words fit
     before = page.evaluate(f"(d => [[...d.design], [...d.theta_m1]])({pinned})")
     light = page.evaluate(f"{pinned}.colour[0]")
     page.reload()

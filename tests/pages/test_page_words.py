@@ -164,7 +164,9 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
     rest, error = np.zeros(801), 1e-4 * np.exp(-time)
     move = Move(time, rest, rest, error, rest[:, None], False, 0.18, window=1e-6)
     assert shown_until(move) == pytest.approx(0.54)
-    assert "after the figure's end 57.7 µm" in ways_figure({"one": [move]}, "").caption
+    drawn = ways_figure({"one": [move]}, "")
+    assert "after the figure's end 57.7 µm" in drawn.caption
+    assert [row[0].curves[0].label for row in drawn.drawing.rows] == ["one", "one"]  # read out
     soon = replace(move, error=1e-6 * np.exp(-time))
     assert "after the figure's end" not in ways_figure({"one": [soon]}, "").caption
 
