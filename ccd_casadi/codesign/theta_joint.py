@@ -11,6 +11,7 @@ far the first order may reach. Where no more is promised the conditions of optim
 true plants too, as values and slopes are exact in the middle.
 """
 
+import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -39,7 +40,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
-from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
+from ccd_casadi.plants.plant import Evaluate, hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
@@ -59,7 +60,7 @@ LEAST_GAIN = 1e-7  # of w2 ω_b
 LAST, FADED = 12, 0.15  # trials that gain less of all that was gained: made anew, plants tell more
 SETTLED = 3e-4  # of J: less is not worth another set of plants
 CLOSE, NEAR = 0.02, 2e-3  # of the box: last searches, on plants known near and to first order
-ENDINGS, KEPT = 3, 2e-6  # of these; of J: a promise at which the conditions of optimality hold
+ENDINGS, KEPT = 5, 2e-6  # of these; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
@@ -108,8 +109,10 @@ def joint_search(
             return sampler, first, False
         if not np.isfinite(J):
             break
-        make = partial(proposed, problem, models, best, reach)
-        found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
+        found = asked.cached(
+            "together", (*best.theta, reach, turn), Proposal,
+            partial(proposed, problem, models, best, reach),
+        )  # fmt: skip
         if tell is not None:
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
@@ -117,17 +120,19 @@ def joint_search(
             if settled:
                 break
             asked, best, _ = on_worse_plants(asked, models, best, TURNS + turn, WITHIN, tell)
-            best, problem = finished(asked, models, best), asked.problem
+            best, near, problem = *finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
             scenarios = violations(problem, own, kappa, omega_b, 2 * LOOKS * TURNS + turn, tell)[1]
-            settled = not scenarios
+            settled = near and not scenarios
             if settled:
                 break
-            asked = with_scenarios(asked, scenarios)
+            asked = with_scenarios(asked, scenarios) if scenarios else asked
+            known = [best.theta]
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
-        models = ()  # the basis is large: it grows and need not stay
+        models = ()  # the basis is large: it grows and need not stay,
+        gc.collect()  # nor in the circles of searches before
         models = nearby(problem, known, found.end.theta)
         end, there = JointModel(problem, models, found.end, reach).adapted()
         gained = J - there
@@ -137,7 +142,7 @@ def joint_search(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = best if settled or ends is not None else finished(asked, models, best)
+    best = best if settled or ends is not None else finished(asked, models, best)[0]
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
@@ -166,7 +171,8 @@ def on_worse_plants(
     tell: Callable[[str], None] | None,
 ) -> tuple[Sampler, JointPoint, float]:
     """The sampler of the problem with the plants on which the controller exceeds a bound, the
-    controller adapted to them until no worse plant is found, and J there."""
+    controller adapted to them until no worse plant is found, and J there. With the tightest bound
+    every search is made: one alone misses plants."""
     for look in range(LOOKS):
         problem = sampler.problem
         uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
@@ -177,14 +183,17 @@ def on_worse_plants(
         if scenarios:
             sampler = with_scenarios(sampler, scenarios)
         best, J = JointModel(sampler.problem, models, best, 0.0).adapted()
-        if not scenarios or not np.isfinite(J):
+        if not np.isfinite(J) or not (scenarios or within == WITHIN):
             break
     return sampler, best, J
 
 
-def finished(sampler: Sampler, models: Sequence[Evaluate], start: JointPoint) -> JointPoint:
+def finished(
+    sampler: Sampler, models: Sequence[Evaluate], start: JointPoint
+) -> tuple[JointPoint, bool]:
     """The joint optimum near by, on plants known near it and then on the plants themselves to first
-    order: so near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it."""
+    order: so near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it;
+    and whether it is that near, or was."""
 
     def ended(models: Sequence[Evaluate], at: JointPoint, reach: float) -> Proposal:
         make = partial(proposed, problem, models, at, reach, LAST_GAIN)
@@ -193,18 +202,17 @@ def finished(sampler: Sampler, models: Sequence[Evaluate], start: JointPoint) ->
     problem, reach = sampler.problem, NEAR
     best = ended(models, start, CLOSE).end
     models = nearby(problem, (), best.theta)
-    best, J = JointModel(problem, models, best, reach).adapted()
+    best, J = first = JointModel(problem, models, best, reach).adapted()
     for _ in range(ENDINGS):
         found = ended(models, best, reach)
         if found.gain <= KEPT * abs(J):
-            break
+            return best, True
         others = nearby(problem, (), found.end.theta)
         end, there = JointModel(problem, others, found.end, reach).adapted()
+        reach *= 2.0 if J - there > GOOD * found.gain else 0.3
         if there < J:
             best, J, models = end, there, others
-        else:
-            reach *= 0.1
-    return best
+    return best, first[1] - J <= SETTLED * abs(J)
 
 
 def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:
@@ -254,7 +262,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     x = (z, κ, τ), with the loops at x."""
 
     corrected = bending = True
-    enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
+    enough: float | None = None  # a gain of what is minimised that counts; None: to the optimum
 
     def __init__(
         self, problem: CoDesignProblem, models: Sequence[Evaluate], place: JointPoint, reach: float
@@ -317,21 +325,17 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         count = len(self.middle)
         return x[:count], x[count:-1], float(x[-1])
 
-    def uncertain(self, z: Array, beside: Array | None = None) -> UncertainPlant:
-        """The plant at z, or beside z to first order."""
+    def uncertain(self, z: Array) -> UncertainPlant:
+        """The plant at z."""
         theta = tuple(self.theta(z).tolist())
-        known = [model(theta) for model in self.models]
-        if beside is not None:
-            known = [to_first_order(one, self.width * beside) for one in known]
-            theta = tuple(self.theta(z + beside).tolist())
-        return uncertain_plant(self.problem, theta, known)
+        return uncertain_plant(self.problem, theta, [model(theta) for model in self.models])
 
-    def loops(self, z: Array, beside: Array | None = None) -> LoopProblem:
+    def loops(self, z: Array) -> LoopProblem:
         """Those of the set there, in the units of its first plant in the middle."""
         share = self.width[:, None, None]
         plants = [
             replace(plant, dA=share * plant.dA, dB=share * plant.dB, dC=share * plant.dC)
-            for plant in self.uncertain(z, beside).plants(self.scenarios)
+            for plant in self.uncertain(z).plants(self.scenarios)
         ]
         structured = structured_of(self.problem)
         return problem_for(
@@ -340,7 +344,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         )  # fmt: skip
 
     def _loops_beside(self, z: tuple[float, ...]) -> list[LoopProblem]:
-        return [self.loops(np.array(z), BESIDE * unit) for unit in np.eye(len(z))]
+        return [self.loops(np.array(z) + BESIDE * unit) for unit in np.eye(len(z))]
 
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
         """With every loop stable, and masses that are positive to first order."""
@@ -362,9 +366,11 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     def ended(self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]) -> bool:
         """Where the last trials gain little of what all have."""
         self.merits.append(here.value + PENALTY * here.violation)
+        if self.enough is None:
+            return False
         gained = self.merits[0] - self.merits[-1]
         late = self.merits[-LAST:][0] - self.merits[-1]
-        return len(self.merits) > LAST and gained > self.enough and late < FADED * gained
+        return len(self.merits) > LAST and late < FADED * max(gained, self.enough)
 
     def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""

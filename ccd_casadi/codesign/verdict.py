@@ -17,9 +17,9 @@ from typing import Any
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FigureOfMerit
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import counted, metres, small_share, with_unit
+from ccd_casadi.support.units import counted, small_share, with_unit
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -165,7 +165,7 @@ def predicted(
     sigmas: float | None = None,
     extrapolates: Sequence[str] = (),
     surrogate: bool = True,
-    of: Figure = BANDWIDTH,
+    of: FigureOfMerit = BANDWIDTH,
 ) -> VerdictLine:
     """Surrogate against truth at the design.
 
@@ -253,7 +253,7 @@ def survives(
     if rest.differentiates:
         said.append(
             f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
-            f"bandwidth, 1 N at rest moves the stage {metres(rest.compliance, 2)}"
+            f"bandwidth, 1 N at rest moves the stage {with_unit(rest.compliance, 'm', 2)}"
         )
     figures = {
         **(figures or {}),
@@ -294,7 +294,7 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
     words = (
         f"run deploy; the loops' least delay margin is {with_unit(survival.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
-    ).replace("µ", "u")
+    )
     return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
 
 

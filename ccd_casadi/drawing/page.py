@@ -10,7 +10,7 @@ from html import escape as _escape
 from typing import Any
 
 from ccd_casadi.drawing.content import Table
-from ccd_casadi.drawing.svg import THEME
+from ccd_casadi.drawing.svg import SUPERSCRIPT, THEME
 from ccd_casadi.support.package_text import filled, package_text
 from ccd_casadi.support.units import number
 
@@ -44,11 +44,19 @@ def typeset(text: str) -> str:
 
     >>> typeset("less than +-2 %, norm <= 3, 41 um").replace("\xa0", "~")
     'less than ±2~%, norm ≤ 3, 41~µm'
+    >>> typeset("KKT residual 1.5e-16, at confidence 1 - 1e-6")
+    'KKT residual 1.5·10⁻¹⁶, at confidence 1 - 10⁻⁶'
     """
     for plain, sign in (("+-", "±"), ("<=", "≤"), (">=", "≥")):
         text = text.replace(plain, sign)
     text = re.sub(r"(?<=\d) u(?=[ms]\b)", " µ", text)
+    text = re.sub(r"\b(\d(?:\.\d+)?)e([+-]?\d+)\b", _power, text)  # and no line ends in it
     return re.sub(r"(?<=\d) (?=(?:%|°|[GMkmµn]?(?:Hz|kg|N|m|s)\b))", "\xa0", text)
+
+
+def _power(found: re.Match[str]) -> str:
+    power = f"10{str(int(found[2])).translate(SUPERSCRIPT)}"
+    return power if found[1] == "1" else f"{found[1]}·{power}"
 
 
 def table_html(table: Table) -> str:

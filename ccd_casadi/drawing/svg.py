@@ -36,6 +36,7 @@ THEME = {
 }  # fmt: skip
 VARIABLES = {light: f"var(--{name})" for name, (light, _) in THEME.items()}
 VARIABLES["#000000"] = "var(--ink)"
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 COLOUR_MAP = "viridis"
 WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
 NARROW = 4.6  # inches of the same figure on a screen of a telephone
@@ -187,5 +188,5 @@ def power_of_ten(value: float, plain: bool = False) -> str:
         return f"{value:g}"
     exponent = int(np.floor(np.log10(value) + 1e-9))
     lead = value / 10.0**exponent
-    digits = str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    digits = str(exponent).translate(SUPERSCRIPT)
     return f"10{digits}" if abs(lead - 1.0) < 1e-6 else f"{lead:g}·10{digits}"

@@ -10,7 +10,7 @@ from ccd_casadi.drawing.svg import BLACK, CYCLE
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.units import number
+from ccd_casadi.support.units import display_unit, number, with_unit
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
 DECADES = 3.5  # of the error's axis
@@ -31,23 +31,24 @@ def budget_chapter(
 
 def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
     windowed = model.window is not None
-    head = ["source", "enters as", "RMS error (µm)", "of the variance (%)"]
-    head += ["MA (µm)", "MSD (µm)"] if windowed else []
+    unit, scale = display_unit("m", model.error)
+    head = ["source", "enters as", f"RMS error ({unit})", "of the variance (%)"]
+    head += [f"MA ({unit})", f"MSD ({unit})"] if windowed else []
     head += ["RMS force (N)"]
     rows = []
     for item in model.sources:
         share = 100.0 * (item.error / model.error) ** 2 if model.error > 0.0 else 0.0
-        moving = (1e6 * item.average, 1e6 * item.deviation) if windowed else ()
+        moving = (scale * item.average, scale * item.deviation) if windowed else ()
         kind = item.source.kind.value.replace("_", " ")
-        rows.append((item.source.name, kind, 1e6 * item.error, share, *moving, item.force))
-    moving = (1e6 * model.average, 1e6 * model.deviation) if windowed else ()
-    rows.append(("together", "", 1e6 * model.error, 100.0, *moving, model.force))
+        rows.append((item.source.name, kind, scale * item.error, share, *moving, item.force))
+    moving = (scale * model.average, scale * model.deviation) if windowed else ()
+    rows.append(("together", "", scale * model.error, 100.0, *moving, model.force))
     words = "The error of the true position, r - y"
     words += " at the samples" if found.hold is not None else ""
     if found.plants > 1:
         words += (
             f", on the model; on the {found.plants} plants of the set at most "
-            f"{number(1e6 * found.largest_error, 4)} µm and {number(found.largest_force, 4)} N"
+            f"{with_unit(found.largest_error, 'm', 4)} and {number(found.largest_force, 4)} N"
         )
     if windowed:
         words += (
@@ -59,8 +60,8 @@ def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
     if exact:
         worst = max(item.disagreement for item in exact)
         words += (
-            ". Filters by Lyapunov's equation, which the integral over frequency confirms to "
-            f"{number(worst, 1)}"
+            ". Filters by Lyapunov's equation; the integral over frequency differs by "
+            f"{number(worst, 1)} (relative)"
         )
     if tables:
         worst = max(item.disagreement for item in tables)
@@ -79,19 +80,19 @@ def _figure(model: BudgetFigures) -> Figure:
     low = float(hz[np.searchsorted(whole, SHOWN**2 * whole[-1])])
     high = float(hz[min(np.searchsorted(whole, (1.0 - 1e-6) * whole[-1]), len(hz) - 1)])
     x = (low, max(2.0 * high, 10.0 * low))
+    unit, scale = display_unit("m", model.error)
     curves = [
-        Curve(hz, 1e6 * np.sqrt(part), item.source.name, CYCLE[i % (len(CYCLE) - 1)],
+        Curve(hz, scale * np.sqrt(part), item.source.name, CYCLE[i % (len(CYCLE) - 1)],
               "-" if i < len(CYCLE) - 1 else "--")
         for i, (item, part) in enumerate(zip(shown, parts, strict=True))
     ]  # fmt: skip
-    total = Curve(hz, 1e6 * np.sqrt(whole), "together", BLACK, width=1.8)
-    top = 1e6 * float(np.sqrt(whole[-1]))
-    panel = Panel("frequency (Hz)", "RMS error up to it (µm)", (*curves, total), log_x=True,
+    total = Curve(hz, scale * np.sqrt(whole), "together", BLACK, width=1.8)
+    top = scale * float(np.sqrt(whole[-1]))
+    panel = Panel("frequency (Hz)", f"RMS error up to it ({unit})", (*curves, total), log_x=True,
                   log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top))  # fmt: skip
     lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
     words = (
-        "Dynamic error budget: the RMS error that has come together up to each frequency, by "
-        "source; the squares of the curves add up to the black one's. Where a curve rises is "
-        "where its source is felt."
+        "Dynamic error budget: the RMS error up to each frequency, by source; the squares of the "
+        "curves add up to that of the black one. A source acts where its curve rises."
     )
     return Figure(lines, words)

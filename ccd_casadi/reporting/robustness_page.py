@@ -12,7 +12,7 @@ from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Line, PerturbedLoop
 from ccd_casadi.robust.study import Study
-from ccd_casadi.support.units import HZ, metres, number, with_unit
+from ccd_casadi.support.units import HZ, number, with_unit
 
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
@@ -109,10 +109,10 @@ def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
 
 def _moved(found: Study, i: int) -> str:
     move = found.moves[i]
-    told = way_words(move.words, [move])
+    stroke, window = (with_unit(v, "m") for v in (found.demands.limits.stroke, move.window))
     return (
-        f"Move of {metres(found.demands.limits.stroke)} in {1e3 * move.duration:.4g} ms {told} "
-        f"(±{metres(move.window)}), peak force {max(move.peak_force):.4g} N."
+        f"Move of {stroke} in {1e3 * move.duration:.4g} ms {way_words(move.words, [move])} "
+        f"(±{window}), peak force {max(move.peak_force):.4g} N."
     )
 
 

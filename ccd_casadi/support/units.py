@@ -41,15 +41,6 @@ def with_unit(value: float, unit: str, digits: int = 3) -> str:
     return f"{number(factor * value, digits)} {read}"
 
 
-def metres(value: float, digits: int = 3) -> str:
-    """A length for the terminal, in ASCII.
-
-    >>> metres(4.1e-5), metres(-2.5e-10)
-    ('41 um', '-0.25 nm')
-    """
-    return with_unit(value, "m", digits).replace("µ", "u")
-
-
 def counted(number: int, noun: str) -> str:
     """A number of things.
 

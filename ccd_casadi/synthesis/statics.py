@@ -16,7 +16,7 @@ from ccd_casadi.lti.grid import refine_peak
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ, metres, with_unit
+from ccd_casadi.support.units import HZ, with_unit
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
@@ -49,12 +49,12 @@ class Statics:
     @property
     def words(self) -> str:
         """One or two sentences."""
-        low = f"1 N at {self.low_hz:.3g} Hz moves it {metres(self.low)}"
+        low = f"1 N at {self.low_hz:.3g} Hz moves it {with_unit(self.low, 'm')}"
         if self.integrates:
             return f"The controller integrates: a constant force does not move the stage; {low}."
         found = (
             f"Static stiffness K(0) = {with_unit(self.stiffness, 'N/m')}: a constant force of 1 N "
-            f"moves the stage {metres(self.compliance)}, {low}."
+            f"moves the stage {with_unit(self.compliance, 'm')}, {low}."
         )
         if self.differentiates:
             found += (
