@@ -25,6 +25,7 @@ from surrogates import design
 POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
 FEW = 8  # points at most where each takes a search over the controller, seconds or more
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
+NEARLY = 0.03  # relative: an end of a range that is worse by less may lead to a better optimum
 CLUSTER = 0.02  # of the box: inner problems that are closer are one look
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
@@ -66,7 +67,8 @@ def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
     ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
         found = outer.sampler.values(ends, "search from the ends of each parameter")
-        least = np.inf if outer.global_check_is_cheap else best
+        room = 0.0 if is_expensive(problem) else NEARLY * abs(best)
+        least = np.inf if outer.global_check_is_cheap else best + room
         solve_from([sample for sample in found if objective_of(problem, sample) < least])
     return GlobalCheck(
         points=len(samples),

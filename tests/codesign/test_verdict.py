@@ -4,8 +4,6 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -21,10 +19,8 @@ from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.direct import TrueDesign
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.formulations import formulation_of
-from ccd_casadi.codesign.global_check import _starts, global_check
 from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
-from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
@@ -32,7 +28,6 @@ from ccd_casadi.codesign.survival import REACH, Survival, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.paint import verdict_html
 from ccd_casadi.inner_problem.controller_problem import RobustSet
-from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import KktCertificate
@@ -40,12 +35,10 @@ from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting import verdict as shown
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from ccd_casadi.synthesis.statics import Statics
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
-from surrogates import design
 
 ROOT = Path(__file__).parents[2]
 KKT_LEVEL = VerifiedDesign.kkt_level
@@ -288,55 +281,6 @@ def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:
         assert kkt.stationarity <= KKT_LEVEL
         ends.append(TrueDesign(case, end, quantities.at(end)).objective)
     assert ends[0] == pytest.approx(ends[1], rel=1e-5)
-
-
-def test_local_solves_start_from_more_than_what_beats_its_neighbours() -> None:
-    case = problem()
-    thetas = design("sobol", np.array(case.lower), np.array(case.upper), 16, 0)
-    samples = [
-        InnerSample(tuple(theta), 1.0, (0.0, 0.0), 1.0, 1.0, (), "", 0.0, 1)
-        for theta in thetas
-    ]  # fmt: skip
-    values = ((thetas - np.array(case.lower)) ** 2).sum(axis=1)  # one basin, one lowest point
-    lowest, others = _starts(case, samples, values, np.array(case.upper))
-    starts = [*lowest, *others]
-    assert [samples.index(start) for start in starts] == list(np.argsort(values))
-
-
-def test_the_way_to_one_optimum_is_no_look_at_the_rest_of_the_box() -> None:
-    """Where each point is dear the solved ones count, and what they leave open is looked at."""
-    case = problem(w1=0.0)
-    lower, upper = np.array(case.lower), np.array(case.upper)
-    low, high = np.array([0.2, 0.2]), np.array([0.8, 0.8])  # of the box: two optima
-
-    def sample(theta: np.ndarray) -> InnerSample:
-        z = (theta - lower) / (upper - lower)
-        away = [float(((z - at) ** 2).sum()) for at in (low, high)]
-        value = 300.0 + 20.0 * math.exp(-9.0 * away[0]) + 40.0 * math.exp(-9.0 * away[1])
-        return InnerSample(tuple(theta), value, (0.0, 0.0), 1.0, 1.0, (), "", 0.0, 1)
-
-    def local_solve(start: InnerSample, _: object) -> Place:
-        z = (np.array(start.theta) - lower) / (upper - lower)
-        at = min((low, high), key=lambda end: float(np.abs(z - end).max()))
-        end = sample(lower + at * (upper - lower))
-        return Place(np.array(end.theta), objective_of(case, end), True)
-
-    path = [sample(lower + share * low * (upper - lower)) for share in np.linspace(0.0, 1.0, 9)]
-    sampler = SimpleNamespace(
-        solved={one.theta: one for one in path},
-        values=lambda thetas, _: [sample(theta) for theta in thetas],
-    )
-    outer = SimpleNamespace(
-        problem=case, sampler=sampler, global_check_is_cheap=False, kkt_level=1e-2,
-        theta_of=lambda x: x, local_solve=local_solve,
-    )  # fmt: skip
-    here = path[-1]
-    kkt = SimpleNamespace(stationarity=0.0)
-    end = SimpleNamespace(x=np.array(here.theta), objective=objective_of(case, here), kkt=kkt)
-    look = global_check(cast(Outer, outer), cast(End, end), 8, 0)
-    assert look.moved
-    assert look.x == pytest.approx(lower + high * (upper - lower))
-    assert look.points <= len(path) + 8
 
 
 @pytest.mark.slow
