@@ -23,7 +23,7 @@ def figures(siso: int, mimo: int, warm: bool) -> np.ndarray:
     from problems import BACKOFF, OMEGA_LOW, stage, two_masses, weights
 
     from ccd_casadi.kernels.design import design
-    from ccd_casadi.kernels.figures import Figure
+    from ccd_casadi.kernels.figures import Column
 
     rng = np.random.default_rng(7)
     rows = []
@@ -36,7 +36,7 @@ def figures(siso: int, mimo: int, warm: bool) -> np.ndarray:
         low = OMEGA_LOW / plant.omega_0
         row = design(plant.A, plant.B, plant.C, w, plant.grid, plant.gain, BACKOFF, low, 0.0)[0]
         if warm:
-            guess = row[Figure.GAMMA_OPT] * (1 + 0.01 * rng.choice([-1, 1]))
+            guess = row[Column.GAMMA_OPT] * (1 + 0.01 * rng.choice([-1, 1]))
             row = design(plant.A, plant.B, plant.C, w, plant.grid, plant.gain, BACKOFF, low, guess)[
                 0
             ]
@@ -46,25 +46,25 @@ def figures(siso: int, mimo: int, warm: bool) -> np.ndarray:
 
 def compare(old: np.ndarray, new: np.ndarray) -> None:
     """Print the largest relative differences over designs that both certify."""
-    from ccd_casadi.kernels.figures import Code, Figure
+    from ccd_casadi.kernels.figures import Code, Column
 
     for code in Code:
-        a, b = (rows[:, Figure.CODE] == code for rows in (old, new))
+        a, b = (rows[:, Column.CODE] == code for rows in (old, new))
         if a.any() or b.any():
             print(f"  {code.name:20s} {a.sum():6d} before, {b.sum():6d} now")
-    moved = old[:, Figure.CODE] != new[:, Figure.CODE]
+    moved = old[:, Column.CODE] != new[:, Column.CODE]
     print(f"  outcomes that changed: {np.flatnonzero(moved).tolist()}")
-    both = ~moved & (old[:, Figure.CODE] == 0)
-    limited = (old[:, Figure.LIMITED_BY_BOUND] != new[:, Figure.LIMITED_BY_BOUND]) & both
-    print(f"  limited by the bound: {int(new[:, Figure.LIMITED_BY_BOUND].sum())}, "
+    both = ~moved & (old[:, Column.CODE] == 0)
+    limited = (old[:, Column.LIMITED_BY_BOUND] != new[:, Column.LIMITED_BY_BOUND]) & both
+    print(f"  limited by the bound: {int(new[:, Column.LIMITED_BY_BOUND].sum())}, "
           f"changed: {int(limited.sum())}")  # fmt: skip
     for name in FIGURES:
-        a, b = old[both, Figure[name]], new[both, Figure[name]]
+        a, b = old[both, Column[name]], new[both, Column[name]]
         with np.errstate(invalid="ignore"):
             off = np.abs(b / a - 1.0)
         off[a == b] = 0.0  # infinite peak frequencies
         print(f"  {name:20s} {off.max():.1e} (median {np.median(off):.1e})")
-    forms = [rows[both, Figure.SCHUR_FORMS].mean() for rows in (old, new)]
+    forms = [rows[both, Column.SCHUR_FORMS].mean() for rows in (old, new)]
     print(f"  Schur forms to γ_opt: {forms[0]:.2f} before, {forms[1]:.2f} now")
 
 

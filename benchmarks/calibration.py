@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.problem import scaled_plant, true_inner
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import sweep_inner
 from ccd_casadi.kernels.design import design
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
 from ccd_casadi.lti.loop import Loop
@@ -88,14 +88,14 @@ def table(plant, weights, backoff):
         for i in range(S.size)[:: 1 if j % 2 == 0 else -1]:
             w = weights.at(S[i] * HZ, T[j] * HZ).scaled(plant.omega_0)
             row, *K = design(*loop, w, plant.grid, plant.gain, backoff, omega[1], guess)
-            if row[Figure.CODE] != Code.CERTIFIED:
+            if row[Column.CODE] != Code.CERTIFIED:
                 raise RuntimeError(f"uncertified design at omega_S {S[i]:g}, omega_T {T[j]:g} Hz")
-            guess = row[Figure.GAMMA_OPT]
+            guess = row[Column.GAMMA_OPT]
             low, g = np.split(gains(*loop, *K, omega), [len(OMEGA_LOW)])
             k = int(np.argmax((g[1:-1] > g[:-2]) & (g[1:-1] >= g[2:]))) + 1
             shift = 0.5 * (g[k - 1] - g[k + 1]) / (g[k - 1] - 2.0 * g[k] + g[k + 1])
             peak = SCAN[k] * (SCAN[1] / SCAN[0]) ** np.clip(shift, -0.5, 0.5)
-            out[i, j] = np.log([row[Figure.BANDWIDTH] * unit, row[Figure.PEAK], peak, *low])
+            out[i, j] = np.log([row[Column.BANDWIDTH] * unit, row[Column.PEAK], peak, *low])
     return out
 
 

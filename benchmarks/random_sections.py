@@ -45,7 +45,7 @@ from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
-from ccd_casadi.fixed_structure.loop_problem import FIRST, Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import MARGIN, RESTORING, DesignSearch
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -193,10 +193,10 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     peaks = assess(free, starts[0], FIRST, depth=-50.0).peaks
     assert peaks is not None
     over = {code: float(np.exp(peaks.value[peaks.curve == code].max(initial=-np.inf)))
-            for code in Curve}  # fmt: skip
-    has = {"S_max": over[Curve.S_MAX], "S_low": over[Curve.S_LOW],
-           "weighted_level": max(over[Curve.KS], over[Curve.T]),
-           "compliance_max": over[Curve.GS]}  # fmt: skip
+            for code in LoopCurve}  # fmt: skip
+    has = {"S_max": over[LoopCurve.S_MAX], "S_low": over[LoopCurve.S_LOW],
+           "weighted_level": max(over[LoopCurve.KS], over[LoopCurve.T]),
+           "compliance_max": over[LoopCurve.GS]}  # fmt: skip
     drawn = {}
     for name, ratio in has.items():
         times = float(np.exp(rng.uniform(0.02, 0.6)))

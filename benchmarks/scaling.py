@@ -8,7 +8,7 @@ import time
 from problems import BACKOFF, OMEGA_LOW, stage, weights
 
 from ccd_casadi.kernels.design import design
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 
 
 def main() -> None:
@@ -25,9 +25,9 @@ def main() -> None:
             row = design(*data)[0]
             times.append(time.process_time() - start)
         n, (p, m) = plant.A.shape[0], (plant.C.shape[0], plant.B.shape[1])
-        outcome = Code(int(row[Figure.CODE])).name.lower()
+        outcome = Code(int(row[Column.CODE])).name.lower()
         print(f"{n + 2 * p + m:3d}  {n:5d}  {p:8d}  {1e3 * min(times):8.2f}  "
-              f"{row[Figure.SCHUR_FORMS]:.0f}  {outcome}")  # fmt: skip
+              f"{row[Column.SCHUR_FORMS]:.0f}  {outcome}")  # fmt: skip
 
 
 if __name__ == "__main__":

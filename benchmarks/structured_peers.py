@@ -26,7 +26,7 @@ from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.fixed_structure.design import _pool, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.sections_design import DesignSearch
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -53,7 +53,7 @@ def problems(count: int) -> list[tuple[int, Case]]:
 
 def by_slsqp(problem: LoopProblem, start: Point, until: float) -> Point | None:
     """SLSQP's end from a start, at the bandwidth that it has; None where its loops are unstable."""
-    curves = [*problem.curves, Curve.S_LOW, Curve.CROSSING]
+    curves = [*problem.curves, LoopCurve.S_LOW, LoopCurve.CROSSING]
     place = {(int(curve), plant): i for i, (curve, plant) in enumerate(
         (curve, plant) for curve in curves for plant in range(problem.plants.count))}  # fmt: skip
     last: dict[str, Any] = {"x": None}

@@ -24,7 +24,7 @@ from problems import BACKOFF, HZ, OMEGA_LOW, Problem, stage, two_masses, weights
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.kernels.design import design, judge, sweep
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.gamma import optimal_gamma
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.lapack import stable_subspace
@@ -47,11 +47,11 @@ def best(action, seconds: float, least: int = 3) -> float:
 def certify(problem: Problem, controller, gamma: float) -> str:
     """What the project's own certificate says of a controller at its γ."""
     plant, w = problem.plant, problem.weights.scaled(problem.plant.omega_0)
-    row = np.full(int(Figure.COUNT), np.nan)
+    row = np.full(int(Column.COUNT), np.nan)
     Ak, Bk, Ck, Dk = (np.ascontiguousarray(matrix, float) for matrix in controller)
     low = OMEGA_LOW / plant.omega_0
     judge(plant.A, plant.B, plant.C, Ak, Bk, Ck, Dk, w, 0.0, gamma, low, row)
-    return Code(int(row[Figure.CODE])).name.lower()
+    return Code(int(row[Column.CODE])).name.lower()
 
 
 def by_mixsyn(problem: Problem) -> tuple[float, str]:
@@ -107,7 +107,7 @@ def by_ours(problem: Problem) -> tuple[float, float, str]:
     rows = sweep(*data, omega_S, omega_T, *end)
     swept = best(lambda: sweep(*data, omega_S, omega_T, *end), 5.0) / rows[..., 0].size
     single = best(lambda: design(*data, *end, 0.0), 2.0)
-    bad = int((rows[..., Figure.CODE] != 0).sum())
+    bad = int((rows[..., Column.CODE] != 0).sum())
     verdict = "certified" if bad == 0 else f"{bad} of {rows[..., 0].size} refused"
     return swept, single, verdict
 
@@ -131,7 +131,7 @@ def one_cold(problem: Problem) -> tuple[float, str]:
     data = (plant.A, plant.B, plant.C, problem.weights.scaled(plant.omega_0), plant.grid)
     end = (plant.gain, BACKOFF, OMEGA_LOW / plant.omega_0, 0.0)
     row = design(*data, *end)[0]
-    return best(lambda: design(*data, *end), 2.0), Code(int(row[Figure.CODE])).name.lower()
+    return best(lambda: design(*data, *end), 2.0), Code(int(row[Column.CODE])).name.lower()
 
 
 def inner_optimum(problem: Problem) -> tuple[float, int]:

@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, Outcome
@@ -198,14 +198,15 @@ def check_references(
 ) -> tuple[ReferenceCheck, ...]:
     """The design's controller on every reference of the problem's plant at θ."""
     names = tuple(plant_of(problem).references)
-    tasks = [(problem, tuple(theta), design, name) for name in names]
-    checks = (workers or Workers(1)).map_unordered(_unit, tasks)
+    tasks = {name: (problem, tuple(theta), design, name) for name in names}
     bar = Progress(len(tasks), "closer models", quiet=quiet)
-    return tuple(sorted(bar.over(checks), key=lambda check: names.index(check.name)))
+    checks = dict(bar.over(results(workers, _check, tasks)))
+    return tuple(checks[name] for name in names)
 
 
-def _unit(task: tuple[CoDesignProblem, tuple[float, ...], Design, str]) -> ReferenceCheck:
-    problem, theta, design, name = task
+def _check(
+    problem: CoDesignProblem, theta: tuple[float, ...], design: Design, name: str
+) -> ReferenceCheck:
     return check_on(problem, plant_of(problem).references[name](theta), design, name)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FigureOfMerit
 from ccd_casadi.optim.kkt import Kink, KktCertificate
 from ccd_casadi.support.units import counted, small_share, with_unit
 
@@ -165,7 +165,7 @@ def predicted(
     sigmas: float | None = None,
     extrapolates: Sequence[str] = (),
     surrogate: bool = True,
-    of: Figure = BANDWIDTH,
+    of: FigureOfMerit = BANDWIDTH,
 ) -> VerdictLine:
     """Surrogate against truth at the design.
 

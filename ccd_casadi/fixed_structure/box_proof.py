@@ -12,7 +12,7 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.box_division import Division, divided, raised
+from ccd_casadi.fixed_structure.box_division import divided, raised
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.structure import Structure
@@ -20,7 +20,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.process_pool import Pool, results
 
 SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
 SLACK_OF_MANY = 0.05  # of several channels or many parameters
@@ -155,8 +155,8 @@ def divide(
     """Branch and bound of every option's loops, each stable at one point of `box` (2, n): `share`
     boxes of each, or `enough` where many of these are still open then."""
     enough = share if enough is None else enough
-    tasks = [(option, own, box, slack, share, enough) for option, own in enumerate(families)]
-    found = dict((workers or Workers(1)).map_unordered(_divided, tasks))
+    tasks = {option: (own, box, slack, share, enough) for option, own in enumerate(families)}
+    found = dict(results(workers, divided, tasks))
     names, levels = families[0].names, dict[str, float]()
     for option in range(len(families)):
         if (passed := found[option].passed) is not None:
@@ -171,7 +171,3 @@ def divide(
     elif highest > 1.0 + slack:
         outcome = ProofOutcome.LOOSER
     return Proof(outcome, slack, names, levels, sum(one.boxes for one in found.values()))
-
-
-def _divided(task: tuple[int, LoopFamily, Array, float, int, int]) -> tuple[int, Division]:
-    return task[0], divided(*task[1:])

@@ -28,7 +28,7 @@ from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.units import counted
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
@@ -103,13 +103,13 @@ def certify(
     sizes = [(plant.A.shape, plant.B.shape, plant.C.shape) for plant in plants]
     alike = [[i for i, own in enumerate(sizes) if own == size] for size in dict.fromkeys(sizes)]
     parts = [same[i : i + AT_ONCE] for same in alike for i in range(0, len(same), AT_ONCE)]
-    tasks = [
-        (number, ([plants[i] for i in part], controller, bounds, sampling, integrator))
-        for number, part in enumerate(parts)
-    ]
+    tasks = {
+        tuple(part): ([plants[i] for i in part], controller, bounds, sampling, integrator)
+        for part in parts
+    }
     each: dict[int, PlantFigures] = {}
-    for number, part in (workers or Workers(1)).map_unordered(_judge, tasks):
-        each |= zip(parts[number], part, strict=True)
+    for part, figures_of in results(workers, judged, tasks):
+        each |= zip(part, figures_of, strict=True)
     found = [each[i] for i in range(len(plants))]
     unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]
     if unstable:
@@ -134,13 +134,6 @@ def certify(
         words = f"stable and within every bound on {counted(len(found), 'plant')}"
     passed = not broken and not lost and bandwidth > 0.0
     return SetCertificate(passed, bandwidth, tuple(found), worst, words)
-
-
-Task = tuple[list[ScaledPlant], StateSpace, Bounds, Sampling | None, bool]
-
-
-def _judge(task: tuple[int, Task]) -> tuple[int, list[PlantFigures]]:
-    return task[0], judged(*task[1])
 
 
 def judged(

@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
-    Curve,
+    LoopCurve,
     LoopProblem,
     Places,
 )
@@ -78,7 +78,7 @@ def assess(
     whole = np.where(sought, closed, whole)
     curve, row, at = [peaks.curve[whole]], [peaks.row[whole]], [top[whole]]
     low = plants.variable(np.full(len(crossing), problem.low))
-    for end_curve, place in ((Curve.S_LOW, low), (Curve.CROSSING, crossing)):
+    for end_curve, place in ((LoopCurve.S_LOW, low), (LoopCurve.CROSSING, crossing)):
         numbers = np.flatnonzero(np.isfinite(problem.limits[end_curve]))
         row.append((numbers[:, None] * P + every).ravel())
         curve.append(np.full(len(row[-1]), end_curve))
@@ -95,8 +95,8 @@ def constraints(
 ) -> Constraints:
     """Values and derivatives of these rows of these curves at these v."""
     value, slope, to_kappa, *_ = evaluate_rows(problem, kappa, tau, curve, row, v)
-    to_tau = np.where(curve == Curve.SHAPE, 1.0, 0.0)
-    end = curve == Curve.CROSSING
+    to_tau = np.where(curve == LoopCurve.SHAPE, 1.0, 0.0)
+    end = curve == LoopCurve.CROSSING
     to_tau[end] = slope[end] / problem.plants.chain(v[end])
     return Constraints(curve, row, v, value + problem.margin, to_kappa, to_tau)
 
@@ -119,7 +119,7 @@ def to_theta(problem: LoopProblem, kappa: Array, constraints: Constraints) -> Ar
     for i in np.unique(which):
         own = np.flatnonzero(which == i)
         out[own] = plants.form_to_theta(int(i), v[own], x[own], y[own]).real
-        own = own[constraints.curve[own] == Curve.GS]
+        own = own[constraints.curve[own] == LoopCurve.GS]
         if len(own):
             free = plants.form_to_theta(int(i), v[own], -x[own], right[own], free=True)
             out[own] += free.real
@@ -148,8 +148,8 @@ def hessians(
     found = evaluate_rows(problem, kappa, tau, np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
     (slope, *slopes), (own, *to_kappa) = (np.split(part, 3) for part in found[1:3])
     c_xx, c_xk = ((up - down) / (2.0 * STEP) for up, down in (slopes, to_kappa))
-    end = rows.curve == Curve.CROSSING
-    fixed = end | (rows.curve == Curve.S_LOW)
+    end = rows.curve == LoopCurve.CROSSING
+    fixed = end | (rows.curve == LoopCurve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
     c_xz, smooth = np.zeros((m, k)), np.ones(m, bool)
     if beside:

@@ -21,7 +21,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     FIRST,
     Assessment,
     Constraints,
-    Curve,
+    LoopCurve,
     LoopProblem,
     Places,
 )
@@ -30,7 +30,7 @@ from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.loop_curvature import second
-from ccd_casadi.kernels.loop_point import Loop
+from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.loop_rows import levels, rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -82,16 +82,16 @@ class LineProblem(LoopProblem):
     effort: float | None = None
 
     @cached_property
-    def curves(self) -> tuple[Curve, ...]:
+    def curves(self) -> tuple[LoopCurve, ...]:
         """KS too where the effort is bounded."""
         found = super().curves
-        return found if self.effort is None or Curve.KS in found else (*found, Curve.KS)
+        return found if self.effort is None or LoopCurve.KS in found else (*found, LoopCurve.KS)
 
-    def loop(self, kappa: Array, tau: float) -> Loop:
+    def loop(self, kappa: Array, tau: float) -> LoopArrays:
         """With the bound of |KS| at this ω_b."""
         loop = super().loop(kappa, tau)
-        loop.limits[Curve.KS, : self.first] = np.minimum(
-            loop.limits[Curve.KS, : self.first], self.ceiling(tau)[0]
+        loop.limits[LoopCurve.KS, : self.first] = np.minimum(
+            loop.limits[LoopCurve.KS, : self.first], self.ceiling(tau)[0]
         )
         return loop
 
@@ -229,13 +229,13 @@ def _(
     value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT)[:, 0]
     value = np.where(problem.short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
     i, c, k = np.nonzero(value > RELEVANT)
-    at_low = np.flatnonzero(np.isfinite(problem.limits[Curve.S_LOW]))
+    at_low = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.S_LOW]))
     low = (at_low[:, None] * P + np.arange(lines, P)).ravel()
-    curve = np.concatenate([codes[c], np.full(len(low), Curve.S_LOW)])
+    curve = np.concatenate([codes[c], np.full(len(low), LoopCurve.S_LOW)])
     row = np.concatenate([i + k * P, low])
     found, _, to_kappa, *_ = rows(curve, row // P, row % P, v[row % P], loop)
-    to_tau = np.where(curve == Curve.SHAPE, 1.0, 0.0)
-    to_tau[curve == Curve.KS] = -problem.ceiling(tau)[1]
+    to_tau = np.where(curve == LoopCurve.SHAPE, 1.0, 0.0)
+    to_tau[curve == LoopCurve.KS] = -problem.ceiling(tau)[1]
     ends = _ends(problem, loop, crossing)
     parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
     curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)
@@ -247,13 +247,13 @@ def _(
 def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarray, ...]:
     """ln|S(jω_b)| + ½ ln 2 of every response and number: curve, row, v, value and slopes."""
     P, v, rows_of = problem.plants.count, problem.v, []
-    numbers = np.flatnonzero(np.isfinite(problem.limits[Curve.CROSSING]))
+    numbers = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.CROSSING]))
     for number in numbers:
         place = crossing[number]
         for a, b in pairwise(problem.starts):
             i = a + int(np.clip(np.searchsorted(v[a:b], place), 1, b - a - 1))
             which, at = np.array([i - 1, i]), v[[i - 1, i]]
-            code = np.full(2, Curve.CROSSING)
+            code = np.full(2, LoopCurve.CROSSING)
             value, _, to_kappa, *_ = rows(code, np.full(2, number), which, at, loop)
             width = np.log(at[1] / at[0])
             share = np.log(place / at[0]) / width
@@ -261,7 +261,7 @@ def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarr
             slope = (value[1] - value[0]) / width / problem.plants.chain(np.array(place))
             rows_of.append((number * P + i, at[1], mean @ value, mean @ to_kappa, slope))
     parts = [np.array(part) for part in zip(*rows_of, strict=True)]
-    return (np.full(len(parts[0]), Curve.CROSSING), *parts)
+    return (np.full(len(parts[0]), LoopCurve.CROSSING), *parts)
 
 
 @hessians.register

@@ -21,8 +21,8 @@ from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.limits import HALF_POWER, Curve, Limit
-from ccd_casadi.kernels.loop_point import Loop
+from ccd_casadi.kernels.limits import HALF_POWER, Limit, LoopCurve
+from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.lti.grid import root_flanks
 from ccd_casadi.support.arrays import Array
 
@@ -75,22 +75,22 @@ class LoopProblem:
         return np.concatenate([np.tile(self.base, (len(found), 1)), flanked(found)], axis=1)
 
     @cached_property
-    def curves(self) -> tuple[Curve, ...]:
+    def curves(self) -> tuple[LoopCurve, ...]:
         """Those of which all peaks count."""
-        found = [Curve.S_MAX, Curve.LEVEL]
+        found = [LoopCurve.S_MAX, LoopCurve.LEVEL]
         if self.bounds.shape is not None:
-            found.append(Curve.SHAPE)
+            found.append(LoopCurve.SHAPE)
         if self.bounds.weighted_level is not None:
-            found += [Curve.KS, Curve.T]
+            found += [LoopCurve.KS, LoopCurve.T]
         if self.bounds.compliance_max is not None:
-            found.append(Curve.GS)
+            found.append(LoopCurve.GS)
         return tuple(found)
 
     @cached_property
     def short(self) -> np.ndarray:
         """Which of the curves are bounded on ω <= ω_b only."""
         ends = self.bounds.shape_ends is ShapeEnd.CROSSING
-        return np.isin(self.curves, [Curve.LEVEL, *[Curve.SHAPE] * ends])
+        return np.isin(self.curves, [LoopCurve.LEVEL, *[LoopCurve.SHAPE] * ends])
 
     @property
     def first(self) -> int:
@@ -99,7 +99,7 @@ class LoopProblem:
 
     @cached_property
     def _factors(self) -> tuple[np.ndarray, np.ndarray]:
-        """The factors of K and the channel of every parameter, see `kernels.loop_point.Loop`."""
+        """The factors of K and the channel of every parameter, see `LoopArrays`."""
         structure = self.structure
         factors, channel = [], np.zeros(len(structure.names), np.int64)
         for i, (own, at) in enumerate(zip(structure.structures, structure.slices, strict=True)):
@@ -141,29 +141,29 @@ class LoopProblem:
         """What gains are held against at ω_b = ω₀, (Limit.COUNT, numbers), see `kernels.limits`."""
         b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
         found = np.zeros((Limit.COUNT, self.first + len(b.channels)))
-        found[: len(Curve)] = np.inf
+        found[: len(LoopCurve)] = np.inf
         whole, alone = found[:, : self.first], found[:, self.first :]
-        whole[[Curve.S_MAX, Curve.S_LOW]] = np.log([[b.S_max], [b.S_low]])
-        whole[[Curve.CROSSING, Curve.LEVEL]] = -HALF_POWER
+        whole[[LoopCurve.S_MAX, LoopCurve.S_LOW]] = np.log([[b.S_max], [b.S_low]])
+        whole[[LoopCurve.CROSSING, LoopCurve.LEVEL]] = -HALF_POWER
         found[Limit.LEAST] = 0.0 if self.structure.integrator else self.low
         if b.shape is not None:
-            whole[Curve.SHAPE] = np.log(b.shape) - HALF_POWER
+            whole[LoopCurve.SHAPE] = np.log(b.shape) - HALF_POWER
         if b.compliance_max is not None:
-            whole[Curve.GS] = np.log(b.compliance_max * force)
+            whole[LoopCurve.GS] = np.log(b.compliance_max * force)
         if b.weights is not None and b.weighted_level is not None:
             w, level = b.weights, np.log(b.weighted_level)
-            whole[Curve.KS] = level - np.log(w.c_K / w.M_K * force)
-            whole[Curve.T] = level + np.log(w.A_u)
+            whole[LoopCurve.KS] = level - np.log(w.c_K / w.M_K * force)
+            whole[LoopCurve.T] = level + np.log(w.A_u)
             ends = (w.omega_K, w.c_K * w.omega_K, w.omega_T / w.A_l, w.omega_T / w.A_u)
             found[Limit.KS_ZERO : Limit.COUNT] = np.array(ends)[:, None] / w0
         for i, one in enumerate(b.channels):
             if one.S_max is not None:
-                alone[Curve.S_MAX, i] = np.log(one.S_max)
+                alone[LoopCurve.S_MAX, i] = np.log(one.S_max)
             if one.M_K is not None and b.weights is not None:
-                alone[Curve.KS, i] = whole[Curve.KS, 0] + np.log(one.M_K / b.weights.M_K)
+                alone[LoopCurve.KS, i] = whole[LoopCurve.KS, 0] + np.log(one.M_K / b.weights.M_K)
             if one.lead > 0.0:
-                alone[[Curve.CROSSING, Curve.LEVEL], i] = -HALF_POWER
-                alone[Curve.SHAPE, i] = whole[Curve.SHAPE, 0] - one.lead
+                alone[[LoopCurve.CROSSING, LoopCurve.LEVEL], i] = -HALF_POWER
+                alone[LoopCurve.SHAPE, i] = whole[LoopCurve.SHAPE, 0] - one.lead
         return found
 
     @cached_property
@@ -181,15 +181,16 @@ class LoopProblem:
 
     def kinds_of(self, constraints: "Constraints") -> list[str]:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
-        return [Curve(int(code)).name for code in constraints.curve]
+        return [LoopCurve(int(code)).name for code in constraints.curve]
 
-    def loop(self, kappa: Array, tau: float) -> Loop:
+    def loop(self, kappa: Array, tau: float) -> LoopArrays:
         """What the kernels take at κ and τ."""
         limits = self.limits.copy()
-        limits[Curve.SHAPE] -= tau
+        limits[LoopCurve.SHAPE] -= tau
         plants = self.plants
-        return Loop(self._factors[0], np.exp(kappa), self._factors[1], plants.into, plants.out,
-                    *plants.modes, limits, self._rows)  # fmt: skip
+        factors, channel = self._factors
+        return LoopArrays(factors, np.exp(kappa), channel, plants.into, plants.out, *plants.modes,
+                          limits, self._rows)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ class Constraints:
 
 
 class Places(NamedTuple):
-    """Curve, plant and v (over ω₀) of constraints."""
+    """LoopCurve, plant and v (over ω₀) of constraints."""
 
     curve: np.ndarray
     plant: np.ndarray

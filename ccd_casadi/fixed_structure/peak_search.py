@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, flanked
-from ccd_casadi.kernels.loop_point import Loop
+from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.loop_rows import close, levels
 from ccd_casadi.support.arrays import Array
 
@@ -74,7 +74,7 @@ def frequency_grid(
 
 
 def local_peaks(
-    loop: Loop, curves: np.ndarray, v: Array, value: Array, depth: float, end: Array
+    loop: LoopArrays, curves: np.ndarray, v: Array, value: Array, depth: float, end: Array
 ) -> Brackets:
     """The local maxima above `depth` of the levels `value` at v (P, k).
 
@@ -146,7 +146,7 @@ def split(
     return brackets.only(kept).and_those(bracketed(known.row, own), bracketed(above, beside))
 
 
-def closed_on_peaks(loop: Loop, peaks: Brackets) -> tuple[Array, np.ndarray]:
+def closed_on_peaks(loop: LoopArrays, peaks: Brackets) -> tuple[Array, np.ndarray]:
     """The maxima in brackets, and which of them lie inside."""
     P = len(loop.terms)
     ends = (peaks.start, peaks.low, peaks.high)

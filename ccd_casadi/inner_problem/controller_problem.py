@@ -12,7 +12,7 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FigureOfMerit
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.synthesis.weights import Weights
@@ -25,7 +25,7 @@ class ControllerProblem:
     """The base of all kinds: of largest bandwidth, continuous, on the plant of the case alone."""
 
     @property
-    def figure(self) -> Figure:
+    def figure(self) -> FigureOfMerit:
         """What J counts of the controller."""
         return BANDWIDTH
 

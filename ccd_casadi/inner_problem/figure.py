@@ -9,7 +9,7 @@ from ccd_casadi.support.units import HZ, with_unit
 
 
 @dataclass(frozen=True)
-class Figure:
+class FigureOfMerit:
     """A value v of the inner problem: its key, its symbol, and how it is shown.
 
     `unit` and `factor` (per SI unit) are for the eye, `entry` is its stem in result.json.
@@ -39,7 +39,9 @@ class Figure:
         return with_unit(value, self.si_unit, digits)
 
 
-BANDWIDTH = Figure("bandwidth", "bandwidth", "ω_b", "rad/s", "Hz", 1.0 / HZ, True, "bandwidth")
-RMS_ERROR = Figure("rms_error", "RMS error", "e", "m", "nm", 1e9, False, "error_rms")
-MOVE_TIME = Figure("move_time", "move time", "t", "s", "ms", 1e3, False, "move_time")
+BANDWIDTH = FigureOfMerit(
+    "bandwidth", "bandwidth", "ω_b", "rad/s", "Hz", 1.0 / HZ, True, "bandwidth"
+)
+RMS_ERROR = FigureOfMerit("rms_error", "RMS error", "e", "m", "nm", 1e9, False, "error_rms")
+MOVE_TIME = FigureOfMerit("move_time", "move time", "t", "s", "ms", 1e3, False, "move_time")
 FIGURES = {figure.key: figure for figure in (BANDWIDTH, RMS_ERROR, MOVE_TIME)}

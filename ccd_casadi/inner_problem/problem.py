@@ -16,7 +16,7 @@ from ccd_casadi.inner_problem.controller_problem import (
     MixedSensitivityProblem,
     RobustSet,
 )
-from ccd_casadi.inner_problem.figure import Figure
+from ccd_casadi.inner_problem.figure import FigureOfMerit
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, sweep_inner
@@ -115,7 +115,7 @@ class CoDesignProblem(NotebookHtml):
         }
 
     @property
-    def figure(self) -> Figure:
+    def figure(self) -> FigureOfMerit:
         """What J counts of the controller."""
         return self.controller.figure
 

@@ -15,7 +15,7 @@ from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, Options
-from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR, Figure
+from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR, FigureOfMerit
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights
@@ -97,7 +97,7 @@ class StructuredProblem(ControllerProblem):
     error_warm_starts: tuple[tuple[float, ...], ...] = ()
 
     @property
-    def figure(self) -> Figure:
+    def figure(self) -> FigureOfMerit:
         """The least RMS error or move time where that is minimised, else ω_b*."""
         return FIGURES[self.minimise]
 

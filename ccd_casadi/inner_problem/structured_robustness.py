@@ -6,7 +6,7 @@ of the box beside them, branch and bound at all of it.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from operator import call
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 
 AT_ONCE = 3  # plants added in a round
 APART = 1e-4  # of the box: plants that are closer are the same plant
@@ -111,8 +111,8 @@ def worse_elsewhere(
     at a time as there are workers."""
     for first in turns[:: workers.count]:
         own = range(first, min(first + workers.count, turns.stop))
-        tasks = [(turn, worst_case, problem, theta, design, turn) for turn in own]
-        found = dict(workers.map_unordered(looked, tasks))
+        tasks = {turn: (problem, theta, design, turn) for turn in own}
+        found = dict(results(workers, worst_case, tasks))
         largest = max(worst.value for worst, _ in found.values())
         progress(f"{100.0 * np.exp(largest):.6g} % of a bound at most, searched from elsewhere")
         for turn in own:
@@ -178,28 +178,22 @@ def proof_of(
     )  # fmt: skip
 
 
-def looked(task: tuple[Any, ...]) -> tuple[Any, Any]:
-    """What a function says of a design, by the task's first entry: for a worker process."""
-    key, look, *design = task
-    return key, look(*design)
-
-
 def checked_whole(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    made: SectionsDesign,
+    design: SectionsDesign,
     worst: Excess,
     workers: Pool,
 ) -> tuple[SetCertificate, int, Proof]:
     """`certify_lattice` and `proof_of` at one time; of several options, whose proofs are spread
     over the workers, one after the other."""
-    own = {certify_lattice: (made.controller, worst), proof_of: (made,)}
-    tasks = [(look.__name__, look, problem, theta, *design) for look, design in own.items()]
+    assert design.controller is not None
+    lattice = (problem, theta, design.controller, worst)
     if structured_of(problem).uncertainty.options:
-        found = dict(looked((*task, workers)) for task in tasks)
-    else:
-        found = dict(workers.map_unordered(looked, tasks[::-1]))
-    return (*found[certify_lattice.__name__], found[proof_of.__name__])
+        return *certify_lattice(*lattice, workers), proof_of(problem, theta, design, workers)
+    tasks = {"proof": (proof_of, problem, theta, design), "lattice": (certify_lattice, *lattice)}
+    found = dict(results(workers, call, tasks))
+    return *found["lattice"], found["proof"]
 
 
 def tolerance_prices(

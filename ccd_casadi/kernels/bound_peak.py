@@ -13,9 +13,12 @@ damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.pullback import squared_weight_slopes
+
+ROUNDING = 4.0 * np.finfo(float).eps
 
 
 class BoundTerms(NamedTuple):
@@ -108,29 +111,11 @@ def slope_root(slope, start):
     """The root of a maximum's slope next to `start`, `start` itself where there is none near."""
     a, fa = start, slope(start)
     step = 1e-7 if fa > 0.0 else -1e-7
-    b, fb = a, fa
     for _ in range(12):
         b = start * (1.0 + step)
         fb = slope(b)
         if fa * fb <= 0.0:
-            break
+            return brentq(slope, a, b, xtol=1e-16 * start, rtol=ROUNDING)
         a, fa = b, fb
         step *= 3.0
-    if not fa * fb < 0.0:
-        return b if fb == 0.0 else start
-    x = a
-    for _ in range(80):
-        # Illinois false position
-        x = (a * fb - b * fa) / (fb - fa)
-        fx = slope(x)
-        if fx == 0.0 or abs(b - a) <= 1e-15 * abs(b):
-            break
-        if fx * fb < 0.0:
-            a, fa = b, fb
-        else:
-            fa *= 0.5
-        moved = abs(x - b)
-        b, fb = x, fx
-        if moved <= 1e-16 * abs(x):
-            break
-    return x
+    return start

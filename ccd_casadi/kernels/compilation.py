@@ -66,7 +66,7 @@ def compile_part(part: str) -> None:
             raise SystemExit("the compiled kernels find no controller where there is one")
     else:
         gamma.plant_gain(A, B, C, grid)
-        row = np.empty(int(design.Figure.COUNT))
+        row = np.empty(int(design.Column.COUNT))
         judged = (A, B, C, -np.eye(5), np.ones((5, 1)), np.zeros((1, 5)), none)
         for delta in (0.0, 1.0):
             design.judge(*judged, w, delta, 1e5, 1e-2, row)
@@ -88,7 +88,7 @@ def _compile_rows(curvature: bool) -> None:
     plants = modes.Plants(np.full((1, 1, 4), -1.0 + 1.0j), np.ones((1, 1, 2, 1, 1)), 0.0, 0.0)
     controller = (np.zeros((1, 4), np.int64), one, first, square, square)
     limits = (np.ones((int(Limit.COUNT), 1)), np.zeros((2, 0, 1)))
-    loop = loop_point.Loop(*controller, *plants, *limits)
+    loop = loop_point.LoopArrays(*controller, *plants, *limits)
     if curvature:
         modes.responses(plants, first, one)
         loop_curvature.second(first, first, first, one, loop)

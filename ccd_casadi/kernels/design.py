@@ -13,7 +13,7 @@ from ccd_casadi.kernels.closed_loop import (
     weighted_loop,
 )
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.lapack import eigenvalues
@@ -21,8 +21,8 @@ from ccd_casadi.kernels.riccati import lqr_hamiltonian
 from ccd_casadi.kernels.sensitivity import bandwidth, peak, sensitivity_gain
 from ccd_casadi.kernels.synthesis import central_controller, synthesise
 
-_COUNT, _CODE, _GAMMA_OPT = int(Figure.COUNT), int(Figure.CODE), int(Figure.GAMMA_OPT)
-_BALANCED = int(Figure.BALANCED)
+_COUNT, _CODE, _GAMMA_OPT = int(Column.COUNT), int(Column.CODE), int(Column.GAMMA_OPT)
+_BALANCED = int(Column.BALANCED)
 
 
 @compiled
@@ -52,7 +52,7 @@ def _closed(A, B, C, Ak, Bk, Ck, Dk, row):
     """How the loop's poles end; its matrices r to e, plant and controller prepared, a grid."""
     As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
     wr, wi, info = eigenvalues(As)
-    row[Figure.MAX_REAL_POLE] = wr.max()
+    row[Column.MAX_REAL_POLE] = wr.max()
     code = Code.CERTIFIED.value
     if info != 0:
         code = Code.EIGENVALUES_FAILED.value
@@ -82,15 +82,15 @@ def _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop):
 @compiled
 def _measured(G, K, Dk, omega_low, loop, wr, wi, row):
     """How the figures of S end."""
-    row[Figure.LOW] = sensitivity_gain(G, K, Dk, omega_low)
+    row[Column.LOW] = sensitivity_gain(G, K, Dk, omega_low)
     value, at, confirmed = peak(G, K, Dk, *loop, wr, wi)
-    row[Figure.PEAK], row[Figure.PEAK_FREQUENCY] = value, at
+    row[Column.PEAK], row[Column.PEAK_FREQUENCY] = value, at
     if not confirmed:
         return Code.PEAK_NOT_CONFIRMED.value
-    row[Figure.BANDWIDTH], info = bandwidth(G, K, Dk, *loop)
+    row[Column.BANDWIDTH], info = bandwidth(G, K, Dk, *loop)
     if info != 0:
         return Code.EIGENVALUES_FAILED.value
-    return Code.CERTIFIED.value if np.isfinite(row[Figure.BANDWIDTH]) else Code.NO_BANDWIDTH.value
+    return Code.CERTIFIED.value if np.isfinite(row[Column.BANDWIDTH]) else Code.NO_BANDWIDTH.value
 
 
 # Numba optimises a kernel anew inside every kernel that calls it. What follows only strings
@@ -107,7 +107,7 @@ def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
 
 def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     """How it ended."""
-    row[Figure.GAMMA] = gamma
+    row[Column.GAMMA] = gamma
     if not (np.isfinite(Ak).all() and np.isfinite(Bk).all() and np.isfinite(Ck).all()):
         return Code.NOT_FINITE
     code, loop, poles, G, K = _closed(A, B, C, Ak, Bk, Ck, Dk, row)
@@ -116,7 +116,7 @@ def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     grid = certificate_grid(*poles)
     matrices = (A, B, C, Ak, Bk, Ck)
     norm, at, held, loop = _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop)
-    row[Figure.NORM], row[Figure.NORM_FREQUENCY] = norm, at
+    row[Column.NORM], row[Column.NORM_FREQUENCY] = norm, at
     if not held:
         return Code.LEVEL_TEST_FAILED if norm <= gamma else Code.NORM_EXCEEDED
     return _measured(G, K, Dk, omega_low, loop, *poles, row)
@@ -164,7 +164,7 @@ def _attempt(plant, numbers, omega_low, channels, balanced):
 def failed_row():
     """The row of a design whose linear algebra met an infinite or undefined number."""
     row = np.full(_COUNT, nan)
-    row[_CODE], row[Figure.LIMITED_BY_BOUND], row[_BALANCED] = float(Code.NOT_FINITE), 0.0, 0.0
+    row[_CODE], row[Column.LIMITED_BY_BOUND], row[_BALANCED] = float(Code.NOT_FINITE), 0.0, 0.0
     return row
 
 
@@ -172,13 +172,13 @@ def _synthesise_channels(A, B, C, w, channels, backoff, guess):
     """As `synthesise`, from the blocks: γ_opt is their largest, F at one γ is theirs together."""
     found = [synthesise(c.A, c.B, c.C, w, c.grid, c.gain, backoff, guess, False) for c in channels]
     rows = np.array([item[0] for item in found])
-    failed = np.flatnonzero(rows[:, Figure.CODE])
+    failed = np.flatnonzero(rows[:, Column.CODE])
     if failed.size:
         return found[failed[0]]
     top = int(rows[:, _GAMMA_OPT].argmax())
     row = rows[top].copy()
-    row[Figure.GAMMA_LOWER_BOUND] = rows[:, Figure.GAMMA_LOWER_BOUND].max()
-    row[Figure.SCHUR_FORMS] = rows[:, Figure.SCHUR_FORMS].sum()
+    row[Column.GAMMA_LOWER_BOUND] = rows[:, Column.GAMMA_LOWER_BOUND].max()
+    row[Column.SCHUR_FORMS] = rows[:, Column.SCHUR_FORMS].sum()
     Ag, B1, B2, _, C2, _, _ = generalized_plant(A, B, C, w)
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     F = np.zeros((m, n + 2 * p + m))
@@ -189,7 +189,7 @@ def _synthesise_channels(A, B, C, w, channels, backoff, guess):
             H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], c.C.shape[0], c.B.shape[1])
             gain, ok = central_controller(*gp, H0, backoff * row[_GAMMA_OPT])[2:]
             if not ok:
-                row[Figure.CODE] = Code.RICCATI_FAILED.value
+                row[Column.CODE] = Code.RICCATI_FAILED.value
         # filters turn with the signals that they see
         turns = (np.eye(n)[:, c.states], c.outputs, c.inputs, c.outputs)
         first, column = 0, 0

@@ -1,4 +1,4 @@
-"""The figures of a design are one row of numbers, in scaled units; `Figure` names the columns."""
+"""The figures of a design are one row of numbers, in scaled units; `Column` names the columns."""
 
 from enum import IntEnum
 
@@ -19,7 +19,7 @@ class Code(IntEnum):
     FILTER_FAILED = 10
 
 
-class Figure(IntEnum):
+class Column(IntEnum):
     """Columns of a row of figures; frequencies over ω₀, poles over ω₀."""
 
     CODE = 0

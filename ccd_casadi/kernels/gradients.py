@@ -23,13 +23,13 @@ Plain NumPy: a point is differentiated once, and compiled this took a third of t
 
 from collections.abc import Sequence
 from math import nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ccd_casadi.kernels.bound_peak import bound_gradient, bound_peak
 from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, innovations_plant
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import generalized_plant
@@ -39,31 +39,21 @@ from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian
 from ccd_casadi.support.arrays import Array
 
 
-class Loop(NamedTuple):
-    """A plant with its derivatives to θ, and the frequency at which σ_max is differentiated.
+class LoopAt(NamedTuple):
+    """A plant's A, B, C and dA, dB, dC to θ, and the frequency at which σ_max is differentiated.
 
     Of S, or with `compliance` of S G; those stand last among several.
     """
 
-    A: Array
-    B: Array
-    C: Array
-    dA: Array
-    dB: Array
-    dC: Array
+    plant: Any
     omega: float
     compliance: bool = False
 
 
-class DesignPlant(NamedTuple):
-    """The plant that a controller is made for, its derivatives to θ, scaled weights, γ/γ_opt, δ."""
+class MadeFor(NamedTuple):
+    """The plant that a controller is made for, as that of `LoopAt`, scaled weights, γ/γ_opt, δ."""
 
-    A: Array
-    B: Array
-    C: Array
-    dA: Array
-    dB: Array
-    dC: Array
+    plant: Any
     w: Array
     backoff: float
     delta: float = 0.0
@@ -145,15 +135,15 @@ def _of_gain(G, K, S, compliance):
     return s[:, 0], gap, a, b, K @ b - v if compliance else K @ b
 
 
-def loop_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
+def loop_gradients(made_for, posed, gamma_opt, gamma_slope, loops):
     """Gradients (k, n_θ + n_w) of σ_max of S(jω) or S G(jω) of each loop, to θ and the weights.
 
     `gamma_slope` (n_θ + n_w) is the gradient of γ_opt. Returns besides, one a loop, the gradient
     to θ with K held, the slopes dσ/dω, σ, the relative gaps (σ1 - σ2)/σ1; and whether the
     Hamiltonian splits.
     """
-    _, B, C, dA, dB, dC, _, backoff, _ = design_plant
-    m, p, count = B.shape[1], C.shape[0], dA.shape[0]
+    plant, backoff = made_for.plant, made_for.backoff
+    m, p, count = plant.B.shape[1], plant.C.shape[0], plant.dA.shape[0]
     gp, H0, back = posed
     Ag, B1, B2, C1, C2, d1, d2 = gp
     gamma = backoff * gamma_opt
@@ -166,7 +156,7 @@ def loop_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
     X = U2 @ inverse
     X = 0.5 * (X + X.T)
     F = -(B2.T @ X + d2 * C1[p : p + m]) / d2**2
-    plants = (np.array([getattr(loop, name) for loop in loops]) for name in "ABC")
+    plants = (np.array([getattr(loop.plant, name) for loop in loops]) for name in "ABC")
     ω = np.array([loop.omega for loop in loops])
     a, b, Kb, aG, lG, rG, lK, rK, slopes, gains, gaps = _gain_cotangents(
         *plants, Ag + B2 @ F - B1 @ C2, B1, F, ω, [loop.compliance for loop in loops]
@@ -188,11 +178,15 @@ def loop_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
         C2=_outer(B1.T @ lK, rK),
     )
     *through, w_ = back.to_plant_and_weights(through_K)
-    held = _contract(direct, [(loop.dA, loop.dB, loop.dC) for loop in loops])
+    held = _contract(direct, [_changes(loop.plant) for loop in loops])
     out = (2.0 * gamma * backoff * level)[:, None] * gamma_slope
-    out[:, :count] += held + _contract(through, [(dA, dB, dC)])
+    out[:, :count] += held + _contract(through, [_changes(plant)])
     out[:, count:] += w_ + back.gain_to_weights(h, rK, XrK, rate)
     return out, held, slopes, gains, gaps, True
+
+
+def _changes(plant):
+    return plant.dA, plant.dB, plant.dC
 
 
 def _outer(x, y):
@@ -213,8 +207,9 @@ def _contract(cotangents, changes):
     return np.array([change @ row for row, change in zip(rows, flat, strict=True)])
 
 
-def figure_gradients(design_plant: DesignPlant, row: Array, grid: Array, sigma: Array,
-                     loops: Sequence[Loop]) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
+def figure_gradients(
+    made_for: MadeFor, row: Array, grid: Array, sigma: Array, loops: Sequence[LoopAt]
+) -> tuple[Array, Array, Array, Array, bool]:
     """Gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt), of ω_b with K held, and σ's gaps.
 
     The first (4, n_θ + n_w), to θ, then to the scaled weights with δ behind them where δ > 0;
@@ -225,27 +220,26 @@ def figure_gradients(design_plant: DesignPlant, row: Array, grid: Array, sigma: 
     certified or there are no loops, and where it needed balanced coordinates: gradients are taken
     in the plant's own.
     """
-    count = design_plant.dA.shape[0]
-    total = count + design_plant.w.size + (design_plant.delta > 0.0)
+    count = made_for.plant.dA.shape[0]
+    total = count + made_for.w.size + (made_for.delta > 0.0)
     none = (np.full((len(loops) + 1, total), nan), np.full(count, nan), np.full(len(loops), nan))
     to_gamma = np.full(total, nan)
-    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED]:
+    if row[Column.CODE] != Code.CERTIFIED or row[Column.BALANCED]:
         return *none, to_gamma, True
     with np.errstate(all="ignore"):  # an undefined number is seen in the result
-        posed, gamma_opt, ok = _posed(design_plant), float(row[Figure.GAMMA_OPT]), True
-        if row[Figure.LIMITED_BY_BOUND] > 0.5:
-            *slopes, to_weights = _bound_gradient(design_plant, grid, sigma)
+        posed, gamma_opt, ok = _posed(made_for), float(row[Column.GAMMA_OPT]), True
+        if row[Column.LIMITED_BY_BOUND] > 0.5:
+            *slopes, to_weights = _bound_gradient(made_for, grid, sigma)
         else:
             *slopes, to_weights, ok = gamma_gradient(posed, gamma_opt)
         if not ok:
             return *none, to_gamma, False
-        changes = (design_plant.dA, design_plant.dB, design_plant.dC)
-        to_theta = _contract([part[None] for part in slopes], [changes])[0]
+        to_theta = _contract([part[None] for part in slopes], [_changes(made_for.plant)])[0]
         to_gamma = np.concatenate([to_theta, to_weights])
         if not loops:
             return *none, to_gamma, True
         found, held, slopes, gains, gaps, ok = loop_gradients(
-            design_plant, posed, gamma_opt, to_gamma, loops
+            made_for, posed, gamma_opt, to_gamma, loops
         )
         if not ok:
             return *none, to_gamma, False
@@ -255,22 +249,24 @@ def figure_gradients(design_plant: DesignPlant, row: Array, grid: Array, sigma: 
         return out, -held[0] / slopes[0], gaps, to_gamma, True
 
 
-def peak_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Array,
-                   loops: Sequence[Loop]) -> Array:  # fmt: skip
+def peak_gradients(
+    made_for: MadeFor, row: Array, gamma_slope: Array, loops: Sequence[LoopAt]
+) -> Array:
     """Gradients (k, n_θ + n_w) of ln σ_max(S(jω)) at local maxima over ω; NaN where there are none.
 
     The frequency of a maximum drops out (envelope). `row` and `gamma_slope` as above.
     """
     with np.errstate(all="ignore"):
         found, _, _, gains, _, ok = loop_gradients(
-            design_plant, _posed(design_plant), float(row[Figure.GAMMA_OPT]), gamma_slope, loops
+            made_for, _posed(made_for), float(row[Column.GAMMA_OPT]), gamma_slope, loops
         )
     return found / gains[:, None] if ok else found
 
 
-def _bound_gradient(plant, grid, sigma):
+def _bound_gradient(made_for, grid, sigma):
     """Gradients of γ_jω to A, B, C and the weights, at its peak."""
-    A, B, C, w, delta = plant.A, plant.B, plant.C, plant.w, plant.delta
+    plant, w, _, delta = made_for
+    A, B, C = plant.A, plant.B, plant.C
     near, least = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[1], True
     if delta:
         _, near, least = disturbance_bound(A, B, C, w, delta, grid)
@@ -279,9 +275,10 @@ def _bound_gradient(plant, grid, sigma):
     return *parts, np.append(w_, to_delta) if delta else w_
 
 
-def _posed(plant):
+def _posed(made_for):
     """The generalized plant, its Hamiltonian at γ = ∞, and the way back to plant and weights."""
-    A, B, C, w, delta = plant.A, plant.B, plant.C, plant.w, plant.delta
+    plant, w, _, delta = made_for
+    A, B, C = plant.A, plant.B, plant.C
     if delta:
         Y, _ = filter_solution(A, B, C, delta)
         gp, back = innovations_plant(A, B, C, w, Y), FourBlockPullback(A, B, C, w, Y, delta)

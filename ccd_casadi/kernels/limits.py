@@ -21,7 +21,7 @@ from ccd_casadi.kernels.compiled import compiled
 HALF_POWER = 0.5 * np.log(2.0)
 
 
-class Curve(IntEnum):
+class LoopCurve(IntEnum):
     """What is bounded; the row of its limit."""
 
     S_MAX = 0
@@ -58,11 +58,11 @@ def warped(T, v):
 def offset(curve, number, ω, chain, limits):
     """What is added to the logarithm of a gain, and its slope to ln v."""
     level = -limits[curve, number]
-    if curve == Curve.SHAPE:
+    if curve == LoopCurve.SHAPE:
         least = limits[Limit.LEAST, number]
         return level - np.log(max(ω, least)), -chain if ω >= least else 0.0
-    if curve == Curve.KS or curve == Curve.T:
-        at = Limit.KS_ZERO if curve == Curve.KS else Limit.T_ZERO
+    if curve == LoopCurve.KS or curve == LoopCurve.T:
+        at = Limit.KS_ZERO if curve == LoopCurve.KS else Limit.T_ZERO
         a = ω * ω + limits[at, number] ** 2
         b = ω * ω + limits[at + 1, number] ** 2
         return level + 0.5 * np.log(a / b), (ω * ω / a - ω * ω / b) * chain

@@ -16,7 +16,7 @@ holds where the model does.
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.limits import Curve
+from ccd_casadi.kernels.limits import LoopCurve
 from ccd_casadi.kernels.loop_point import (
     FREE,
     GV,
@@ -50,7 +50,7 @@ def second(curve, number, which, v, loop):
     for j in range(v.size):
         opened(curve[j], which[j], v[j], loop, at, of, g)
         σ, place = gain_of(curve[j], number[j], loop.into, loop.out, loop.rows, at, of, sigma)
-        columns = m if curve[j] == Curve.GS else p
+        columns = m if curve[j] == LoopCurve.GS else p
         _by_channel(curve[j], number[j], place, loop, at, of, crossed, moved, back, ahead)
         second_slopes(loop.factors, g, bend)
         for a in range(n):
@@ -87,7 +87,7 @@ def _by_channel(curve, number, place, loop, at, of, crossed, moved, back, ahead)
     of z_m (m, c).
     """
     into, (m, c), p = loop.into, loop.into.shape, loop.out.shape[1]
-    rows, columns = m if curve == Curve.KS else p, m if curve == Curve.GS else p
+    rows, columns = m if curve == LoopCurve.KS else p, m if curve == LoopCurve.GS else p
     z = np.complex128
     R, P, Q = np.zeros((c, c), z), np.zeros((m, c), z), np.zeros((m, c), z)
     for i in range(c):
@@ -95,10 +95,10 @@ def _by_channel(curve, number, place, loop, at, of, crossed, moved, back, ahead)
             for a in range(p):
                 R[i, h] += at[US, i, a] * at[GV, a, h]
             crossed[i, h] = of[LEFT, i] * of[K, i] * R[i, h] * of[K, h] * of[RIGHT, h]
-    sign = 1.0 if curve == Curve.T else -1.0
+    sign = 1.0 if curve == LoopCurve.T else -1.0
     for i in range(c):
         for a in range(rows):
-            if curve == Curve.KS:
+            if curve == LoopCurve.KS:
                 P[a, i] = into[a, i]
                 for h in range(c):
                     P[a, i] -= into[a, h] * of[K, h] * R[h, i]
@@ -108,13 +108,13 @@ def _by_channel(curve, number, place, loop, at, of, crossed, moved, back, ahead)
         for q in range(columns):
             for b in range(p):
                 entry = at[V, b, q]
-                if curve == Curve.GS:
+                if curve == LoopCurve.GS:
                     entry = 0.0j
                     for d in range(m):
                         entry += at[FREE, b, d] * at[V, d, q]
                 Q[q, i] += at[US, i, b] * entry
     if number >= p:
-        row_of(loop.rows[int(curve == Curve.KS), number - p], P, rows, c)
+        row_of(loop.rows[int(curve == LoopCurve.KS), number - p], P, rows, c)
         rows = 1
     for i in range(c):
         for h in range(c):

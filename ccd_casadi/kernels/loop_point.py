@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.limits import Curve, offset, warped
+from ccd_casadi.kernels.limits import LoopCurve, offset, warped
 from ccd_casadi.kernels.modes import response
 from ccd_casadi.kernels.sections import gains_and_slopes, inverse
 from ccd_casadi.kernels.small import invert, singular
@@ -31,7 +31,7 @@ G, DG, FREE, DFREE, GV, GK, S, US, M, V = range(10)  # GV = G V, US = Uᵀ S
 K, RATE, U, W, LEFT, RIGHT, SHARE, X, Y = range(9)  # K_i, ∂ln K_i/∂ln v; U = ũ, W = v or G₀ v
 
 
-class Loop(NamedTuple):
+class LoopArrays(NamedTuple):
     """`factors` and `values` of the controller (`sections`), `channel` (n,) of each value; V (m, c)
     and Uᵀ (c, p); the plants (`modes`); the limits (`limits`), and the rows that channels bound for
     themselves, u and w in the plants' coordinates, `rows` (2, channels, m).
@@ -64,7 +64,7 @@ def opened(curve, i, v, loop, at, of, g):
     T, terms, residues = loop.period, loop.terms, loop.residues
     gains_and_slopes(loop.factors, loop.values, complex(0.0, v), of[K], of[RATE], g)
     response(terms, residues, T, loop.delay, i, v, True, at, G)
-    if curve == Curve.GS:
+    if curve == LoopCurve.GS:
         response(terms, residues, 0.0, 0.0, i, warped(T, v)[0], True, at, FREE)
     closed(loop.into, loop.out, of[K], at)
 
@@ -108,7 +108,7 @@ def closed(into, out, k, at):
 def matrix(curve, into, out, k, at):
     """Fills M of a curve; its rows and columns."""
     (m, c), p = into.shape, out.shape[1]
-    if curve == Curve.KS:
+    if curve == LoopCurve.KS:
         for b in range(p):
             for a in range(m):
                 total = 0.0j
@@ -116,14 +116,14 @@ def matrix(curve, into, out, k, at):
                     total += into[a, i] * (k[i] * at[US, i, b])
                 at[M, a, b] = total
         return m, p
-    columns = m if curve == Curve.GS else p
+    columns = m if curve == LoopCurve.GS else p
     for a in range(p):
         for b in range(columns):
             total = 0.0j
-            if curve == Curve.GS:
+            if curve == LoopCurve.GS:
                 for d in range(p):
                     total += at[S, a, d] * at[FREE, d, b]
-            elif curve == Curve.T:
+            elif curve == LoopCurve.T:
                 for d in range(p):
                     total += at[GK, a, d] * at[S, d, b]
             else:
@@ -152,7 +152,7 @@ def gain_of(curve, number, into, out, own, at, of, sigma):
     rows, columns = matrix(curve, into, out, of[K], at)
     place = number
     if number >= p:
-        row, place = own[int(curve == Curve.KS), number - p], 0
+        row, place = own[int(curve == LoopCurve.KS), number - p], 0
         row_of(row, at[M], rows, columns)
     singular(at[M], rows if number < p else 1, columns, at[V], sigma, True)
     scale = 1.0 / (sigma[place] * sigma[place])
@@ -160,10 +160,12 @@ def gain_of(curve, number, into, out, own, at, of, sigma):
         if number < p:
             of[U, a] = at[M, a, place].conjugate() * scale
         else:
-            of[U, a] = own[int(curve == Curve.KS), number - p, a] * at[M, 0, 0].conjugate() * scale
+            of[U, a] = (
+                own[int(curve == LoopCurve.KS), number - p, a] * at[M, 0, 0].conjugate() * scale
+            )
     for a in range(p):
         of[W, a], of[X, a] = at[V, a, place], 0.0
-        if curve == Curve.GS:
+        if curve == LoopCurve.GS:
             of[W, a] = 0.0
             for b in range(m):
                 of[W, a] += at[FREE, a, b] * at[V, b, place]
@@ -173,13 +175,13 @@ def gain_of(curve, number, into, out, own, at, of, sigma):
         of[LEFT, i], of[RIGHT, i] = 0.0, 0.0
         for b in range(p):
             of[RIGHT, i] += at[US, i, b] * of[W, b]
-        if curve == Curve.KS:
+        if curve == LoopCurve.KS:
             for a in range(m):
                 of[LEFT, i] += of[U, a] * into[a, i]
             for b in range(p):
                 of[X, b] -= of[LEFT, i] * of[K, i] * at[US, i, b]
-    if curve != Curve.KS:
-        sign = 1.0 if curve == Curve.T else -1.0
+    if curve != LoopCurve.KS:
+        sign = 1.0 if curve == LoopCurve.T else -1.0
         for b in range(p):
             for a in range(p):
                 of[X, b] += sign * of[U, a] * at[S, a, b]
@@ -204,6 +206,6 @@ def value_and_slope(curve, number, v, loop, at, of, sigma):
     for a in range(p):
         for b in range(m):
             slope += (of[X, a] * at[DG, a, b] * of[Y, b]).real
-            if curve == Curve.GS:
+            if curve == LoopCurve.GS:
                 slope -= chain * (of[X, a] * at[DFREE, a, b] * at[V, b, place]).real
     return np.log(σ) + level, slope, place

@@ -6,7 +6,7 @@ See `loop_point` for the matrices, their derivatives and what a loop is made of.
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.limits import Curve, offset, warped
+from ccd_casadi.kernels.limits import LoopCurve, offset, warped
 from ccd_casadi.kernels.loop_point import (
     FREE,
     SHARE,
@@ -51,8 +51,8 @@ def levels(curves, which, v, loop, least):
             largest, known = np.nan, False  # of S
             for c in range(curves.shape[1]):
                 curve = curves[i, c]
-                of_s = curve != Curve.KS and curve != Curve.T and curve != Curve.GS
-                if curve == Curve.GS:
+                of_s = curve != LoopCurve.KS and curve != LoopCurve.T and curve != LoopCurve.GS
+                if curve == LoopCurve.GS:
                     response(terms, residues, 0.0, 0.0, which[i], ω, False, at, FREE)
                 rows, columns, top = p, p, largest
                 if not of_s or np.isnan(largest):
@@ -77,7 +77,7 @@ def levels(curves, which, v, loop, least):
                 for number in range(p, numbers):
                     if limits[curve, number] < np.inf:
                         matrix(curve, into, outputs, k, at)
-                        row = own[int(curve == Curve.KS), number - p]
+                        row = own[int(curve == LoopCurve.KS), number - p]
                         size = row_of(row, matrix_room, rows, columns)
                         level = offset(curve, number, ω, chain, limits)[0]
                         out[i, j, c, number] = np.log(size) + level
@@ -97,7 +97,7 @@ def rows(curve, number, which, v, loop):
     for j in range(count):
         before = j - 1
         known = j > 0 and v[j] == v[before] and which[j] == which[before]
-        if not known or (curve[j] == Curve.GS and curve[before] != Curve.GS):
+        if not known or (curve[j] == LoopCurve.GS and curve[before] != LoopCurve.GS):
             opened(curve[j], which[j], v[j], loop, at, of, g)
         found = value_and_slope(curve[j], number[j], v[j], loop, at, of, sigma)
         value[j], slope[j], place = found
@@ -107,7 +107,7 @@ def rows(curve, number, which, v, loop):
             x[j, a] = of[X, a]
         for b in range(m):
             sides[0, j, b] = of[Y, b]
-            if b < p or curve[j] == Curve.GS:
+            if b < p or curve[j] == LoopCurve.GS:
                 sides[1, j, b] = at[V, b, place]
     return value, slope, to_kappa, x, sides[0], sides[1]
 

@@ -6,14 +6,14 @@ from ccd_casadi.kernels.balance import balancing, in_coordinates, rounding_noise
 from ccd_casadi.kernels.blocks import add, symmetric_part, transposed
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, innovations_plant
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, optimal_gamma
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.lapack import stable_subspace
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian
 
-_COUNT = int(Figure.COUNT)
+_COUNT = int(Column.COUNT)
 GAMMA_TOLERANCE = 1e-11
 ENOUGH = 1e-8  # relative error of γ_opt above which it is looked for in balanced coordinates too
 
@@ -45,15 +45,15 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
     gamma_opt, limited, forms, converged, error = optimal_gamma(
         H0, B1, C1, d1, bound, guess, GAMMA_TOLERANCE, noise
     )
-    row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, bound
-    row[Figure.LIMITED_BY_BOUND], row[Figure.SCHUR_FORMS] = limited, forms
-    row[Figure.GAMMA_ERROR] = error
+    row[Column.GAMMA_OPT], row[Column.GAMMA_LOWER_BOUND] = gamma_opt, bound
+    row[Column.LIMITED_BY_BOUND], row[Column.SCHUR_FORMS] = limited, forms
+    row[Column.GAMMA_ERROR] = error
     Ak, Bk, Ck, ok = central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, backoff * gamma_opt)
-    row[Figure.CODE] = Code.CERTIFIED.value
+    row[Column.CODE] = Code.CERTIFIED.value
     if not ok:
-        row[Figure.CODE] = Code.RICCATI_FAILED.value
+        row[Column.CODE] = Code.RICCATI_FAILED.value
     if not converged:
-        row[Figure.CODE] = Code.GAMMA_NOT_CONVERGED.value
+        row[Column.CODE] = Code.GAMMA_NOT_CONVERGED.value
     return row, Ak, Bk, Ck
 
 
@@ -80,7 +80,7 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
         posed = _posed(A, B, C, w, grid, sigma, delta)
         if posed is None:
             row = np.full(_COUNT, np.nan)
-            row[Figure.CODE], row[Figure.LIMITED_BY_BOUND] = float(Code.FILTER_FAILED), 0.0
+            row[Column.CODE], row[Column.LIMITED_BY_BOUND] = float(Code.FILTER_FAILED), 0.0
             none = np.full((1, 1), np.nan)
             return row, none, none, none
     if balanced:
@@ -96,8 +96,8 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
             row, *K = _search_and_control(gp, _hamiltonian(gp), bound, backoff, guess, NOISE)
         else:
             row, *K = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
-        closed = row[Figure.CODE] != Code.GAMMA_NOT_CONVERGED
-        if closed and ENOUGH < row[Figure.GAMMA_ERROR] < np.inf:
+        closed = row[Column.CODE] != Code.GAMMA_NOT_CONVERGED
+        if closed and ENOUGH < row[Column.GAMMA_ERROR] < np.inf:
             gp, bound = posed or _posed(A, B, C, w, grid, sigma, delta)
             row, *K = _with_a_better_optimum(row, K, gp, bound, backoff)
     return row, *K
@@ -136,16 +136,16 @@ def _balanced(gp, bound):
 def _with_a_better_optimum(row, K, gp, bound, backoff):
     """γ_opt and K from balanced coordinates where γ_opt agrees with what was found, or that."""
     gp, H0, τ = _balanced(gp, bound)
-    gamma_opt, error = float(row[Figure.GAMMA_OPT]), float(row[Figure.GAMMA_ERROR])
+    gamma_opt, error = float(row[Column.GAMMA_OPT]), float(row[Column.GAMMA_ERROR])
     again, at_bound, more, closed, left = optimal_gamma(
         H0, gp[1], gp[3], gp[5], bound, gamma_opt, GAMMA_TOLERANCE, NOISE
     )
-    row[Figure.SCHUR_FORMS] += more
+    row[Column.SCHUR_FORMS] += more
     # only what both agree on within their errors is the same optimum
     if not (closed and left < error and abs(again - gamma_opt) <= error * again):
         return row, *K
-    row[Figure.GAMMA_OPT], row[Figure.GAMMA_ERROR] = again, left
-    row[Figure.LIMITED_BY_BOUND] = at_bound
+    row[Column.GAMMA_OPT], row[Column.GAMMA_ERROR] = again, left
+    row[Column.LIMITED_BY_BOUND] = at_bound
     *K, ok = central_controller(*gp, H0, backoff * again)
-    row[Figure.CODE] = float(Code.CERTIFIED if ok else Code.RICCATI_FAILED)
+    row[Column.CODE] = float(Code.CERTIFIED if ok else Code.RICCATI_FAILED)
     return row, *_in_own_coordinates(*K, τ)

@@ -55,29 +55,20 @@ def greatest_multiplier(
     one, each = sparse.identity(N), sparse.identity(E)
     summed = sparse.csr_matrix((np.ones(E), (at, np.arange(E))), (N, E))
     re, im = (sparse.csr_matrix(-part) for part in (functions.real, functions.imag))
-    # unknowns: coefficients, Re h_i, Im h_i, bounds of |h - Σ h_i| and of |h_i|
-    parts = [
-        [None, None, None, -one, None], [re, summed, None, None, None],
-        [im, None, summed, None, None],
-    ]  # fmt: skip
-    more = [
-        [None, None, None, None, -each], [None, -each, None, None, None],
-        [None, None, -each, None, None],
-    ]  # fmt: skip
-    stacked = sparse.bmat(parts + more).tocsr()
-    rows_of = [3 * N * i + np.arange(3 * count).reshape(3, count).T.ravel()
-               for i, count in enumerate((N, E))]  # fmt: skip
-    budget = np.concatenate([np.zeros(n + 2 * E), width * radii[0], r])
-    cones = sparse.vstack([sparse.csr_matrix(budget[None]), stacked[np.concatenate(rows_of)]])
-    # the last unknown: the length of the coefficients, a cone of its own
-    count = len(budget)
-    length = sparse.coo_matrix(
-        (-np.ones(n + 1), (np.arange(n + 1), [count, *range(n)])), (n + 1, count + 1)
-    )
-    none = sparse.csr_matrix((cones.shape[0], 1))
-    rows = sparse.vstack([sparse.hstack([cones, none]), length]).tocsc()
-    right = np.zeros(rows.shape[0])
-    right[0] = 1.0
+    # unknowns: coefficients, Re h_i, Im h_i, bounds of |h - Σ h_i|, of |h_i| and of the length
+    rows = sparse.bmat([
+        [None, None, None, (width * radii[0])[None], r[None], None],
+        [None, None, None, -one, None, None], [re, summed, None, None, None, None],
+        [im, None, summed, None, None, None],
+        [None, None, None, None, -each, None], [None, -each, None, None, None, None],
+        [None, None, -each, None, None, None],
+        [None, None, None, None, None, [[-1.0]]],
+        [-sparse.identity(n), None, None, None, None, None],
+    ]).tocsr()  # fmt: skip
+    threes = [np.arange(3 * count).reshape(3, count).T.ravel() for count in (N, E)]
+    end = 1 + 3 * (N + E)
+    order = [[0], 1 + threes[0], 1 + 3 * N + threes[1], np.arange(end, end + n + 1)]
+    rows, right = rows[np.concatenate(order)].tocsc(), np.append(1.0, np.zeros(end + n))
     aim = np.concatenate([np.zeros(n), -c.real, c.imag, np.zeros(N + E), [COST]])
     x = _solved(aim, rows, right, 1, n + 1)
     return (np.inf, np.zeros(n)) if x is None else (float(-aim[:-1] @ x[:-1]), x[:n])

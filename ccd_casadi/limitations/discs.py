@@ -27,9 +27,8 @@ def discs(limits: Limits, low: Array, high: Array, omega_b: float) -> tuple[np.n
         m_S, m_T = other.radii(low, high, omega_b)
         r, spread = ratio(limits.row[0], other.row[0], low, high)
         slack = np.maximum(1.0 - spread * np.minimum(m_T, 1.0 + m_S), 1e-9)  # |T| <= 1 + |S|
-        for centre, radius in (
-            circle_of_S(r, m_S / slack), circle_of_T(r, m_T * (1.0 + spread) / slack)
-        ):  # fmt: skip
+        S, size = circle(1.0 / r, m_T * (1.0 + spread) / slack)  # T and S change places
+        for centre, radius in (circle(r, m_S / slack), (1.0 - S, size)):
             matters = radius < LARGEST
             centres.append(np.where(matters, centre, 0.0))
             radii.append(np.where(matters, radius, radii[0]))
@@ -59,20 +58,10 @@ def ratio(one: Response, other: Response, low: Array, high: Array) -> tuple[np.n
     return r, np.expm1(half * slope + 3.0 * FAITHFUL)
 
 
-def circle_of_S(r: np.ndarray, m: Array) -> tuple[np.ndarray, Array]:
-    """|1 - T| <= m |1 + (r - 1) T|."""
-    return _circle(1.0 - (m * np.abs(r - 1.0)) ** 2, np.conj(1.0 + m**2 * (r - 1.0)), m * np.abs(r))
-
-
-def circle_of_T(r: np.ndarray, m: Array) -> tuple[np.ndarray, Array]:
-    """|r T| <= m |1 + (r - 1) T|."""
-    return _circle(
-        np.abs(r) ** 2 - (m * np.abs(r - 1.0)) ** 2, np.conj(m**2 * (r - 1.0)), m * np.abs(r)
-    )
-
-
-def _circle(square: Array, centre: np.ndarray, radius: Array) -> tuple[np.ndarray, Array]:
-    """Centre and radius over the factor of |T|²; infinite where that is not positive."""
+def circle(r: np.ndarray, m: Array) -> tuple[np.ndarray, Array]:
+    """Of |1 - T| <= m |1 + (r - 1) T|; an infinite radius where that is not the inside of one."""
+    square = 1.0 - (m * np.abs(r - 1.0)) ** 2
     inside = square > 0.0
     square = np.where(inside, square, 1.0)
-    return centre / square, np.where(inside, radius / square, np.inf)
+    radius = np.where(inside, m * np.abs(r) / square, np.inf)
+    return np.conj(1.0 + m**2 * (r - 1.0)) / square, radius

@@ -12,7 +12,7 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.robust.perturbed import PerturbedLoop, judge, search
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.progress import Progress
 
 CORNERS = 5  # parameters up to which all corners of the tolerances are tried
@@ -67,9 +67,9 @@ def tolerances(
 
     light = replace(run, result={})
     drawn: list[PerturbedLoop | None] = [None] * samples
-    tasks = [(i, light, place(x)) for i, x in enumerate(unit)]
+    tasks = {i: (light, place(x)) for i, x in enumerate(unit)}
     bar = Progress(samples, "hardware tolerances")
-    for i, item in bar.over(pool.map_unordered(_hardware_unit, tasks)):
+    for i, item in bar.over(results(pool, _hardware, tasks)):
         drawn[i] = item
     failed = sum(item is None for item in drawn)
     one = np.ones(theta.size)
@@ -88,10 +88,3 @@ def _hardware(run: FinishedRun, theta: tuple[float, ...]) -> PerturbedLoop | Non
         return judge(run, modal_plant(system, run.problem.suspension), theta)
     except PlantError:
         return None
-
-
-def _hardware_unit(
-    task: tuple[int, FinishedRun, tuple[float, ...]],
-) -> tuple[int, PerturbedLoop | None]:
-    index, run, theta = task
-    return index, _hardware(run, theta)

@@ -5,10 +5,10 @@ A task whose worker dies is tried once more, in a new one.
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from multiprocessing import connection
 from reprlib import Repr
-from typing import Protocol, Self
+from typing import Any, Protocol, Self, TypeVar
 
 from ccd_casadi.support.interrupts import raise_dropped
 from ccd_casadi.support.worker_process import (
@@ -20,6 +20,7 @@ from ccd_casadi.support.worker_process import (
     track_resources,
 )
 
+K = TypeVar("K")
 PATIENCE = 2.0  # s of work that is not worth starting processes for
 _SHORT = Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
@@ -167,3 +168,16 @@ class Workers:
             for worker in [worker for worker in workers if worker in self._workers]:
                 worker.end()
                 self._workers.remove(worker)
+
+
+def results(
+    workers: Pool | None, function: Callable[..., R], tasks: Mapping[K, tuple[Any, ...]]
+) -> Generator[tuple[K, R], None, None]:
+    """Key and `function(*arguments)` of every task, as they complete; None: in this process."""
+    calls = [(key, function, arguments) for key, arguments in tasks.items()]
+    return (workers or Workers(1)).map_unordered(_keyed, calls)
+
+
+def _keyed(task: tuple[K, Callable[..., R], tuple[Any, ...]]) -> tuple[K, R]:
+    key, function, arguments = task
+    return key, function(*arguments)

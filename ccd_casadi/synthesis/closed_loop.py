@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.kernels.design import judge
-from ccd_casadi.kernels.figures import Figure
+from ccd_casadi.kernels.figures import Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome, figures_from_row
@@ -29,9 +29,9 @@ def measure(
 
     The figures end where the certificate fails; ω_low in rad/s.
     """
-    w0, row = plant.omega_0, np.full(int(Figure.COUNT), np.nan)
-    row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
-    row[Figure.LIMITED_BY_BOUND] = 0.0
+    w0, row = plant.omega_0, np.full(int(Column.COUNT), np.nan)
+    row[Column.GAMMA_OPT], row[Column.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
+    row[Column.LIMITED_BY_BOUND] = 0.0
     K = controller.in_units(w0, plant.force)
     A, B, C, D = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
     judge(plant.A, plant.B, plant.C, A, B, C, D, weights.scaled(w0), weights.delta, gamma,

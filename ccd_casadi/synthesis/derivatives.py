@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ccd_casadi.kernels.design import design, failed_row
-from ccd_casadi.kernels.gradients import DesignPlant, Loop, figure_gradients
+from ccd_casadi.kernels.gradients import LoopAt, MadeFor, figure_gradients
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
@@ -79,16 +79,16 @@ def sensitivities(
     made_on = plant.design_plant
     names = _WEIGHTS + (("disturbance",) if weights.delta else ())
     scaled = np.append(weights.scaled(w0), weights.delta)
-    made_at = DesignPlant(made_on.A, made_on.B, made_on.C, made_on.dA, made_on.dB, made_on.dC,
-                          weights.scaled(w0), gamma_backoff, weights.delta)  # fmt: skip
+    made_for = MadeFor(made_on, weights.scaled(w0), gamma_backoff, weights.delta)
     made = None
     try:
         # Rounding may put the blocks' γ_opt below the whole plant's: it is then made from that.
         for channels in (made_on.channels, ()) if made_on.channels else ((),):
-            row, *controller = design(*made_at[:3], made_at.w, made_on.grid, made_on.gain,
-                                      gamma_backoff, omega_low / w0, 0.0, channels,
-                                      weights.delta)  # fmt: skip
-            K = (controller[0], controller[1], controller[2])
+            row, Ak, Bk, Ck = design(
+                made_on.A, made_on.B, made_on.C, made_for.w, made_on.grid, made_on.gain,
+                gamma_backoff, omega_low / w0, 0.0, channels, weights.delta,
+            )  # fmt: skip
+            K = Ak, Bk, Ck
             figures, worst = over_family(plant, weights, row, K, omega_low)
             places = [
                 (plant, figures.bandwidth, False),
@@ -99,12 +99,9 @@ def sensitivities(
                 most = compliance_over_family(plant, plant.controller_si(*K))
                 figures = replace(figures, compliance=most.gain)
                 places.append((most.plant, most.omega, True))
-            loops = [
-                Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega / w0, of_force)
-                for at, omega, of_force in places
-            ]
+            loops = [LoopAt(at, omega / w0, of_force) for at, omega, of_force in places]
             gradient, fixed, gaps, to_gamma, whole = figure_gradients(
-                made_at, row, made_on.grid, made_on.gain, loops if figures.certified else []
+                made_for, row, made_on.grid, made_on.gain, loops if figures.certified else []
             )
             if whole:
                 break

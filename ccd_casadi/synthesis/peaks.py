@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.kernels.gradients import DesignPlant, Loop, peak_gradients
+from ccd_casadi.kernels.gradients import LoopAt, MadeFor, peak_gradients
 from ccd_casadi.kernels.sensitivity import sensitivity_gain, sensitivity_gains
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.grid import frequency_grid, local_maxima, refine_peak, root_flanks
@@ -55,10 +55,9 @@ def local_peaks_with_gradients(
     `design`: what `sensitivities` made of the same plant and weights; nothing is made anew.
     """
     made = design.made
-    if made is None or made.row[Figure.CODE] != Code.CERTIFIED or made.row[Figure.BALANCED]:
+    if made is None or made.row[Column.CODE] != Code.CERTIFIED or made.row[Column.BALANCED]:
         return ()
     w0, w = plant.omega_0, weights.scaled(plant.omega_0)
-    made_on = plant.design_plant
     found = [
         (omega, i, gain)
         for i, member in enumerate(plant.members)
@@ -66,15 +65,11 @@ def local_peaks_with_gradients(
     ]
     if not found:
         return ()
-    loops = [
-        Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega)
-        for omega, at in ((omega, plant.members[i]) for omega, i, _ in found)
-    ]
+    loops = [LoopAt(plant.members[i], omega) for omega, i, _ in found]
     count = plant.dA.shape[0]
-    slopes = (made_on.dA, made_on.dB, made_on.dC)
-    made_at = DesignPlant(made_on.A, made_on.B, made_on.C, *slopes, w, gamma_backoff, weights.delta)
+    made_for = MadeFor(plant.design_plant, w, gamma_backoff, weights.delta)
     try:
-        rows = peak_gradients(made_at, made.row, made.to_gamma, loops)
+        rows = peak_gradients(made_for, made.row, made.to_gamma, loops)
     except np.linalg.LinAlgError:
         return ()
     out = []

@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.kernels.design import design, judge
 from ccd_casadi.kernels.design import sweep as _sweep
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -188,7 +188,7 @@ def over_family(
     is of that one; the certified norm is of the plant itself, and no optimal one there.
     """
     w0 = plant.omega_0
-    if row[Figure.CODE] != Code.CERTIFIED or plant.family is None:
+    if row[Column.CODE] != Code.CERTIFIED or plant.family is None:
         return figures_from_row(row, weights, w0), plant
     w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
@@ -199,42 +199,42 @@ def over_family(
         return own
 
     own = assessed(plant, UNBOUNDED)
-    if own[Figure.CODE] == Code.CERTIFIED:
-        own = assessed(plant, max(row[Figure.GAMMA], (1.0 + LEVEL) * own[Figure.NORM]))
+    if own[Column.CODE] == Code.CERTIFIED:
+        own = assessed(plant, max(row[Column.GAMMA], (1.0 + LEVEL) * own[Column.NORM]))
     worst = plant
-    if own[Figure.CODE] == Code.CERTIFIED:
+    if own[Column.CODE] == Code.CERTIFIED:
         for member in plant.family.perturbed:
             other = assessed(member, UNBOUNDED)
-            if other[Figure.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
+            if other[Column.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
                 figures = figures_from_row(own, weights, w0)
                 return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member
-            if other[Figure.PEAK] > own[Figure.PEAK]:
-                worst, of_peak = member, [Figure.PEAK, Figure.PEAK_FREQUENCY]
+            if other[Column.PEAK] > own[Column.PEAK]:
+                worst, of_peak = member, [Column.PEAK, Column.PEAK_FREQUENCY]
                 own[of_peak] = other[of_peak]
     return figures_from_row(own, weights, w0), worst
 
 
 def figures_from_row(row: Array, weights: Weights, omega_0: float) -> DesignFigures:
     """A kernel's row of scaled figures in SI."""
-    code = Code(int(row[Figure.CODE]))
-    pole = float(row[Figure.MAX_REAL_POLE]) * omega_0
+    code = Code(int(row[Column.CODE]))
+    pole = float(row[Column.MAX_REAL_POLE]) * omega_0
     return DesignFigures(
         omega_S=weights.omega_S,
         omega_T=weights.omega_T,
         outcome=_OUTCOMES[code],
-        gamma_opt=float(row[Figure.GAMMA_OPT]),
-        gamma_lower_bound=float(row[Figure.GAMMA_LOWER_BOUND]),
-        gamma=float(row[Figure.NORM]),
-        limited_by_bound=bool(row[Figure.LIMITED_BY_BOUND]),
-        bandwidth=float(row[Figure.BANDWIDTH]) * omega_0,
-        sensitivity_peak=float(row[Figure.PEAK]),
-        sensitivity_peak_frequency=float(row[Figure.PEAK_FREQUENCY]) * omega_0,
-        sensitivity_low=float(row[Figure.LOW]),
+        gamma_opt=float(row[Column.GAMMA_OPT]),
+        gamma_lower_bound=float(row[Column.GAMMA_LOWER_BOUND]),
+        gamma=float(row[Column.NORM]),
+        limited_by_bound=bool(row[Column.LIMITED_BY_BOUND]),
+        bandwidth=float(row[Column.BANDWIDTH]) * omega_0,
+        sensitivity_peak=float(row[Column.PEAK]),
+        sensitivity_peak_frequency=float(row[Column.PEAK_FREQUENCY]) * omega_0,
+        sensitivity_low=float(row[Column.LOW]),
         certificate=Certificate(
             stable=pole < 0.0,
             max_real_pole=pole,
-            norm=float(row[Figure.NORM]),
-            norm_bound=float(row[Figure.GAMMA]),
+            norm=float(row[Column.NORM]),
+            norm_bound=float(row[Column.GAMMA]),
             passed=code in (Code.CERTIFIED, Code.NO_BANDWIDTH),
         ),
     )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ccd_casadi.kernels.bound_peak import direction
-from ccd_casadi.kernels.figures import Figure
+from ccd_casadi.kernels.figures import Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import BACKWARD, gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import squared_weights
@@ -39,7 +39,7 @@ def gamma_error(
     row: Array, A: Array, B: Array, C: Array, w: Array, grid: Array, gain: Array
 ) -> float:
     """δγ_opt/γ_opt of a design's row: of its search, and of the bound where that limits it."""
-    error = float(row[Figure.GAMMA_ERROR])
-    if row[Figure.LIMITED_BY_BOUND]:
+    error = float(row[Column.GAMMA_ERROR])
+    if row[Column.LIMITED_BY_BOUND]:
         error += bound_error(A, B, C, w, gamma_lower_bound(prepare(A, B, C), w, grid, gain)[1])
     return error

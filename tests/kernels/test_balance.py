@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ccd_casadi.kernels import design as module
 from ccd_casadi.kernels.balance import balancing, rounding_noise
 from ccd_casadi.kernels.design import design
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.riccati import NOISE, lqr_hamiltonian
@@ -51,8 +51,8 @@ def check_certified(item: dict[str, Any], row: Array, controller: list[Array]) -
     weights = Weights(M_S, A_S, omega_S, c_K, omega_K, 1.0, A_l, A_u, omega_T)
     omega = np.concatenate([np.geomspace(1e-6, 1e6, 2000), np.abs(poles)])
     gains = stack_gain(G, K, weights, omega)
-    assert gains.max() <= BACKOFF * row[Figure.GAMMA_OPT] * (1.0 + 1e-6)
-    assert gains.max() >= 0.5 * row[Figure.GAMMA_OPT]
+    assert gains.max() <= BACKOFF * row[Column.GAMMA_OPT] * (1.0 + 1e-6)
+    assert gains.max() >= 0.5 * row[Column.GAMMA_OPT]
 
 
 def test_designs_lost_in_the_plants_own_coordinates_are_certified(
@@ -70,15 +70,15 @@ def test_designs_lost_in_the_plants_own_coordinates_are_certified(
         with monkeypatch.context() as patch:
             patch.setattr(module, "_PASSED", tuple(Code))  # the first attempt alone
             alone = design(*numbers)[0]
-        assert not alone[Figure.BALANCED]
-        if row[Figure.CODE] in PASSED:
+        assert not alone[Column.BALANCED]
+        if row[Column.CODE] in PASSED:
             check_certified(item, row, controller)
             certified += 1
-            saved += alone[Figure.CODE] not in PASSED
-            assert row[Figure.BALANCED] == (alone[Figure.CODE] not in PASSED)
+            saved += alone[Column.CODE] not in PASSED
+            assert row[Column.BALANCED] == (alone[Column.CODE] not in PASSED)
         else:
             other = synthesise(A, B, C, w, *grid, BACKOFF, 0.0, True)[0]
-            assert other[Figure.GAMMA_ERROR] > BACKOFF - 1.0
+            assert other[Column.GAMMA_ERROR] > BACKOFF - 1.0
     assert len(LOST) == 5
     assert certified >= 4  # five with some kernels of OpenBLAS
     assert saved >= 2
@@ -94,13 +94,13 @@ def test_the_optimum_is_the_same_in_any_coordinates(seed: int, log_S: float, log
     w = PAPER.at(plant.omega_0 * 10.0 ** (log_S - 2.0), plant.omega_0 * 10.0 ** (log_T - 1.5))
     data = (plant.A, plant.B, plant.C, w.scaled(plant.omega_0), plant.grid, plant.gain)
     (row, *own), (other, *balanced) = (synthesise(*data, BACKOFF, 0.0, x) for x in (False, True))
-    assume(row[Figure.CODE] == Code.CERTIFIED)
-    assert other[Figure.CODE] == Code.CERTIFIED
+    assume(row[Column.CODE] == Code.CERTIFIED)
+    assert other[Column.CODE] == Code.CERTIFIED
     # In 15,000 designs under three sets of kernels the plant's own coordinates told 3e-7 at most,
     # balanced ones 2e-6 and once 6e-5; γ_opt differed by 1e-8.
     assert gamma_error(row, *data) < 6e-7
     told = min(gamma_error(row, *data) + gamma_error(other, *data), 1e-6)
-    assert other[Figure.GAMMA_OPT] == pytest.approx(row[Figure.GAMMA_OPT], rel=told)
+    assert other[Column.GAMMA_OPT] == pytest.approx(row[Column.GAMMA_OPT], rel=told)
     s = 1j * np.array([OMEGA_LOW / plant.omega_0, 0.3, 1.0, 3.0])[:, None, None]
     K, L = (
         C @ np.linalg.solve(s * np.eye(len(A)) - A, B.astype(complex))

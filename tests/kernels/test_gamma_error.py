@@ -7,7 +7,7 @@ from helpers import PAPER, few, flexible_case, two_mass
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.synthesis import synthesise
@@ -51,8 +51,8 @@ def test_a_design_that_the_bound_limits_has_the_error_of_the_bound() -> None:
         told = []
         for balanced in (False, True):
             row = synthesise(*data, 1.02, 0.0, balanced)[0]
-            if row[Figure.LIMITED_BY_BOUND]:
-                assert row[Figure.GAMMA_OPT] == row[Figure.GAMMA_LOWER_BOUND]
+            if row[Column.LIMITED_BY_BOUND]:
+                assert row[Column.GAMMA_OPT] == row[Column.GAMMA_LOWER_BOUND]
                 assert 0.0 < error <= gamma_error(row, *data)
                 told.append(gamma_error(row, *data))
         # far from γ_X: nothing but the error of the bound, and the search's 1e-11; a processor may
@@ -74,18 +74,18 @@ def test_where_the_limit_passes_from_the_riccati_level_to_the_bound_both_sides_a
 
     def row(exponent: float) -> Array:
         found = synthesise(*data(exponent), 1.02, 0.0, False)[0]
-        assert found[Figure.CODE] == Code.CERTIFIED
+        assert found[Column.CODE] == Code.CERTIFIED
         return found
 
     ends = [-4.0, 2.0]
     sides = [row(x) for x in ends]
-    limited = [bool(side[Figure.LIMITED_BY_BOUND]) for side in sides]
+    limited = [bool(side[Column.LIMITED_BY_BOUND]) for side in sides]
     assert limited[0] != limited[1]
     for _ in range(40):
         middle = 0.5 * (ends[0] + ends[1])
         found = row(middle)
-        i = limited.index(bool(found[Figure.LIMITED_BY_BOUND]))
+        i = limited.index(bool(found[Column.LIMITED_BY_BOUND]))
         ends[i], sides[i] = middle, found
     told = sum(gamma_error(side, *data(x)) for side, x in zip(sides, ends, strict=True)) + 1e-10
     assert told < 1e-3
-    assert sides[1][Figure.GAMMA_OPT] == pytest.approx(sides[0][Figure.GAMMA_OPT], rel=told)
+    assert sides[1][Column.GAMMA_OPT] == pytest.approx(sides[0][Column.GAMMA_OPT], rel=told)

@@ -51,11 +51,11 @@ def test_a_sweep_needs_fewer_schur_forms_than_its_points_alone() -> None:
         for j, T in enumerate(omega_T):
             w[2], w[7] = S, T
             row = design.design(plant.A, plant.B, plant.C, w, *numbers, 0.0)[0]
-            alone += row[design.Figure.SCHUR_FORMS]
-            assert rows[i, j, design.Figure.GAMMA_OPT] == pytest.approx(
-                row[design.Figure.GAMMA_OPT], rel=1e-9
+            alone += row[design.Column.SCHUR_FORMS]
+            assert rows[i, j, design.Column.GAMMA_OPT] == pytest.approx(
+                row[design.Column.GAMMA_OPT], rel=1e-9
             )
-    assert rows[:, :, design.Figure.SCHUR_FORMS].sum() < 0.7 * alone
+    assert rows[:, :, design.Column.SCHUR_FORMS].sum() < 0.7 * alone
 
 
 def test_the_search_for_gamma_takes_few_schur_forms() -> None:
@@ -67,10 +67,10 @@ def test_the_search_for_gamma_takes_few_schur_forms() -> None:
         for T in np.geomspace(20, 1000, 5) * HZ:
             arguments = (plant.A, plant.B, plant.C, PAPER.at(S, T).scaled(plant.omega_0), *numbers)
             row = design.design(*arguments, 0.0)[0]
-            cold.append(row[design.Figure.SCHUR_FORMS])
+            cold.append(row[design.Column.SCHUR_FORMS])
             for factor in (0.99, 1.01):
-                again = design.design(*arguments, factor * row[design.Figure.GAMMA_OPT])[0]
-                near.append(again[design.Figure.SCHUR_FORMS])
+                again = design.design(*arguments, factor * row[design.Column.GAMMA_OPT])[0]
+                near.append(again[design.Column.SCHUR_FORMS])
     assert np.mean(cold) < 4.0
     assert max(cold) <= 8
     assert np.mean(near) < 2.2
@@ -173,15 +173,15 @@ def test_gamma_that_rounding_would_spoil_is_found_in_balanced_coordinates(seed: 
     H0 = riccati.lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], 3, 3)
     data = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain, 1.02)
     row = kernel(*data, 0.0, False)[0]
-    bound, tolerance = row[design.Figure.GAMMA_LOWER_BOUND], 1e-11
+    bound, tolerance = row[design.Column.GAMMA_LOWER_BOUND], 1e-11
     own = gamma.optimal_gamma(H0, gp[1], gp[3], gp[5], bound, 0.0, tolerance, riccati.NOISE)
     assert own[3]
     assert own[4] > ENOUGH
-    assert row[design.Figure.GAMMA_ERROR] < 0.1 * own[4]
-    assert row[design.Figure.GAMMA_OPT] == pytest.approx(own[0], rel=own[4])
+    assert row[design.Column.GAMMA_ERROR] < 0.1 * own[4]
+    assert row[design.Column.GAMMA_OPT] == pytest.approx(own[0], rel=own[4])
     for guess in (0.98, 1.01, 1.03):  # other levels on the way, other rounding
         again = kernel(*data, guess * own[0], False)[0]
-        told = row[design.Figure.GAMMA_ERROR] + again[design.Figure.GAMMA_ERROR]
-        assert again[design.Figure.GAMMA_OPT] == pytest.approx(
-            row[design.Figure.GAMMA_OPT], rel=told
+        told = row[design.Column.GAMMA_ERROR] + again[design.Column.GAMMA_ERROR]
+        assert again[design.Column.GAMMA_OPT] == pytest.approx(
+            row[design.Column.GAMMA_OPT], rel=told
         )

@@ -27,7 +27,7 @@ from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -61,7 +61,7 @@ def test_derivatives_of_the_rows(seed: int, sampling: Sampling | None, skewed: b
     peaks = assess(model, kappa, TAU, depth=-2.0).peaks
     assert peaks is not None
     alone = peaks.plant // 2 >= model.first
-    kinds = {Curve.S_MAX, Curve.LEVEL, Curve.SHAPE, Curve.CROSSING, Curve.KS}
+    kinds = {LoopCurve.S_MAX, LoopCurve.LEVEL, LoopCurve.SHAPE, LoopCurve.CROSSING, LoopCurve.KS}
     assert set(peaks.curve[alone]) == kinds
     seen = assert_derivatives(
         lambda theta: as_one(whole, sampling, 0.3, theta), kappa,
@@ -132,10 +132,10 @@ def test_peaks_of_the_rows_are_those_of_dense_grids() -> None:
         (0, np.linalg.norm(np.array(own[0].output) @ S, axis=-1) / 1.5),
         (2, np.linalg.norm(np.array(own[2].output) @ S, axis=-1) / 1.6),
     ):
-        value = peaks.value[(peaks.plant == 3 + i) & (peaks.curve == Curve.S_MAX)].max()
+        value = peaks.value[(peaks.plant == 3 + i) & (peaks.curve == LoopCurve.S_MAX)].max()
         assert np.exp(value) == pytest.approx(gain.max(), rel=1e-3)
     size = np.abs(BOUNDS.weights.responses(omega)[1]) * np.linalg.norm(own[2].force @ KS, axis=-1)
-    value = peaks.value[(peaks.plant == 5) & (peaks.curve == Curve.KS)].max()
+    value = peaks.value[(peaks.plant == 5) & (peaks.curve == LoopCurve.KS)].max()
     assert np.exp(value) * BOUNDS.weighted_level == pytest.approx(size.max() / 0.4, rel=1e-3)
 
 
@@ -175,7 +175,7 @@ def test_what_the_whole_asks_anyway_is_never_what_holds_a_step(off: float) -> No
         assert own.stable == plain.stable
         if not plain.stable:
             continue
-        for curve in (Curve.S_MAX, Curve.KS):
+        for curve in (LoopCurve.S_MAX, LoopCurve.KS):
             tops = [found.peaks.value[found.peaks.curve == curve].max() for found in (plain, own)]
             assert tops[1] == pytest.approx(tops[0], abs=1e-9)
             compared += 1

@@ -34,7 +34,7 @@ from ccd_casadi.fixed_structure.decoupling import (
 )
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.peak_search import Brackets, split
 from ccd_casadi.support.errors import PlantError
 
@@ -109,7 +109,7 @@ def test_derivatives_of_singular_values(
     seen = assert_derivatives(
         lambda theta: whole(problem, sampling, theta=theta), kappa, lambda row: row % 2 == 1
     )
-    assert seen >= {Curve.S_MAX, Curve.S_LOW, Curve.KS, Curve.T, Curve.CROSSING}
+    assert seen >= {LoopCurve.S_MAX, LoopCurve.S_LOW, LoopCurve.KS, LoopCurve.T, LoopCurve.CROSSING}
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])
@@ -183,7 +183,7 @@ def test_peaks_of_the_whole_are_those_of_dense_grids(off: tuple[float, ...]) -> 
     omega = np.geomspace(1e-2, 1e4, 20001) * first.omega_0
     for i, x in enumerate(off):
         gain = sensitivity_gain(plant(off=x).plant_si(), controller, omega)
-        own = peaks.value[(owner == i) & (peaks.curve == Curve.S_MAX)].max()
+        own = peaks.value[(owner == i) & (peaks.curve == LoopCurve.S_MAX)].max()
         assert np.exp(own) * BOUNDS.S_max >= gain.max() * (1.0 - 1e-9)
         assert np.exp(own) * BOUNDS.S_max <= gain.max() * (1.0 + 1e-3)
     assert structure().order == 3 * STRUCTURE.order
@@ -197,14 +197,14 @@ def test_a_maximum_beside_a_crossing_of_singular_values_is_found() -> None:
         return np.sort(np.stack([one, other], axis=-1))[..., ::-1]
 
     # the grid's own largest sigma_1 is elsewhere; sigma_2 is largest where the two cross
-    brackets = Brackets(np.full(2, Curve.T), np.array([0, 1]), np.array([1.0, 1.004]),
+    brackets = Brackets(np.full(2, LoopCurve.T), np.array([0, 1]), np.array([1.0, 1.004]),
                         np.array([0.99, 1.0]), np.array([1.004, 1.03]))  # fmt: skip
     inside = finer(brackets)
     found = split(brackets, np.arange(2), inside, level(inside), 1, 2)
     assert ((found.row == 0) & (found.low < 1.01) & (found.high > 1.01)).sum() == 1
     assert (found.row == 0).sum() == 2  # and the one that was known stays
     assert ((found.low <= found.start) & (found.start <= found.high)).all()
-    assert (found.curve == Curve.T).all()
+    assert (found.curve == LoopCurve.T).all()
 
 
 def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
@@ -225,7 +225,7 @@ def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
 
     low, start, high = (np.array([v]) for v in (0.99, 0.9985, 1.0145))
     assert largest(start) > max(largest(low), largest(high))
-    brackets = Brackets(np.full(1, Curve.S_MAX), np.zeros(1, int), start, low, high)
+    brackets = Brackets(np.full(1, LoopCurve.S_MAX), np.zeros(1, int), start, low, high)
     assert not closed(monkeypatch, slope, brackets)[1].any()
     inside = finer(brackets)
     found = split(brackets, np.arange(1), inside, largest(inside)[..., None], 1, 1)

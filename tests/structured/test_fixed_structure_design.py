@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.fixed_structure.design import bandwidth_envelope, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.loop_problem import Curve
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
@@ -127,7 +127,7 @@ def test_a_narrow_peak_at_3_db_is_seen_by_the_judge_and_by_the_search(gain: floa
     shape = np.minimum(1.0, bounds.shape * omega / bandwidth)
     worst = (np.sqrt(2.0) * S / shape)[omega < bandwidth].max()
     peaks = assess(problem, scaled, float(np.log(bandwidth / own.omega_0))).peaks
-    below = np.isin(peaks.curve, (Curve.SHAPE, Curve.LEVEL, Curve.CROSSING))
+    below = np.isin(peaks.curve, (LoopCurve.SHAPE, LoopCurve.LEVEL, LoopCurve.CROSSING))
     found = peaks.value[below].max() - problem.margin
     assert found == pytest.approx(np.log(worst), abs=1e-6)
 
@@ -143,7 +143,9 @@ def test_a_rigid_body_is_looked_at_far_above_its_suspension() -> None:
     unit = problem.plants
     controller = SMALL.state_space(SMALL.in_units(kappa, unit.omega_0, unit.force))
     judged = certify([body], controller, bounds).plants[0]
-    found = np.exp(peaks.value[peaks.curve == Curve.S_MAX].max() - problem.margin) * bounds.S_max
+    found = (
+        np.exp(peaks.value[peaks.curve == LoopCurve.S_MAX].max() - problem.margin) * bounds.S_max
+    )
     assert found == pytest.approx(judged.S_peak, rel=1e-6)
 
 

@@ -29,7 +29,7 @@ from ccd_casadi.fixed_structure.figures import (
     to_theta,
 )
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.peak_search import Brackets
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random
@@ -129,7 +129,7 @@ def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
     peaks = found.peaks
     assert figures.stable
     assert peaks is not None
-    top = peaks.value[peaks.curve == Curve.S_MAX].max()
+    top = peaks.value[peaks.curve == LoopCurve.S_MAX].max()
     assert np.exp(top - problem.margin) * BOUNDS.S_max == pytest.approx(
         figures.sensitivity_peak, rel=1e-6
     )
@@ -148,14 +148,14 @@ def test_peaks_are_the_suprema_of_dense_grids(
     assert found is not None
     edge = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
     v = np.geomspace(problem.base[0], problem.base[-1], 60001)
-    curves = (*problem.curves, Curve.CROSSING)
+    curves = (*problem.curves, LoopCurve.CROSSING)
     short = dict(zip(problem.curves, problem.short, strict=True))
     dense = by_curve(problem, kappa, tau, curves, np.tile(v, (2, 1)))
     for i in range(2):
         for curve in curves:
             kinds, values = [curve], dense[curve][i] + problem.margin
             if short.get(curve, True):
-                values, kinds = values[v <= edge], [curve, Curve.LEVEL, Curve.CROSSING]
+                values, kinds = values[v <= edge], [curve, LoopCurve.LEVEL, LoopCurve.CROSSING]
             own = (found.plant == i) & np.isin(found.curve, kinds)
             assert found.value[own].max() >= values.max() - 1e-9
             if not short.get(curve, True):
@@ -171,7 +171,7 @@ def test_the_peak_of_s_is_its_h_infinity_norm() -> None:
         S = StateSpace(A, np.vstack([G.B @ K.D, K.B]),
                        np.hstack([-G.C, np.zeros((1, len(K.A)))]), np.eye(1))  # fmt: skip
         assert found is not None
-        top = found.value[found.curve == Curve.S_MAX].max() - problem.margin
+        top = found.value[found.curve == LoopCurve.S_MAX].max() - problem.margin
         assert np.exp(top) * BOUNDS.S_max == pytest.approx(hinf_norm(S)[0], rel=1e-7)
 
 
@@ -190,7 +190,7 @@ def test_derivatives_of_the_peaks(seed: int, sampling: Sampling | None) -> None:
     size = np.abs(peaks.to_kappa).max(1, keepdims=True) + 1e-3
     to_kappa = slopes(lambda x: values(problem, x, tau), kappa, 1e-4)
     assert (np.abs(to_kappa - peaks.to_kappa) / size).max() < 1e-5
-    rising = peaks.curve != Curve.CROSSING
+    rising = peaks.curve != LoopCurve.CROSSING
     slope = (values(problem, kappa, tau + 1e-6) - values(problem, kappa, tau - 1e-6)) / 2e-6
     np.testing.assert_allclose(slope[rising], peaks.to_tau[rising], atol=1e-6)
     exact = to_theta(problem, kappa, peaks)
@@ -318,6 +318,6 @@ def test_a_plant_that_answers_nothing_raises_nothing() -> None:
     silent = replace(problem, plants=silence)
     v = np.geomspace(0.01, 1.0, 5)
     found = by_curve(silent, kappa, 0.0, silent.curves, np.tile(v, (1, 1)))
-    assert (found[Curve.T] == -np.inf).all()
-    rows = np.full(5, int(Curve.T))
+    assert (found[LoopCurve.T] == -np.inf).all()
+    rows = np.full(5, int(LoopCurve.T))
     assert not np.isfinite(evaluate_rows(silent, kappa, 0.0, rows, np.zeros(5, int), v)[1]).any()

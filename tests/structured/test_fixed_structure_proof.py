@@ -14,7 +14,7 @@ from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
-from ccd_casadi.fixed_structure.loop_problem import Curve
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.fixed_structure.worst_plant import lattice
@@ -105,7 +105,7 @@ def test_enclosures_hold_at_the_corners_of_small_boxes(sampling, structure) -> N
     plants = box.plants([(0, point) for point in corner[1:].T])
     problem = problem_for(plants, structure, BOUNDS, sampling)
     own = problem.plants
-    curves = (Curve.S_MAX, Curve.SHAPE, Curve.KS, Curve.T, Curve.GS)
+    curves = (LoopCurve.S_MAX, LoopCurve.SHAPE, LoopCurve.KS, LoopCurve.T, LoopCurve.GS)
     v = own.variable(corner[0] / own.omega_0)[:, None]
     tau = float(np.log(bandwidth / own.omega_0))
     levels = by_curve(problem, in_problem_units(problem, kappa), tau, curves, v)
@@ -114,11 +114,11 @@ def test_enclosures_hold_at_the_corners_of_small_boxes(sampling, structure) -> N
     for curve in curves:
         highest = found.highest[found.names.index(curve.name)]
         value = np.exp(levels[curve]).reshape(count, 4).max(axis=1)
-        if curve is Curve.SHAPE:  # beyond it S_max says more
+        if curve is LoopCurve.SHAPE:  # beyond it S_max says more
             highest, value = highest[rising], value[rising]
         assert (value <= highest * (1.0 + 1e-9)).all()
         lost, size = 1.0 - value / highest, (half / np.vstack([omega, np.ones(count)])).max(axis=0)
-        assert np.median(lost / (size[rising] if curve is Curve.SHAPE else size)) < 10.0
+        assert np.median(lost / (size[rising] if curve is LoopCurve.SHAPE else size)) < 10.0
 
 
 def test_an_unstable_corner_is_never_proven() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from ccd_casadi.fixed_structure.loop_problem import PER_DECADE
 from ccd_casadi.fixed_structure.peak_search import hidden_peaks, local_peaks
-from ccd_casadi.kernels.limits import Curve
+from ccd_casadi.kernels.limits import LoopCurve
 
 STEP = np.log(10.0) / PER_DECADE
 HALF = 0.09  # of the distance of the maxima in ln v: one in five shows on no grid
@@ -26,7 +26,7 @@ def test_every_maximum_lies_in_a_bracket(seed: int) -> None:
     x = -1.5 + STEP * (np.arange(32) + rng.uniform() + rng.uniform(-0.2, 0.2, 32))
     v, value = np.exp(x)[None], two_maxima(x, *curve)[None, :, None, None]
     loop: Any = SimpleNamespace(out=np.eye(1))
-    curves = np.array([Curve.S_MAX])
+    curves = np.array([LoopCurve.S_MAX])
     shown = local_peaks(loop, curves, v, value, -1.0, np.full((1, 1), np.inf))
     found = shown.and_those(hidden_peaks(curves, v, value))
     fine = np.linspace(-0.3, 0.3, 6001)

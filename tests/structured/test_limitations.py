@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.problem import best_choice, scaled_plant
 from ccd_casadi.limitations.basis import Basis
 from ccd_casadi.limitations.bound import lower_bound, upper_bound
 from ccd_casadi.limitations.certificate import rules_out, support, support_of
-from ccd_casadi.limitations.discs import circle_of_S, circle_of_T, discs, ratio
+from ccd_casadi.limitations.discs import circle, discs, ratio
 from ccd_casadi.limitations.limits import limits_of, response_of
 from ccd_casadi.limitations.of_problem import gap_of, limits_of_problem, opposite_corners
 from ccd_casadi.lti.hold import sampled
@@ -92,7 +92,8 @@ def test_a_circle_is_the_bound_on_another_plant(seed: int, m: float, of_S: bool)
     rng = np.random.default_rng(seed)
     r = np.exp(rng.normal(scale=0.3, size=1) + 1j * rng.normal(scale=0.3, size=1))
     assume(m * np.abs(r - 1.0) < 0.99 * (1.0 if of_S else np.abs(r)))
-    centre, radius = (circle_of_S if of_S else circle_of_T)(r, np.array([m]))
+    centre, radius = circle(r if of_S else 1.0 / r, np.array([m]))
+    centre = centre if of_S else 1.0 - centre
     turned = np.exp(2j * np.pi * rng.uniform(size=1000))
     T = centre + radius * turned * rng.uniform(0.5, 1.5, 1000)
     share = (np.abs(1.0 - T) if of_S else np.abs(r * T)) / (m * np.abs(1.0 + (r - 1.0) * T))

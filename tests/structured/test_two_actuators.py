@@ -16,7 +16,7 @@ from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
@@ -58,8 +58,8 @@ def test_derivatives_of_gains_of_1_by_2_plants(sampling: Sampling | None) -> Non
     seen = assert_derivatives(
         lambda theta: problem(theta, sampling), kappa, lambda row: row % 2 == 1
     )
-    assert seen >= {Curve.S_MAX, Curve.S_LOW, Curve.CROSSING}
-    assert seen & {Curve.KS, Curve.GS}
+    assert seen >= {LoopCurve.S_MAX, LoopCurve.S_LOW, LoopCurve.CROSSING}
+    assert seen & {LoopCurve.KS, LoopCurve.GS}
 
 
 def test_second_derivatives_of_1_by_2_plants() -> None:
@@ -91,7 +91,7 @@ def test_the_peak_of_s_is_that_of_the_sum_of_both_loops() -> None:
     g = G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B + 0j)
     loops = g[:, 0, 0] * k[:, 0, 0] + g[:, 0, 1] * k[:, 1, 0]
     peaks = assess(model, kappa, -1.5).peaks
-    own = peaks.value[(peaks.plant == 0) & (peaks.curve == Curve.S_MAX)].max()
+    own = peaks.value[(peaks.plant == 0) & (peaks.curve == LoopCurve.S_MAX)].max()
     assert np.exp(own) * BOUNDS.S_max == pytest.approx(np.abs(1.0 / (1.0 + loops)).max(), rel=1e-3)
 
 

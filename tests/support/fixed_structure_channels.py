@@ -15,7 +15,7 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decoupling
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
-from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.peak_search import CLOSINGS, FLAT, NARROW, Brackets
 from ccd_casadi.kernels import loop_rows
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
@@ -128,7 +128,7 @@ def assert_derivatives(
     size = np.abs(peaks.to_kappa).max(1, keepdims=True) + 1e-2
     to_kappa = slopes(lambda x: values(model, x, tau), kappa, 1e-4)
     assert (np.abs(to_kappa - peaks.to_kappa) / size).max() < 1e-5
-    rising = peaks.curve != Curve.CROSSING
+    rising = peaks.curve != LoopCurve.CROSSING
     slope = (values(model, kappa, tau + 1e-6) - values(model, kappa, tau - 1e-6)) / 2e-6
     np.testing.assert_allclose(slope[rising], peaks.to_tau[rising], atol=1e-6)
     exact = to_theta(model, kappa, peaks)

@@ -7,7 +7,7 @@ from helpers import HZ, PAPER, SUSPENSION, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.loop_problem import Curve, Problem
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, Problem
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
@@ -53,8 +53,8 @@ def loop(
 
 
 def by_curve(
-    problem: Problem, kappa: Array, tau: float, curves: Sequence[Curve], v: Array
-) -> dict[Curve, Array]:
+    problem: Problem, kappa: Array, tau: float, curves: Sequence[LoopCurve], v: Array
+) -> dict[LoopCurve, Array]:
     """The levels of all plants at v (P, k) by curve, without the margin."""
     codes, loop = np.tile(np.array(curves, np.int64), (len(v), 1)), problem.loop(kappa, tau)
     found = levels(codes, np.arange(len(v)), v, loop, -np.inf)

@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.kernels.design import judge
-from ccd_casadi.kernels.figures import Figure
+from ccd_casadi.kernels.figures import Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
@@ -197,8 +197,8 @@ def assessed(
     """Certificate and figures of any controller in SI against the claim `gamma`."""
     K = in_time_unit(controller, plant.omega_0, plant.force)
     matrices = (np.ascontiguousarray(matrix) for matrix in (K.A, K.B, K.C, K.D))
-    row = np.full(int(Figure.COUNT), np.nan)
-    row[Figure.LIMITED_BY_BOUND] = 0.0
+    row = np.full(int(Column.COUNT), np.nan)
+    row[Column.LIMITED_BY_BOUND] = 0.0
     scaled_weights = weights.scaled(plant.omega_0)
     low = omega_low / plant.omega_0
     judge(plant.A, plant.B, plant.C, *matrices, scaled_weights, 0.0, gamma, low, row)

@@ -95,7 +95,7 @@ def test_a_block_that_fails_is_how_the_design_ends(which: int, monkeypatch) -> N
         found = whole(*arguments)
         balanced = arguments[8]
         if len(made) == which or balanced:  # nor does the second attempt help
-            found[0][design.Figure.CODE] = design.Code.GAMMA_NOT_CONVERGED
+            found[0][design.Column.CODE] = design.Code.GAMMA_NOT_CONVERGED
         made.append(found)
         return found
 
@@ -103,7 +103,7 @@ def test_a_block_that_fails_is_how_the_design_ends(which: int, monkeypatch) -> N
     figures = synthesise(plant, WEIGHTS, omega_low=HZ).figures
     assert len(made) == 4
     assert figures.outcome is Outcome.GAMMA_NOT_CONVERGED
-    assert figures.gamma_opt == made[which][0][design.Figure.GAMMA_OPT]
+    assert figures.gamma_opt == made[which][0][design.Column.GAMMA_OPT]
 
 
 def test_gradients_that_the_blocks_do_not_give_are_the_whole_plants(monkeypatch) -> None:  # type: ignore[no-untyped-def]

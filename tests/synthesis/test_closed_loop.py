@@ -18,7 +18,7 @@ from helpers import (
 )
 
 from ccd_casadi.analysis.loop_view import peaks_of
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -107,9 +107,9 @@ def replace_A(system: StateSpace, A: np.ndarray) -> StateSpace:
 def test_each_code_of_the_kernels_is_one_outcome(name: str) -> None:
     """No two codes and no two columns are the same number."""
     assert len(Code) == len(Code.__members__)
-    assert [int(column) for column in Figure] == list(range(int(Figure.COUNT) + 1))
-    row = np.zeros(int(Figure.COUNT))
-    row[Figure.CODE] = Code[name]
+    assert [int(column) for column in Column] == list(range(int(Column.COUNT) + 1))
+    row = np.zeros(int(Column.COUNT))
+    row[Column.CODE] = Code[name]
     figures = figures_from_row(row, PAPER, 1.0)
     assert figures.outcome is Outcome[name]
     assert figures.certificate.passed == (name in ("CERTIFIED", "NO_BANDWIDTH"))

@@ -18,7 +18,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import true_inner
 from ccd_casadi.kernels.design import design, judge
 from ccd_casadi.kernels.disturbance import filter_solution, innovations_plant
-from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.lapack import stable_subspace
 from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian
 from ccd_casadi.lti.norms import hinf_norm
@@ -185,9 +185,9 @@ def test_the_certificate_refuses_a_bound_below_the_norm_and_a_loop_without_its_d
     arguments = (plant.A, plant.B, plant.C, K.A, K.B, K.C, K.D, weights.scaled(plant.omega_0))
 
     def code(delta: float, gamma: float) -> Code:
-        row = np.full(int(Figure.COUNT), np.nan)
+        row = np.full(int(Column.COUNT), np.nan)
         judge(*arguments, delta, gamma, 1e-3, row)
-        return Code(int(row[Figure.CODE]))
+        return Code(int(row[Column.CODE]))
 
     norm = done.figures.gamma
     assert code(weights.delta, norm * (1.0 + 1e-6)) is Code.CERTIFIED
@@ -204,7 +204,7 @@ def test_an_undamped_mode_that_no_force_drives_is_never_passed() -> None:
     w = np.array([2.0, 1e-4, 1.0, 1e2, 1.0, 1.0, 1e-2, 10.0])
     grid = np.geomspace(1e-3, 1e3, 62)
     row = design(A, B, C, w, grid, np.ones(62), 1.02, 1e-2, 0.0, (), 1.0)[0]
-    assert Code(int(row[Figure.CODE])) in (
+    assert Code(int(row[Column.CODE])) in (
         Code.FILTER_FAILED, Code.UNSTABLE_LOOP, Code.RICCATI_FAILED, Code.GAMMA_NOT_CONVERGED
     )  # fmt: skip
 
