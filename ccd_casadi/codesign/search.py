@@ -75,16 +75,11 @@ def _looked(search: SearchResult, formulation: Formulation, seed: int) -> Search
         ends = [end, *map(outer.polished, starts)]
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
     learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
-    if learns and end.feasible and _missed(outcome, end) > formulation.tolerance:
-        outcome = outer.with_training_sample(
-            outcome, end
-        )  # left out, it tells how they support the design
+    if learns and end.feasible:
+        missed = abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
+        if missed > formulation.tolerance:  # left out, it tells how they support the design
+            outcome = outer.with_training_sample(outcome, end)
     return replace(search, outcome=outcome, end=end, look=look)
-
-
-def _missed(outcome: FormulationResult, end: End) -> float:
-    """The relative error of what was predicted of an end."""
-    return abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
 
 
 def best_end(ends: Sequence[End], level: float, tolerance: float) -> End:

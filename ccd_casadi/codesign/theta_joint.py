@@ -40,7 +40,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
-from ccd_casadi.plants.plant import Evaluate, hardware_cost
+from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
@@ -109,10 +109,8 @@ def joint_search(
             return sampler, first, False
         if not np.isfinite(J):
             break
-        found = asked.cached(
-            "together", (*best.theta, reach, turn), Proposal,
-            partial(proposed, problem, models, best, reach),
-        )  # fmt: skip
+        make = partial(proposed, problem, models, best, reach)
+        found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
@@ -131,7 +129,7 @@ def joint_search(
             known = [best.theta]
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
-        models = ()  # the basis is large: it grows and need not stay,
+        del make, models  # the basis is large: it grows and need not stay,
         gc.collect()  # nor in the circles of searches before
         models = nearby(problem, known, found.end.theta)
         end, there = JointModel(problem, models, found.end, reach).adapted()
@@ -262,7 +260,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     x = (z, κ, τ), with the loops at x."""
 
     corrected = bending = True
-    enough: float | None = None  # a gain of what is minimised that counts; None: to the optimum
+    enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
 
     def __init__(
         self, problem: CoDesignProblem, models: Sequence[Evaluate], place: JointPoint, reach: float
@@ -325,17 +323,21 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         count = len(self.middle)
         return x[:count], x[count:-1], float(x[-1])
 
-    def uncertain(self, z: Array) -> UncertainPlant:
-        """The plant at z."""
+    def uncertain(self, z: Array, beside: Array | None = None) -> UncertainPlant:
+        """The plant at z, or beside z to first order."""
         theta = tuple(self.theta(z).tolist())
-        return uncertain_plant(self.problem, theta, [model(theta) for model in self.models])
+        known = [model(theta) for model in self.models]
+        if beside is not None:
+            known = [to_first_order(one, self.width * beside) for one in known]
+            theta = tuple(self.theta(z + beside).tolist())
+        return uncertain_plant(self.problem, theta, known)
 
-    def loops(self, z: Array) -> LoopProblem:
+    def loops(self, z: Array, beside: Array | None = None) -> LoopProblem:
         """Those of the set there, in the units of its first plant in the middle."""
         share = self.width[:, None, None]
         plants = [
             replace(plant, dA=share * plant.dA, dB=share * plant.dB, dC=share * plant.dC)
-            for plant in self.uncertain(z).plants(self.scenarios)
+            for plant in self.uncertain(z, beside).plants(self.scenarios)
         ]
         structured = structured_of(self.problem)
         return problem_for(
@@ -344,7 +346,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         )  # fmt: skip
 
     def _loops_beside(self, z: tuple[float, ...]) -> list[LoopProblem]:
-        return [self.loops(np.array(z) + BESIDE * unit) for unit in np.eye(len(z))]
+        return [self.loops(np.array(z), BESIDE * unit) for unit in np.eye(len(z))]
 
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
         """With every loop stable, and masses that are positive to first order."""
@@ -366,11 +368,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     def ended(self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]) -> bool:
         """Where the last trials gain little of what all have."""
         self.merits.append(here.value + PENALTY * here.violation)
-        if self.enough is None:
-            return False
         gained = self.merits[0] - self.merits[-1]
         late = self.merits[-LAST:][0] - self.merits[-1]
-        return len(self.merits) > LAST and late < FADED * max(gained, self.enough)
+        return len(self.merits) > LAST and gained > self.enough and late < FADED * gained
 
     def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""

@@ -38,7 +38,7 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> 
         if not usable:
             break
         X = np.array([points[i] for i in usable])
-        Y = np.array([_values(designs[i]) for i in usable])
+        Y = np.array([[np.log(d.values[0]), *d.values[1:-1]] for d in (designs[i] for i in usable)])
         dY = np.array([_slopes(designs[i], width) for i in usable])
         new = _next_point(problem, fine, _interpolate(X, Y, dY, fine), np.array(points), designs)
         if new is None:
@@ -69,10 +69,6 @@ def _design(
     x = bounds[:, 0] + point * (bounds[:, 1] - bounds[:, 0])
     omega = np.clip(np.exp(x), *np.array([problem.omega_S, problem.omega_T]).T)
     return evaluate(plant, weights, problem, (float(omega[0]), float(omega[1])))
-
-
-def _values(design: Sensitivities) -> Array:
-    return np.array([np.log(design.values[0]), *design.values[1:-1]])
 
 
 def _slopes(design: Sensitivities, width: Array) -> Array:

@@ -175,11 +175,9 @@ class Sampler:
         """Values and derivatives at every row of X = (θ, ln ω_S, ln ω_T), in their order."""
         points = [tuple(float(v) for v in x) for x in np.atleast_2d(X)]
         keys = [self._design_key(x) for x in points]
-        count = len(self.problem.names)
+        slopes = (len(self.problem.names) + 2) * (2 + len(self.problem.inner.bounds))
         known = {key: s for key, s in self.store.get(keys).items() if s.gradients is not None}
-        if any(
-            len(sample.gradients or ()) != self._size * (count + 2) for sample in known.values()
-        ):
+        if any(len(sample.gradients or ()) != slopes for sample in known.values()):
             raise self.store.damaged()
         todo = list({k: x for k, x in zip(keys, points, strict=True) if k not in known}.items())
         size = min(CHUNK, max(1, -(-len(todo) // self.workers.count)))  # a few keep all at work
@@ -192,7 +190,7 @@ class Sampler:
                 progress.advance(len(samples))
         before = len(self.trace)
         for x, key in zip(points, keys, strict=True):
-            self._spend(key, 1, x[:count], self._worth(known[key]))
+            self._spend(key, 1, x[:-2], self._worth(known[key]))
         self.report(before)
         inner = self.problem.inner
         return [quantity_sample(x, known[k], inner) for x, k in zip(points, keys, strict=True)]
@@ -254,11 +252,6 @@ class Sampler:
         """The bandwidth of a design that meets the bounds, else NaN."""
         meets = sample.certified and self.problem.inner.excess(sample) <= 0.0
         return sample.bandwidth if meets else np.nan
-
-    @property
-    def _size(self) -> int:
-        """Number of values of a design."""
-        return 2 + len(self.problem.inner.bounds)
 
     def _design_key(self, x: tuple[float, ...]) -> str:
         return sample_key(self.hash, x[:-2], *frequencies(self.problem, x))
