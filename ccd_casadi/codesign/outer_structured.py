@@ -282,7 +282,8 @@ class StructuredOuter(ThetaOuter):
                 return *whole, None
             return *whole, fresh_yield(problem, best.theta, design, sampler.workers)
 
-        with alongside(judged) as result, Progress(1, "what limits it", quiet=sampler.quiet) as bar:
+        judgement = alongside(judged)
+        with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
             kkt = kkt or certificate()
             make = partial(costs_of, problem, best.theta, design.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
@@ -292,7 +293,7 @@ class StructuredOuter(ThetaOuter):
             damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, design.controller, best.value)
-            wide, checked, proof, drawn = result()
+            wide, checked, proof, drawn = judgement()
             bar.advance()
         return VerifiedStructured(
             problem=problem,

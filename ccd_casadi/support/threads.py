@@ -8,6 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import copy_context
 from functools import cache
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -73,13 +74,24 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     return list(_threads(count).map(function, todo))
 
 
-@contextmanager
-def alongside(function: Callable[[], R]) -> Iterator[Callable[[], R]]:
-    """A thread that runs a function while the block runs; what is given waits for its result.
+def alongside(function: Callable[[], R]) -> Callable[[], R]:
+    """Begin a function in a thread; what is given waits for its result, or raises what it raised.
 
-    For work that processes do: of two that compute here each has the lock half of the time.
+    For work that processes do: of two that compute here each has the lock half of the time. Nothing
+    waits for the thread where its result is not wanted any more, as after Ctrl-C.
+
+    >>> alongside(lambda: 3)()
+    3
     """
-    from concurrent.futures import ThreadPoolExecutor
+    from concurrent.futures import Future
 
-    with ThreadPoolExecutor(1, "alongside") as one:
-        yield one.submit(function).result
+    answer: Future[R] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(function())
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(None, copy_context().run, "alongside", (run,), daemon=True).start()
+    return answer.result

@@ -2,13 +2,15 @@
 
 import gc
 import threading
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy import sparse
 
 from ccd_casadi.plants.eigenpairs import Pencil, build_pencil
-from ccd_casadi.support.threads import OwnThreads, side_by_side, threads_permitted
+from ccd_casadi.support.threads import OwnThreads, alongside, side_by_side, threads_permitted
 
 PAGE = 4096  # bytes, at least
 
@@ -71,3 +73,23 @@ def test_factorisations_of_threads_do_not_pile_up() -> None:
             gc.collect()
             held.append(PAGE * resident_pages())
     assert max(held[2:]) - held[2] < 60e6
+
+
+def test_what_runs_alongside_holds_nobody_up() -> None:
+    """It has this thread's context, raises here what it raised, and no exit waits for it."""
+    context: ContextVar[int] = ContextVar("context")
+    context.set(7)
+    assert alongside(context.get)() == 7
+    with pytest.raises(ZeroDivisionError):
+        alongside(lambda: 1 / 0)()
+    begun, go_on = threading.Event(), threading.Event()
+
+    def waiting() -> bool:
+        begun.set()
+        return go_on.wait(60.0)
+
+    result = alongside(waiting)
+    assert begun.wait(60.0)
+    assert all(one.daemon for one in threading.enumerate() if one.name == "alongside")
+    go_on.set()
+    assert result()
