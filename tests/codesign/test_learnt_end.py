@@ -11,6 +11,7 @@ from ccd_casadi.codesign import search
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.outer import End, Outer
+from ccd_casadi.codesign.result import predicted_value
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import SynthesisCounts
 from surrogates import fit
@@ -59,5 +60,6 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     monkeypatch.setattr(search, "global_check", lambda *_: SimpleNamespace(x=None))
     options = SimpleNamespace(box_points=0, max_refinements=rounds, tolerance=1e-3)
     found = search._looked(search.SearchResult(outer, outcome, end, 1), options, 0)
-    assert search._missed(outcome, end) > 0.1
-    assert (search._missed(found.outcome, end) < 1e-3) is (rounds > 0)
+    assert abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0) > 0.1
+    learnt = abs(predicted_value(found.outcome, end.x, end.value) / end.value - 1.0) < 1e-3
+    assert learnt is (rounds > 0)
