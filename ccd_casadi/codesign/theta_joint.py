@@ -103,7 +103,7 @@ def joint_search(
     for turn in range(TURNS):
         models = nearby(problem, known, best.theta)
         within = LOOSE if turn else WITHIN
-        asked, best, J = on_worse_plants(asked, models, best, turn, within, tell)
+        asked, best, J = on_worse_plants(asked, models, best, (turn,), within, tell)
         problem = asked.problem
         if _arrived(problem, best, J, ends or ()):
             return sampler, first, False
@@ -117,7 +117,8 @@ def joint_search(
             settled = ends is not None
             if settled:
                 break
-            asked, best, _ = on_worse_plants(asked, models, best, TURNS + turn, WITHIN, tell)
+            looks = range(TURNS + LOOKS * turn, TURNS + LOOKS * (turn + 1))
+            asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
             best, near, problem = *finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
@@ -164,24 +165,23 @@ def on_worse_plants(
     sampler: Sampler,
     models: Sequence[Evaluate],
     best: JointPoint,
-    turn: int,
+    looks: Sequence[int],
     within: float,
     tell: Callable[[str], None] | None,
 ) -> tuple[Sampler, JointPoint, float]:
     """The sampler of the problem with the plants on which the controller exceeds a bound, the
-    controller adapted to them until no worse plant is found, and J there. With the tightest bound
-    every search is made: one alone misses plants."""
-    for look in range(LOOKS):
+    controller adapted to them, and J there; `looks`: the searches for worse plants, one after the
+    other, each elsewhere in the box."""
+    J = np.inf
+    for look in looks:
         problem = sampler.problem
         uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
-        scenarios = violations(
-            problem, uncertain, np.array(best.kappa), best.bandwidth, LOOKS * turn + look, tell,
-            within,
-        )[1]  # fmt: skip
+        kappa, omega_b = np.array(best.kappa), best.bandwidth
+        scenarios = violations(problem, uncertain, kappa, omega_b, look, tell, within)[1]
         if scenarios:
             sampler = with_scenarios(sampler, scenarios)
         best, J = JointModel(sampler.problem, models, best, 0.0).adapted()
-        if not np.isfinite(J) or not (scenarios or within == WITHIN):
+        if not np.isfinite(J):
             break
     return sampler, best, J
 
