@@ -193,9 +193,7 @@ def cost_figure(methods: Sequence[Method]) -> c.Figure:
         (c.Panel(x, "least J so far (–)", tuple(curves_J), log_x=True),),
         (c.Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True),),
     )
-    lines = c.Lines(
-        rows, "Objective and bandwidth against true syntheses", (3.6, 2.6)
-    )
+    lines = c.Lines(rows, "Objective and bandwidth against true syntheses", (3.6, 2.6))
     return c.Figure(lines, "Further left is cheaper, lower is better.", (_cost_table(methods),))
 
 
