@@ -79,10 +79,7 @@ def zero_findings(facts: PlantFacts, S_max: float, place: str) -> list[Finding]:
             "(suspension.frequency_hz) moves it away"
         )
         found.append(Finding(Severity.NOTE, Topic.ZERO, words))
-    for zero in facts.zeros:
-        if -1e-9 <= zero.damping_ratio < LIGHT:
-            found.append(_dip(zero))
-    return found
+    return found + [_dip(zero) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT]
 
 
 def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
