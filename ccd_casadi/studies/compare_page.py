@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import Chapter, Figure, Head, Page, Source, Table, Verdict, Words
@@ -18,7 +17,7 @@ from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.solve_page import stage_chapters
 from ccd_casadi.reporting.verdict import lines_of, worst_state
 from ccd_casadi.studies.baselines import baseline_of
-from ccd_casadi.studies.comparison import Comparison, Method
+from ccd_casadi.studies.comparison import Comparison
 from ccd_casadi.studies.conclusions import LABELS
 from ccd_casadi.studies.methods import cost_figure, theta_paths
 from ccd_casadi.support.units import number
@@ -34,11 +33,9 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         Chapter("Cost", (cost_figure(comparison.methods),)),
     ]
     if len(problem.names) == 2:
-        paths = _paths(folder, comparison, best)
-        chapters.append(Chapter("Paths over the landscape", (paths,)))
+        chapters.append(Chapter("Paths over the landscape", (_paths(folder, comparison, best),)))
     if best is not None:
-        loops = _loops(comparison, best)
-        chapters.append(Chapter("Sensitivity, baseline against co-design", (loops,)))
+        chapters.append(Chapter("Sensitivity, baseline and co-design", (_loops(comparison, best),)))
         thetas = {
             name: comparison.method(name).figures.get("theta") for name in ("sequential", best)
         }
@@ -126,7 +123,6 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
             problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, process, truths)
-    walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]
     optimum = None
     if best is not None:
         theta = comparison.method(best).figures["theta"]
@@ -135,28 +131,22 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
         "Colours: ω_b*(θ) predicted by the nested formulation's surrogate; dots: its true samples "
         "in the same colours."
     )
-    land = replace(land, paths=theta_paths(walked), optimum=optimum)
-    return Figure(land, caption)
+    return Figure(replace(land, paths=theta_paths(comparison.methods), optimum=optimum), caption)
 
 
 def _loops(comparison: Comparison, best: str) -> Figure:
     """σ_max(S) of the sequential baseline against the best co-design (the paper's figure 11)."""
     loops = [
-        _loop(comparison.problem, comparison.method(name))
-        for name in ("sequential", best)
-        if comparison.method(name).figures.get("objective") is not None
-    ]
+        design_view(
+            comparison.problem, tuple(method.figures["theta"].values()), method.controller,
+            bandwidth_hz=method.figures["bandwidth_hz"], label=LABELS[method.name],
+        )
+        for method in (comparison.method("sequential"), comparison.method(best))
+        if method.controller is not None
+    ]  # fmt: skip
     words = "; ".join(
         f"{loop.label}: ω_b = {loop.bandwidth_hz:.2f} Hz, ‖S‖∞ = {loop.sizes[0].max():.3f}"
         for loop in loops
     )
     caption = f"Largest singular values of the closed loop. {words}."
     return Figure(figure_gains(loops, bounds=False), caption)
-
-
-def _loop(problem: CoDesignProblem, method: Method) -> LoopView:
-    figures = method.figures
-    theta = tuple(figures["theta"][name] for name in problem.names)
-    assert method.controller is not None
-    return design_view(problem, theta, method.controller, bandwidth_hz=figures["bandwidth_hz"],
-                       label=LABELS[method.name])  # fmt: skip

@@ -52,17 +52,15 @@ def _steps(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _cost_table(methods: Sequence[Method]) -> Table:
     """Every improvement of every method."""
-    rows = []
-    for method in methods:
-        for spent, objective, bandwidth in zip(*best_so_far(method), strict=True):
-            rows.append((LABELS[method.name], int(spent), float(objective), float(bandwidth)))
+    rows = (
+        (LABELS[method.name], int(spent), float(objective), float(bandwidth))
+        for method in methods
+        for spent, objective, bandwidth in zip(*best_so_far(method), strict=True)
+    )
     return Table(("method", "syntheses", "least J", "bandwidth (Hz)"), tuple(rows))
 
 
 def theta_paths(methods: Sequence[Method]) -> tuple[ThetaPath, ...]:
-    """Each method's way over the two parameters."""
-    return tuple(
-        ThetaPath(LABELS[method.name], np.array(method.path))
-        for method in methods
-        if len(method.path)
-    )
+    """The way over the two parameters of each method that is no formulation."""
+    walked = [method for method in methods if method.path and method.solution is None]
+    return tuple(ThetaPath(LABELS[method.name], np.array(method.path)) for method in walked)
