@@ -111,19 +111,22 @@ def worse_elsewhere(
     turns: range,
     workers: Pool,
     progress: Progress,
-) -> tuple[Scenario, ...]:
-    """What the first of several searches for the worst plants finds that exceeds a bound; as many
-    at a time as there are workers."""
+) -> tuple[Excess, tuple[Scenario, ...]]:
+    """The worst plant of several searches, and those to add of the first that finds any; as many at
+    a time as there are workers."""
+    seen: list[Excess] = []
     for first in turns[:: workers.count]:
         own = range(first, min(first + workers.count, turns.stop))
         tasks = {turn: (problem, theta, design, turn) for turn in own}
         found = dict(results(workers, worst_case, tasks))
-        largest = max(worst.value for worst, _ in found.values())
-        progress(f"{100.0 * np.exp(largest):.6g} % of a bound at most, searched from elsewhere")
-        for turn in own:
-            if found[turn][1]:
-                return found[turn][1]
-    return ()
+        seen += [worst for worst, _ in found.values()]
+        largest = max(seen, key=lambda one: one.value)
+        words = f"{100.0 * np.exp(largest.value):.6g} % of a bound at most"
+        progress(f"{words}, searched from elsewhere")
+        added = next((found[turn][1] for turn in own if found[turn][1]), ())
+        if added:
+            break
+    return largest, added
 
 
 def certify_lattice(

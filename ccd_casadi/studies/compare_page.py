@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing import content as c
@@ -35,11 +34,11 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         c.Chapter("Cost", (cost_figure(comparison.methods),)),
     ]
     if len(problem.names) == 2:
-        paths = _paths(folder, comparison, best)
-        chapters.append(c.Chapter("Paths over the landscape", (paths,)))
+        chapters.append(c.Chapter("Paths over the landscape", (_paths(folder, comparison, best),)))
     if best is not None:
-        loops = _loops(comparison, best)
-        chapters.append(c.Chapter("Sensitivity, baseline against co-design", (loops,)))
+        chapters.append(
+            c.Chapter("Sensitivity, baseline and co-design", (_loops(comparison, best),))
+        )
         thetas = {
             name: comparison.method(name).figures.get("theta") for name in ("sequential", best)
         }
@@ -127,7 +126,6 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> c.Figure:
             problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, process, truths)
-    walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]
     optimum = None
     if best is not None:
         theta = comparison.method(best).figures["theta"]
@@ -136,31 +134,25 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> c.Figure:
         "Colours: ω_b*(θ) predicted by the nested formulation's surrogate; dots: its true samples "
         "in the same colours."
     )
-    land = replace(land, paths=theta_paths(walked), optimum=optimum)
-    return c.Figure(land, caption)
+    return c.Figure(replace(land, paths=theta_paths(comparison.methods), optimum=optimum), caption)
 
 
 def _loops(comparison: Comparison, best: str) -> c.Figure:
     """σ_max(S) of the sequential baseline against the best co-design (the paper's figure 11)."""
     loops = [
-        _loop(comparison.problem, comparison.method(name))
-        for name in ("sequential", best)
-        if comparison.method(name).figures.get("objective") is not None
-    ]
+        design_view(
+            comparison.problem, tuple(method.figures["theta"].values()), method.controller,
+            bandwidth_hz=method.figures["bandwidth_hz"], label=LABELS[method.name],
+        )
+        for method in (comparison.method("sequential"), comparison.method(best))
+        if method.controller is not None
+    ]  # fmt: skip
     words = "; ".join(
         f"{loop.label}: ω_b = {loop.bandwidth_hz:.2f} Hz, ‖S‖∞ = {loop.sizes[0].max():.3f}"
         for loop in loops
     )
     caption = f"Largest singular values of the closed loop. {words}."
     return c.Figure(figure_gains(loops, bounds=False), caption)
-
-
-def _loop(problem: CoDesignProblem, method: Method) -> LoopView:
-    figures = method.figures
-    theta = tuple(figures["theta"][name] for name in problem.names)
-    assert method.controller is not None
-    return design_view(problem, theta, method.controller, bandwidth_hz=figures["bandwidth_hz"],
-                       label=LABELS[method.name])  # fmt: skip
 
 
 def best_so_far(method: Method) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -193,7 +185,9 @@ def cost_figure(methods: Sequence[Method]) -> c.Figure:
         (c.Panel(x, "least J so far (–)", tuple(curves_J), log_x=True),),
         (c.Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True),),
     )
-    lines = c.Lines(rows, "Objective and bandwidth against true syntheses", (3.6, 2.6))
+    lines = c.Lines(
+        rows, "Objective and bandwidth against the number of true syntheses", (3.6, 2.6)
+    )
     return c.Figure(lines, "Further left is cheaper, lower is better.", (_cost_table(methods),))
 
 
@@ -204,17 +198,15 @@ def _steps(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _cost_table(methods: Sequence[Method]) -> c.Table:
     """Every improvement of every method."""
-    rows = []
-    for method in methods:
-        for spent, objective, bandwidth in zip(*best_so_far(method), strict=True):
-            rows.append((LABELS[method.name], int(spent), float(objective), float(bandwidth)))
+    rows = (
+        (LABELS[method.name], int(spent), float(objective), float(bandwidth))
+        for method in methods
+        for spent, objective, bandwidth in zip(*best_so_far(method), strict=True)
+    )
     return c.Table(("method", "syntheses", "least J", "bandwidth (Hz)"), tuple(rows))
 
 
 def theta_paths(methods: Sequence[Method]) -> tuple[c.ThetaPath, ...]:
-    """Each method's way over the two parameters."""
-    return tuple(
-        c.ThetaPath(LABELS[method.name], np.array(method.path))
-        for method in methods
-        if len(method.path)
-    )
+    """The way over the two parameters of each method that is no formulation."""
+    walked = [method for method in methods if method.path and method.solution is None]
+    return tuple(c.ThetaPath(LABELS[method.name], np.array(method.path)) for method in walked)
