@@ -74,6 +74,11 @@ class MapFigure:
         fill: Any = "stretch_width"
         return column(row(*self._selects), self._figure, self._words, sizing_mode=fill)
 
+    def choose(self, axes: Sequence[int]) -> None:
+        """The parameters across and up."""
+        for select, i in zip(self._selects, axes, strict=False):
+            select.value = self.names[i]
+
     @property
     def axes(self) -> tuple[int, int]:
         """The parameters chosen."""
