@@ -26,9 +26,7 @@ LABELS = {
     "descent, total gradient": "the stage of the descent with the total gradient",
     "lifted": "the nominal optimum",
     "fitted to 0.59 kg": "the stage fitted to the paper's 0.59 kg",
-    "this set": "the stage made for the set",
-    "heavier": "a heavier stage",
-    "heavier still": "a heavier stage still",
+    "co-designed": "the co-designed stage",
 }
 NOMINAL = ("descent, K held", "descent, total gradient", "lifted")  # of nominal co-designs
 HEAD = (

@@ -49,7 +49,7 @@ REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first o
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
-LOOKS = 3  # for worse plants at most in a turn, each after the controller adapts to those before
+LOOKS, APART = 5, 200  # for worse plants before an end, each elsewhere in the box; numbered from
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 PENALTY = (
     6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
@@ -117,12 +117,13 @@ def joint_search(
             settled = ends is not None
             if settled:
                 break
-            looks = range(TURNS + LOOKS * turn, TURNS + LOOKS * (turn + 1))
+            last = APART + (LOOKS + 1) * turn + LOOKS
+            looks = range(last - LOOKS, last)
             asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
             best, near, problem = *finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
-            scenarios = violations(problem, own, kappa, omega_b, 2 * LOOKS * TURNS + turn, tell)[1]
+            scenarios = violations(problem, own, kappa, omega_b, last, tell)[1]
             settled = near and not scenarios
             if settled:
                 break

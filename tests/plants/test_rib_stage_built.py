@@ -107,19 +107,19 @@ def test_another_figure_is_another_conclusion() -> None:
                        "nominal": {"bandwidth_hz": alone},
                        "whole": {"certified": True, "bandwidth_hz": hz[name]}}
                 for name, mass, alone in (("sequential", 1.0, 50.0), ("lifted", 0.4, 80.0),
-                                          ("this set", 0.6, 70.0))}  # fmt: skip
+                                          ("co-designed", 0.6, 70.0))}  # fmt: skip
         return on_the_set.sentences(on_the_set.stages_of(rows, problem.w1, problem.w2))
 
-    first = said({"sequential": 75.0, "lifted": 45.0, "this set": 76.0})
+    first = said({"sequential": 75.0, "lifted": 45.0, "co-designed": 76.0})
     assert first[1].endswith("the nominal optimum is 60 % lighter and 60 % faster.")
     assert "keeps 45.0 of its 80.0 Hz: 60 % lighter and 40 % slower" in first[3]
     assert "The nominal optimum has the best J nominally and the worst on the set." in first
     assert first[-1].endswith("on the set: the mass, not the bandwidth.")
-    other = said({"sequential": 50.0, "lifted": 45.0, "this set": 70.0})
+    other = said({"sequential": 50.0, "lifted": 45.0, "co-designed": 70.0})
     assert "40 % lighter and 40 % faster" in other[-1]
     assert other[-1].endswith("on the set: all of it.")
-    part = said({"sequential": 50.0, "lifted": 45.0, "this set": 55.0})
+    part = said({"sequential": 50.0, "lifted": 45.0, "co-designed": 55.0})
     assert part[-1].endswith("on the set: the mass and 36 % of the gain in bandwidth.")
-    nothing = said({"sequential": 75.0, "lifted": 45.0, "this set": 60.0})
+    nothing = said({"sequential": 75.0, "lifted": 45.0, "co-designed": 60.0})
     assert "No stage here has a better J on the set than the sequential one." in nothing
     assert nothing[-1].endswith("nothing is left.")
