@@ -185,10 +185,8 @@ def outputs(graph: ca.Function, x: list[Affine]) -> list[Affine]:
         elif kind == ca.OP_CONST:
             work[to] = graph.instruction_constant(k)
         elif kind == ca.OP_OUTPUT:
-            value, (column, row) = (
-                work[graph.instruction_input(k)[0]],
-                divmod(*place, shapes[to][1]),
-            )
+            value = work[graph.instruction_input(k)[0]]
+            column, row = divmod(place[0], shapes[to][1])
             for part, default in (("centre", value), ("slope", 0.0), ("rest", 0.0)):
                 getattr(found[to], part)[..., row, column] = getattr(value, part, default)
         else:

@@ -33,13 +33,15 @@ def moving_modes(
     are not, and faster than `slowest` rad/s, is part of it.
     """
     pieces, back = np.unique(np.vstack([low, high]), axis=1, return_inverse=True)
-    x = [variable(*pieces[k :: len(low)], k, len(low)) for k in range(len(low))]
+    ends = zip(*np.split(pieces, 2), strict=True)
+    x = [variable(least, most, k, len(low)) for k, (least, most) in enumerate(ends)]
     M, _, K, b, c = outputs(graph, x)
     (q, N, n), eye = M.slope.shape[:3], np.eye(M.slope.shape[2])
-    known = np.isfinite([f.size.sum(axis=(1, 2)) for f in (M, K, b, c)]).all(axis=0)
+    sizes = np.array([f.size.sum(axis=(1, 2)) for f in (M, K, b, c)])
+    known = np.asarray(np.isfinite(sizes).all(axis=0))
     mass, stiffness = (np.where(known[:, None, None], f.centre, eye) for f in (M, K))
-    ends = np.linalg.eigvalsh(mass)[:, [0, -1]]
-    known &= ends[:, 0] > SINGULAR * ends[:, 1]
+    spectrum = np.linalg.eigvalsh(mass)
+    known &= spectrum[:, 0] > SINGULAR * spectrum[:, -1]
     half = np.linalg.inv(np.linalg.cholesky(np.where(known[:, None, None], mass, eye)))
     lam, turned = np.linalg.eigh(half @ stiffness @ half.transpose(0, 2, 1))
     shapes = half.transpose(0, 2, 1) @ turned
