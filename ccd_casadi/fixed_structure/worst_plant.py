@@ -73,20 +73,6 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
 
 
 def excesses(
-    uncertain: UncertainPlant,
-    points: Sequence[tuple[int, Array]],
-    structure: Structure | ChannelStructure,
-    kappa: Array,
-    bandwidth: float,
-    bounds: Bounds,
-    sampling: Sampling | None,
-) -> Array:
-    """The largest c of every plant's loop, with SI parameters κ and ω_b in rad/s."""
-    plants = uncertain.plants(points)
-    return _looked_at(plants, structure, kappa, bandwidth, bounds, sampling)[0]
-
-
-def _looked_at(
     plants: Sequence[ScaledPlant],
     structure: Structure | ChannelStructure,
     kappa: Array,
@@ -94,7 +80,8 @@ def _looked_at(
     bounds: Bounds,
     sampling: Sampling | None,
 ) -> tuple[Array, LoopProblem, Constraints | None]:
-    """The largest c of every plant's loop; the problem, and the constraints it is one of."""
+    """The largest c of every plant's loop, with SI parameters κ and ω_b in rad/s; the problem, and
+    the constraints it is one of."""
     problem = problem_for(plants, structure, bounds, sampling)
     scaled = in_problem_units(problem, kappa)
     tau = float(np.log(bandwidth / problem.plants.omega_0))
@@ -124,7 +111,7 @@ def worst_plants(
     if n > FEW:
         return _climbed(uncertain, loop, min(count, UNDAMPED), seed)
     points = lattice(uncertain, count, seed)
-    value = excesses(uncertain, points, *loop)
+    value = excesses(uncertain.plants(points), *loop)[0]
     looked, first = len(points), np.argsort(-value)[:SEARCHES]
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
@@ -152,7 +139,8 @@ def _tried(
     """Moves heads by steps (a head's number, a point) that raise them; whether one by `WITHIN`."""
     before = [head.value for head in heads]
     points = [(heads[row].option, point) for row, point in steps]
-    for (row, point), end in zip(steps, excesses(uncertain, points, *loop).tolist(), strict=True):
+    ends = excesses(uncertain.plants(points), *loop)[0].tolist()
+    for (row, point), end in zip(steps, ends, strict=True):
         if end > heads[row].value:
             heads[row] = Excess(heads[row].option, point, end)
     return any(head.value > value + WITHIN for head, value in zip(heads, before, strict=True))
@@ -167,7 +155,7 @@ def _climbed(
         (option, np.where(own & (i % EVENLY > 0), uncertain.box[0], point))
         for i, (option, point) in enumerate(lattice(uncertain, count, seed))
     ]
-    value, problem, peaks = _looked_at(uncertain.plants(points), *loop)
+    value, problem, peaks = excesses(uncertain.plants(points), *loop)
     found = dict[tuple[int, ...], Excess]()
     for i in np.argsort(-value).tolist():
         option, point = points[i]
@@ -194,7 +182,7 @@ def _towards_corners(
     """Steps from every head that is stable: the head's number and the point."""
     box, kappa = uncertain.box, loop[1]
     plants = [uncertain.sloped(head.point, head.option) for head in heads]
-    _, problem, peaks = _looked_at(plants, *loop)
+    _, problem, peaks = excesses(plants, *loop)
     if peaks is None:
         return []
     of = problem.plants_of(peaks)

@@ -277,11 +277,11 @@ def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
     box = uncertain(resonance_shift=0.02, gain=0.03)
     asked = (SMALL, design.kappa, design.bandwidth, EASY, None)
     heads, looked = worst_plants(box, *asked, count=40)
-    values = excesses(box, lattice(box, 60, 7), *asked)
+    values = excesses(box.plants(lattice(box, 60, 7)), *asked)[0]
     assert looked > 40
     assert heads[0].value >= values.max() - 1e-6
     assert heads[0].value == pytest.approx(
-        excesses(box, [(heads[0].option, heads[0].point)], *asked)[0]
+        excesses(box.plants([(heads[0].option, heads[0].point)]), *asked)[0][0]
     )
 
 
@@ -298,7 +298,7 @@ def test_of_many_parameters_the_worst_plant_is_climbed_to(design) -> None:
     heads, looked = worst_plants(box, *asked, count=12)
     ends = np.array(list(np.ndindex(*(2,) * 7)))
     corners = [(0, box.box[row, np.arange(7)]) for row in ends]
-    values = excesses(box, [*lattice(box, 12, 0), *corners], *asked)
+    values = excesses(box.plants([*lattice(box, 12, 0), *corners]), *asked)[0]
     assert looked < len(corners)
     assert heads[0].value >= values.max() - 1e-6
 
