@@ -111,12 +111,10 @@ def value_of_design(
         design, error, envelope = found.design, found.value, found.envelope
     elif design.certified:
         envelope = bandwidth_envelope(plants, bounds_of(problem), design, problem.sampling)
-    bandwidth = design.bandwidth if design.certified else np.nan
+    bandwidth = float(design.bandwidth) if design.certified else np.nan
     gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
     slope = tuple(map(float, gradient))
-    return StructuredValue(
-        point, float(bandwidth), slope, design, spent, envelope, error=float(error)
-    )
+    return StructuredValue(point, bandwidth, slope, design, spent, envelope, error=error)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
