@@ -17,7 +17,13 @@ from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
+from ccd_casadi.fixed_structure.worst_plant import (
+    WITHIN,
+    BoundedLoop,
+    Excess,
+    lattice,
+    worst_plants,
+)
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -79,10 +85,9 @@ def violations(
 ) -> tuple[Excess, tuple[Scenario, ...]]:
     """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
     structured = structured_of(problem)
-    heads, count = worst_plants(
-        uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem), structured.sampling,
-        seed=structured.seed + turn,
-    )  # fmt: skip
+    loop = BoundedLoop(structure_of(problem), kappa, bandwidth, bounds_of(problem),
+                       structured.sampling)  # fmt: skip
+    heads, count = worst_plants(uncertain, loop, seed=structured.seed + turn)
     if progress is not None:
         progress(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
