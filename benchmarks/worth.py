@@ -25,7 +25,7 @@ ROOT = Path(__file__).parent.parent
 CASES = ("runs/two_mass.toml", "runs/two_mass_paper.toml", "runs/two_mass_built.toml",
          "runs/rib_stage.toml", *(f"examples/{name}/case.toml" for name in (
              "guided_beam", "planar_stage", "three_mass_axis", "two_axes", "modal_table",
-             "cad_stage")))  # fmt: skip
+             "cad_stage", "gantry_stroke")))  # fmt: skip
 COLUMNS = ("case", "worth", "full solve", "expected cost", "expected Hz", "miss", "stated", "CPU s")
 
 

@@ -181,24 +181,18 @@ def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> 
 
 def _resonances(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
     """The first resonance that shows, against the bandwidth that M_K suits without resonances."""
-    flexible = [mode for mode in facts.modes if not mode.rigid]
-    seen = [m.frequency_hz for m in flexible if min(m.driven, m.measured) > SHOWS]
-    if not seen or not np.isfinite(facts.inertia):
-        return []
-    (_, high), first = _searched(problem), seen[0]
-    suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ
+    shown = (m for m in facts.modes if not m.rigid and min(m.driven, m.measured) > SHOWS)
+    first = next((mode.frequency_hz for mode in shown), np.nan)  # which compares with nothing
+    suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
+    high = _searched(problem)[1]
     if suits > TWICE * first:
-        return [
-            f"the first resonance is at {first:.3g} Hz, and M_K = {problem.weights.M_K:.3g} suits "
-            f"a bandwidth of {suits:.3g} Hz for the {facts.inertia:.3g} kg that an actuator moves: "
-            f"is the stiffness in another unit? {SI}; if it is not, lower M_K"
-        ]
-    if first > 100.0 * high:
-        return [
-            f"the first resonance is at {first:.3g} Hz, and [inner] searches up to {high:.3g} Hz: "
-            f"is the stiffness in another unit? {SI}"
-        ]
-    return []
+        against = f"M_K suits {suits:.3g} Hz for the {facts.inertia:.3g} kg that an actuator moves"
+    elif suits > 0.0 and first > 100.0 * high:
+        against = f"[inner] searches up to {high:.3g} Hz"
+    else:
+        return []
+    words = f"the first resonance is at {first:.3g} Hz, and {against}"
+    return [f"{words}: is the stiffness in another unit? {SI}"]
 
 
 def peak_words(S_max: float) -> list[str]:

@@ -125,7 +125,7 @@ def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fac
          f"{robust['words']}; the worst plant that a search found is at "
          f"{100.0 + 100.0 * robust['worst_excess']:.6g} % of a bound; "
          f"{r['proof']['words']}"),
-        ("Optimality (KKT residual)", number(kkt, 2),
+        ("Optimality (KKT residual)", number(kkt, 3),
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
          "controller"),
         ("A multi-start search at this θ", optima or "–",

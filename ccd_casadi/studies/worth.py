@@ -1,8 +1,8 @@
 """What co-design gains over the sequential way, from a few true designs and their derivatives.
 
-Both designs are true and certified, so the gain is a lower bound that has no error. How much better
-a full solve may be is estimated by the surrogate v ~ N(m, s²) of what J counts. One more true
-design at θ is expected to gain (Jones, Schonlau and Welch 1998)
+Both designs are true and certified, so the gain is a lower bound without error. What a full solve
+may add is estimated by the surrogate v ~ N(m, s²) of what J counts: one more true design at θ is
+expected to gain (Jones, Schonlau and Welch 1998)
 
     EI(θ) = E[max(J_best - J(θ), 0)] = |w2| s (z Φ(z) + φ(z)),
     z = (J_best - w1 f(θ) - w2 m(θ)) / (|w2| s(θ)),
@@ -12,7 +12,7 @@ solve are the hardware cost and bandwidth of designs with w1 f + w2 m <= J_best 
 
     δ = 2 max EI + |w2| |v(θ_n) - m(θ_n)|,   θ_n the surrogate's last optimum, where v is known.
 
-This is an estimate and no bound: a region that no sample tells of is not excluded.
+No bound: a region without samples may be better, and so may another structured controller at a θ.
 """
 
 from collections.abc import Mapping
