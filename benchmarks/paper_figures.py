@@ -34,7 +34,7 @@ from ccd_casadi.drawing.svg import CYCLE
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.loops import synthesised_loop
-from ccd_casadi.studies.published import TWO_MASS
+from ccd_casadi.studies.published import PUBLISHED
 
 ROOT = Path(__file__).resolve().parent.parent
 THETA = (60.0, 60.0)
@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("case", nargs="?", type=Path, default=ROOT / "runs" / "two_mass_paper.toml")
     parser.add_argument("--out", type=Path, default=Path("paper_figures.html"))
     given = parser.parse_args()
-    found = sections(problem_of(load_case(given.case)), TWO_MASS)
+    found = sections(problem_of(load_case(given.case)), PUBLISHED["two_mass"])
     head = Head("The paper's figures 4 and 5", "good", "computed", "", "", "")
     given.out.write_text(page_html(Page(head, tuple(found), index="")))
 

@@ -1,28 +1,37 @@
 """Moves of random loops against a simulation of its own, sample by sample: settled when?
 
-    python benchmarks/random_moves.py [COUNT]
+    python benchmarks/random_moves.py [COUNT] [--run FOLDER]
 
 Each case draws a two-mass plant whose rigid body is free, a lead with integrator and roll-off at
 a random crossover, hold, delay, window and a motor's move. The judge here knows nothing of the
 package's loops: it steps the plant from event to event with the matrix exponential and the
 controller by its difference equation. Printed: how many settle at the same sample, the largest
 difference of the error over the window, and by how much the smooth time lies above the exact one.
+
+With --run: how many of COUNT fresh random plants of the finished run settle later than it states,
+by the same judge. The plants are drawn and put together here, from M and K at its θ.
 """
 
-import sys
+import argparse
 from dataclasses import dataclass
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import eigh, expm
 
 from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime
+from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.inner_problem.move_figures import motion_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
@@ -91,11 +100,13 @@ def drawn(rng: np.random.Generator) -> MoveCase:
             return case
 
 
-def judged(case: MoveCase, which: int, count: int) -> np.ndarray:
-    """The error (count,) of plant `which`, sample by sample."""
-    G, K = case.goal().plants[which].plant_si(), STRUCTURE.state_space(case.kappa)
-    T, tau, n = case.hold.period, case.hold.delay, len(G.A)
-    motion, profile = case.at(case.theta), case.at(case.theta).cycle.profile
+def judged(
+    G: StateSpace, K: StateSpace, hold: Sampling, motion: MotionAt, count: int
+) -> tuple[np.ndarray, float]:
+    """The error (count,) of a plant sample by sample, and the instant (s) from which on it stays
+    in the window."""
+    T, tau, n = hold.period, hold.delay, len(G.A)
+    profile = motion.cycle.profile
 
     def stepped(x: np.ndarray, u: float, span: float) -> np.ndarray:
         joint = np.zeros((n + 1, n + 1))
@@ -125,7 +136,8 @@ def judged(case: MoveCase, which: int, count: int) -> np.ndarray:
         sent = [u, *sent[:-1]]
         x = before @ np.append(x, sent[whole + 1])
         x = after @ np.append(x, sent[whole])
-    return errors
+    outside = np.flatnonzero(np.abs(errors) > motion.motion.window)
+    return errors, T * (outside[-1] + 1 if outside.size else 0)
 
 
 def compared(case: MoveCase, which: int) -> tuple[float, float, float, float]:
@@ -136,20 +148,60 @@ def compared(case: MoveCase, which: int) -> tuple[float, float, float, float]:
     profile = motion.cycle.profile
     move = simulate(loop, profile, axis=0, forces=motion.forward, window=motion.motion.window,
                     bandwidth_hz=10.0 / profile.duration)  # fmt: skip
-    own = judged(case, which, 2 * len(move.time))  # whether what follows stays within it
-    outside = np.flatnonzero(np.abs(own) > motion.motion.window)
-    settled = outside[-1] + 1 if outside.size else 0
+    own, settled = judged(  # twice as long: whether what follows stays within it
+        loop.plant, loop.controller, case.hold, motion, 2 * len(move.time)
+    )
     smooth = max(goal.times(case.kappa)[which], motion.cycle.profile.duration)
     return (
-        move.settled / case.hold.period - settled,
+        (move.settled - settled) / case.hold.period,
         float(np.abs(own[: len(move.time)] - move.error).max() / motion.motion.window),
         max(move.settled, motion.cycle.profile.duration),
         smooth,
     )
 
 
+def fresh(problem: CoDesignProblem, theta: np.ndarray, rng: np.random.Generator) -> StateSpace:
+    """One plant of the box, its rigid body free: every flexible frequency and damping ratio off the
+    model by one factor each, and the gain."""
+    own, u = mechanics(plant_of(problem), theta), structured_of(problem).uncertainty
+    assert own.damping_ratio is not None
+    assert (u.mode_shift, u.options, u.ranges) == (0.0, (), ()), "is not drawn here"
+    squares, shapes = eigh(own.K, own.M)
+    omega = np.sqrt(np.where(squares > 1e-10 * squares[-1], squares, 0.0))
+    omega *= 1.0 + rng.uniform(-u.resonance_shift, u.resonance_shift)
+    decay = 2.0 * own.damping_ratio * rng.uniform(*u.damping) * omega
+    n = len(omega)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), -np.diag(decay)]])
+    B = np.vstack([np.zeros((n, 1)), shapes.T @ own.B]) * (1.0 + rng.uniform(-u.gain, u.gain))
+    return StateSpace(A, B, np.hstack([own.C @ shapes, np.zeros((1, n))]), np.zeros((1, 1)))
+
+
+def judge_run(folder: Path, count: int) -> None:
+    """Fresh plants of a finished run against the time that it states."""
+    run = read_run(folder)
+    problem, theta, stated = run.problem, np.array(run.theta), run.result["move_time"]
+    assert problem.sampling is not None
+    motion, rng = motion_of(problem, run.theta), np.random.default_rng(2026)
+    samples = int(2.0 * stated / problem.sampling.period)
+    times = np.array([
+        judged(fresh(problem, theta, rng), run.controller, problem.sampling, motion, samples)[1]
+        for _ in range(count)
+    ])  # fmt: skip
+    times = np.maximum(times, motion.cycle.profile.duration)
+    print(f"stated {1e3 * stated:.3f} ms, setpoint {1e3 * motion.cycle.profile.duration:.3f} ms")
+    print(f"{(times > stated).sum()} of {count} fresh plants settle later; ", end="")
+    print(f"the latest after {1e3 * times.max():.3f} ms, the median {1e3 * np.median(times):.3f}")
+
+
 def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 100
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("count", type=int, nargs="?")
+    parser.add_argument("--run", type=Path)
+    options = parser.parse_args()
+    if options.run is not None:
+        judge_run(options.run, options.count or 500)
+        return
+    count = options.count or 100
     rng = np.random.default_rng(42)
     found = np.array([compared(drawn(rng), i % 2) for i in range(count)])
     apart, error, exact, smooth = found.T

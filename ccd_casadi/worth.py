@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Sequence
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
-from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.terminal import inform
 
 
@@ -24,7 +24,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     out = options.out or options.case.with_name(options.case.stem + "_worth")
     folder = run_folder(options.case, out)
     with (
-        Workers(options.workers, PATIENCE) as workers,
+        Workers(options.workers, 10.0) as workers,  # s: threads here share a plant's elements
         SampleStore(folder / "samples.sqlite") as store,
     ):
         found = worth(case, Sampler(problem, store, workers, quiet=options.quiet), options.seed)

@@ -96,8 +96,7 @@ def sobol(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
     """
     from scipy.stats import qmc  # 0.5 s to import, so only where it is needed
 
-    low, high = box(lower, upper)
-    _positive(n)
+    low, high = _box(lower, upper, n)
     sequence = qmc.Sobol(low.size, scramble=True, rng=np.random.default_rng(seed))
     return _spread(sequence.random_base2((n - 1).bit_length())[:n], low, high)
 
@@ -123,11 +122,9 @@ def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Ar
     """
     from scipy.stats import qmc
 
-    low, high = box(lower, upper)
-    _positive(n)
-    return _spread(
-        qmc.LatinHypercube(low.size, rng=np.random.default_rng(seed)).random(n), low, high
-    )
+    low, high = _box(lower, upper, n)
+    cells = qmc.LatinHypercube(low.size, rng=np.random.default_rng(seed))
+    return _spread(cells.random(n), low, high)
 
 
 def design(
@@ -167,9 +164,10 @@ def design(
             return latin_hypercube(lower, upper, n, seed)
 
 
-def _positive(n: int) -> None:
+def _box(lower: ArrayLike, upper: ArrayLike, n: int) -> tuple[Array, Array]:
     if n < 1:
         raise ValueError(f"a plan needs at least one point, got n = {n}")
+    return box(lower, upper)
 
 
 def _spread(unit: Array, low: Array, high: Array) -> Array:

@@ -19,7 +19,9 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 
 LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
-FAR = 3.0  # how far outside the frequencies that [inner] searches effort may end
+FAR = 3.0  # how far above the frequencies that [inner] searches effort may end
+TWICE = 2.0  # M_K suits 0.1 to 1.5 times the first resonance on the shipped cases
+SHOWS = 0.1  # of the largest gain: a mode that is driven and measured so much shows in the loop
 DECIBEL = 3.0  # from here on a peak of S is more likely one in dB
 # in SI, by how a person writes them
 MASS = {"t": 1e3, "kg": 1.0, "g": 1e-3, "mg": 1e-6}
@@ -77,10 +79,7 @@ def zero_findings(facts: PlantFacts, S_max: float, place: str) -> list[Finding]:
             "(suspension.frequency_hz) moves it away"
         )
         found.append(Finding(Severity.NOTE, Topic.ZERO, words))
-    for zero in facts.zeros:
-        if -1e-9 <= zero.damping_ratio < LIGHT:
-            found.append(_dip(zero))
-    return found
+    return found + [_dip(zero) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT]
 
 
 def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
@@ -152,14 +151,14 @@ def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]
 def _searched(problem: CoDesignProblem) -> tuple[float, float]:
     """From where to where, in Hz, a bandwidth can be meant."""
     inner = problem.inner
-    low = max(inner.omega_low, min(inner.omega_S[0], inner.omega_T[0]) / 4.0)
+    low = max(inner.omega_low, inner.omega_T[0] / 4.0)
     return low / HZ, max(inner.omega_S[1], inner.omega_T[1]) / HZ
 
 
 def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> list[str]:
     low, high = _searched(problem)
     M_K, effort = problem.weights.M_K, facts.effort_hz
-    if np.isfinite(effort) and low / FAR <= effort <= FAR * high:
+    if np.isfinite(effort) and low <= effort <= FAR * high:
         return []
     first = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
     aim = float(np.clip(first[0] / 3.0 if first else np.sqrt(low * high), low, high))
@@ -181,20 +180,19 @@ def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> 
 
 
 def _resonances(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
-    low, high = _searched(problem)
-    flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
-    if not flexible or not any(mode.rigid for mode in facts.modes):
-        return []
-    if flexible[-1] < low:
-        side = f"all resonances lie below {flexible[-1]:.3g} Hz"
-    elif flexible[0] > 100.0 * high:
-        side = f"the first resonance is at {flexible[0]:.3g} Hz"
+    """The first resonance that shows, against the bandwidth that M_K suits without resonances."""
+    shown = (m for m in facts.modes if not m.rigid and min(m.driven, m.measured) > SHOWS)
+    first = next((mode.frequency_hz for mode in shown), np.nan)  # which compares with nothing
+    suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
+    high = _searched(problem)[1]
+    if suits > TWICE * first:
+        against = f"M_K suits {suits:.3g} Hz for the {facts.inertia:.3g} kg that an actuator moves"
+    elif suits > 0.0 and first > 100.0 * high:
+        against = f"[inner] searches up to {high:.3g} Hz"
     else:
         return []
-    return [
-        f"{side}, and [inner] searches {low:.3g} to {high:.3g} Hz: is the stiffness in another "
-        f"unit? {SI}"
-    ]
+    words = f"the first resonance is at {first:.3g} Hz, and {against}"
+    return [f"{words}: is the stiffness in another unit? {SI}"]
 
 
 def peak_words(S_max: float) -> list[str]:

@@ -19,7 +19,11 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
+from ccd_casadi.inner_problem.structured_plant_set import (
+    structure_of,
+    structured_of,
+    with_structured,
+)
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import with_range, with_warm_start
@@ -168,7 +172,6 @@ def with_function(
 
     Raises UserError where result.json holds others.
     """
-    structured = structured_of(problem)
     if "anchors" not in result:
         return problem  # of an earlier version
     try:
@@ -185,14 +188,8 @@ def with_function(
     own = len(structure_of(problem).names)
     if any(len(kappa) != own for kappa in (*warm_starts, *slower)):
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
-    found = replace(
-        structured,
-        warm_starts=warm_starts,
-        scenarios=scenarios,
-        seed=seed,
-        error_warm_starts=slower,
-    )
-    return with_range(replace(problem, controller=found))
+    known = {"warm_starts": warm_starts, "error_warm_starts": slower}
+    return with_range(with_structured(problem, **known, scenarios=scenarios, seed=seed))
 
 
 def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
@@ -229,7 +226,7 @@ def _with_directions(
     except (KeyError, TypeError, ValueError):
         words = "sections.channels: names no directions; solve the case again"
         raise UserError(f"{path}: {words}") from None
-    return replace(problem, controller=replace(structured, channels=channels))
+    return with_structured(problem, channels=channels)
 
 
 _READERS: dict[type[ControllerProblem], Callable[..., dict[str, Any]]] = {

@@ -93,9 +93,7 @@ def move_entry(
     motion, free = motion_of(problem, theta), replace(problem, suspension=FREE)
     times = exact_times(problem, motion, kind_of(free).plants(theta), controller)
     cycle, own = motion.cycle, problem.source.motion
-    shown: tuple[str, ...] = ("peak_force", "rms_force")
-    if own.motor is not None:
-        shown += ("power", "peak_share", "heat_share")
+    of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
     return {"move": {
         "duration": cycle.profile.duration,
         "settled": float(times[0]),
@@ -106,7 +104,7 @@ def move_entry(
         "reached": {key: float(getattr(cycle.profile, key))
                     for key in ("velocity", "acceleration", "jerk")},
         "limits": list(cycle.limits),
-        **{key: float(getattr(cycle, key)) for key in shown},
+        **{key: float(getattr(cycle, key)) for key in ("peak_force", "rms_force", *of_motor)},
         **({} if own.motor is None else {
             "peak_current": cycle.peak_force / own.motor.at(motion.mass)[0]}),
         "feedforward": motion.forward.tolist(),

@@ -152,7 +152,7 @@ def newton_step(
     A = here.rows[held]
     inside = np.array([INSIDE * (name in problem.inner.bounds) for name in here.labels])
     aim = np.where(np.arange(held.size) < here.constraints, -(here.slack + inside), 0.0)[held]
-    Z = null_space(A) if A.size else np.eye(x.size)
+    Z = null_space(A)
     if Z.shape[1] == 0:  # a vertex
         return None
     columns = lagrangian_hessian(problem, x, Z, kkt.multipliers, quantities.at)

@@ -28,7 +28,7 @@ from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside, with_scenarios
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
-from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
@@ -235,8 +235,7 @@ class StructuredOuter(ThetaOuter):
             with sampler.spent.on("polish"):
                 sampler, best = polish_structured(sampler, theta)
             problem, found = sampler.problem, value_with_design(sampler, best)
-            tell = printer("at the end", sampler.quiet)
-            worst, scenarios = worst_case(problem, best.theta, found.design, 0, tell)
+            worst, scenarios = _worst_plants(sampler, best, found.design)
             multistart = None if scenarios else multistart_at(sampler, best)
             gap = 0.0 if multistart is None else _gap(problem, best, multistart)
             if multistart is None or gap <= (WORTH if self.retries_pay else WORTH_ELEMENTS):
@@ -250,19 +249,13 @@ class StructuredOuter(ThetaOuter):
         )  # fmt: skip
 
     def extended(self, end: End) -> "StructuredOuter | None":
-        """With plants that it does not keep, of those searched or drawn for this alone: fresh ones
-        judge the answer."""
+        """With plants that it does not keep, searched for this alone: fresh ones judge the
+        answer."""
         end = cast(StructuredEnd, end)
-        problem, theta, scenarios = end.sampler.problem, end.best.theta, end.scenarios
-        if end.feasible and not scenarios:
-            few, tell = is_expensive(problem), printer("at the end", end.sampler.quiet)
-            turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
-            workers = Workers(1) if few else end.sampler.workers
-            scenarios = worse_elsewhere(problem, theta, end.inner.design, turns, workers, tell)
-        if not scenarios:
+        if not end.scenarios:
             return None
-        anchored = with_warm_start(problem, end.inner.design.kappa)
-        return StructuredOuter(with_scenarios(end.sampler.of(anchored), scenarios))
+        anchored = with_warm_start(end.sampler.problem, end.inner.design.kappa)
+        return StructuredOuter(with_scenarios(end.sampler.of(anchored), end.scenarios))
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
         end = cast(StructuredEnd, end)
@@ -323,6 +316,22 @@ class StructuredOuter(ThetaOuter):
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.values(x, "the run's own design")[0]
         return structured_responses(self.problem, sample, value_with_design(self.sampler, sample))
+
+
+def _worst_plants(
+    sampler: Sampler, best: InnerSample, design: SectionsDesign
+) -> tuple[Excess, tuple[Scenario, ...]]:
+    """The worst plant found for a design and those to add, by one search and, where that finds
+    none, by several elsewhere in the box: before a multi-start search, which they would outdate."""
+    problem, tell = sampler.problem, printer("at the end", sampler.quiet)
+    worst, scenarios = worst_case(problem, best.theta, design, 0, tell)
+    if scenarios or not np.isfinite(objective_of(problem, best)):
+        return worst, scenarios
+    few = is_expensive(problem)
+    turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
+    workers = Workers(1) if few else sampler.workers
+    other, scenarios = worse_elsewhere(problem, best.theta, design, turns, workers, tell)
+    return max(worst, other, key=lambda one: one.value), scenarios
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:

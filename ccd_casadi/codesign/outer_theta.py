@@ -8,6 +8,7 @@ is held against a wider search, and how the design is judged.
 from abc import ABC
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -97,23 +98,26 @@ def pieces_from(
         asked.extend(sampler.values(theta, "local solve"))
         return local(asked[-1])
 
+    @cache
     def local(sample: InnerSample) -> Local | None:
         J, gradient = objective_of(problem, sample), objective_gradient(problem, sample)
         if not (np.isfinite(J) and np.isfinite(gradient).all()):
             return None
         return Local((np.array(sample.theta) - lower) / width, J, gradient)
 
+    def known() -> list[Local]:
+        return [found for found in map(local, sampler.solved.values()) if found is not None]
+
     def constraints(z: Array) -> tuple[Array, Array]:
         found = hardware_at(problem, lower + width * z)
         return found.constraints, found.slopes
 
-    steps = STEPS * len(lower)
     for _ in range(FOLLOWED):
         start, improvements = local(best), sampler.improvements
         if start is None:
             break
-        others = [found for found in map(local, sampler.solved.values()) if found is not None]
-        descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
+        steps = STEPS * len(lower)
+        descend(at, start, known, constraints, steps=steps, settled=settled, first=first)
         best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
         if sampler.improvements == improvements:
             break

@@ -63,17 +63,16 @@ def other_peaks(
             continue  # the row S_max itself
         on = f" on plant {peak.member} of the set" if peak.member else ""
         place = f"{peak.omega / HZ:.4g} Hz{on}"
+        shelf = peak.member == 0 and peak.omega < figures.bandwidth
         if peak.ln_gain >= S_max - band:
-            level, name = S_max, OTHER_PEAK + place
-            row = peak.gradient * width
-            found.append(PeakConstraint(name, peak.ln_gain - level, row, peak.omega, peak.member))
-        elif (
-            peak.member == 0
-            and peak.omega < figures.bandwidth
-            and abs(peak.ln_gain - HALF_POWER) <= band
-        ):
-            row, value = peak.gradient * width, peak.ln_gain - HALF_POWER
-            found.append(PeakConstraint(f"-3 dB at {place}", value, row, peak.omega, 0))
+            level, kind = S_max, OTHER_PEAK
+        elif shelf and abs(peak.ln_gain - HALF_POWER) <= band:
+            level, kind = HALF_POWER, "-3 dB at "
+        else:
+            continue
+        found.append(PeakConstraint(
+            kind + place, peak.ln_gain - level, peak.gradient * width, peak.omega, peak.member
+        ))  # fmt: skip
     return tuple(found)
 
 

@@ -161,7 +161,7 @@ def _responses(
     strong = _strong(kkt)
     held = [here.labels.index(name) for name in strong]
     A = here.rows[held] * here.sizes[held, None]
-    Z = null_space(A) if len(A) else np.eye(n)
+    Z = null_space(A)
     H = hessian() if Z.shape[1] else np.zeros((n, n))
     determined = H is not None and Z.shape[1] == n - len(A)
     if H is not None and Z.shape[1]:

@@ -55,7 +55,12 @@ def search_outer(
         end = outer.polished(outcome.x)
         more = None if rounds == AGAIN else outer.extended(end)
         if more is None:
-            return _looked(SearchResult(outer, outcome, end, rounds), formulation, seed)
+            search = _looked(SearchResult(outer, outcome, end, rounds), formulation, seed)
+            assert search.end is not None
+            moved = search.end is not end and rounds < AGAIN
+            more, end = outer.extended(search.end) if moved else None, search.end
+        if more is None:
+            return search
         goes_on = known is not None or isinstance(formulation, Direct)
         outer, known = more, end.x if goes_on else None
 

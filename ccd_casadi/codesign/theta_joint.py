@@ -59,7 +59,7 @@ FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-7  # of w2 ω_b
 LAST, FADED = 12, 0.15  # trials that gain less of all that was gained: made anew, plants tell more
 SETTLED = 3e-4  # of J: less is not worth another set of plants
-CLOSE, NEAR = 0.02, 2e-3  # of the box: last searches, on plants known near and to first order
+CLOSE = 0.02  # of the box: the reach of last searches, on plants known near and to first order
 ENDINGS, KEPT = 12, 2e-6  # of these; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
@@ -197,7 +197,7 @@ def finished(
         make = partial(proposed, problem, models, at, reach, LAST_GAIN)
         return sampler.cached("finished", (*at.theta, at.bandwidth, reach), Proposal, make)
 
-    problem, reach = sampler.problem, NEAR
+    problem, reach = sampler.problem, CLOSE
     best = ended(models, start, CLOSE).end
     models = nearby(problem, (), best.theta)
     best, J = first = JointModel(problem, models, best, reach).adapted()

@@ -227,6 +227,6 @@ def _peak(G: StateSpace, K: StateSpace | None) -> tuple[float, float]:
 def _finer(response: MeasuredResponse, G: StateSpace, omega: list[float]) -> MeasuredResponse:
     """With lines where |S| was too large between two, and nearby."""
     more = (np.array(omega)[:, None] * NEARBY).ravel() / HZ
-    hz = np.unique(np.append(response.hz, more[(more > response.hz[0]) & (more < response.hz[-1])]))
-    hz = hz[np.append(True, np.diff(hz) > APART * hz[1:])]
+    known = response.hz
+    hz = frequency_grid(float(known[0]), float(known[-1]), 2, known, more, apart=APART)
     return replace(response, hz=hz, G=G.response(HZ * hz).reshape(len(hz), *response.G.shape[1:]))

@@ -90,10 +90,10 @@ def optimal(
     if unknown and not math.isfinite(residual):
         return VerdictLine(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
     if not residual <= level:
-        words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
+        words = f"not optimal: KKT residual {residual:.3g} over theta, above {level:g}; {known}"
         return VerdictLine(State.FAILED, words, figures)
     if kink is None:
-        words = f"locally optimal, KKT residual {residual:.1e} over theta; {known}"
+        words = f"locally optimal, KKT residual {residual:.2g} over theta; {known}"
         if kkt.second_order is not None and kkt.second_order < saddle:
             figures["least_curvature"] = kkt.second_order
             words = f"a stationary point that curves downwards ({kkt.second_order:.2g}): {words}"
@@ -104,7 +104,7 @@ def optimal(
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
         return VerdictLine(State.FAILED, f"{words}; {known}", figures)
     words = (
-        f"locally optimal to first order at a kink of J: KKT residual {residual:.1e} over theta "
+        f"locally optimal to first order at a kink of J: KKT residual {residual:.2g} over theta "
         f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
         f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"

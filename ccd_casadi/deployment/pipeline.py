@@ -1,16 +1,16 @@
 """Certified controller → reduced → sampled → verified → realised."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.as_designed import at_its_rate, designed_channels, require_own_bounds
 from ccd_casadi.deployment.channels import LoopChannel, assemble, scalar_channels, whole_loop
-from ccd_casadi.deployment.discretise import Conversion, Target
-from ccd_casadi.deployment.judgement import assess
+from ccd_casadi.deployment.discretise import Conversion, Target, discretise
 from ccd_casadi.deployment.outcome import (
     SAMPLED_BANDWIDTH,
     SAMPLED_EXCESS,
@@ -18,14 +18,20 @@ from ccd_casadi.deployment.outcome import (
     Deployment,
 )
 from ccd_casadi.deployment.rate_choice import choose
+from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController, reductions, smallest
-from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
+from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.structured_plant_set import structured_of
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
+from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.statics import compliance_of
+from ccd_casadi.synthesis.statics import compliance_of, statics
 
 # A reduced controller keeps S_max and a bound on the compliance to 0.5 % (they bind at most optima,
 # where any change passes them a little), S_low, 99 % of ω_b, and no gain more than twice the bound
@@ -98,14 +104,16 @@ def deploy(
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing)
         way |= {"needed_hz": own_hz, "target": target}
-        return assess(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
+        return _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
     loops = list(zip(channels, small, strict=True))
     for attempt in range(1 + ADDED):
         conversion, needed, rate = choose(
             run, timing, loops, target, family, progress, attempt, remedy
         )
         way |= {"needed_hz": needed, "target": target}
-        found = assess(run, dense, orders, conversion, rate, timing.delay_at(rate), saturation, way)
+        found = _assessed(
+            run, dense, orders, conversion, rate, timing.delay_at(rate), saturation, way
+        )
         outside = max((m for m in found.members if not target.held(m.figures)),
                       default=None, key=lambda m: m.badness)  # fmt: skip
         if timing.rate_hz is not None or outside is None:
@@ -148,3 +156,47 @@ def _orders(
         smallest(rows, limits, holds(limits.peak)),
         smallest(rows, strict, holds(strict.peak)),
     )
+
+
+def _assessed(
+    run: FinishedRun, members: Sequence[Member], orders: Sequence[ChannelOrders],
+    conversion: Conversion, rate_hz: float, delay: float, saturation: float | None,
+    way: Mapping[str, Any],
+) -> Deployment:  # fmt: skip
+    """A controller as it runs, on the nominal plant and on the members of a set.
+
+    Behind every plant are a hold of a period and a delay in s. `way`: what else was found of the
+    reduction and the rate, by the fields of `Deployment`.
+    """
+    period, bandwidth = 1.0 / rate_hz, run.figures.bandwidth
+    parts = [discretise(o.chosen.controller, conversion, period, delay) for o in orders]
+    realisation = with_anti_windup(
+        realise([o.channel for o in orders], parts, saturation), bandwidth
+    )
+    K, nominal = realisation.system, Perturbation()
+    plants = {nominal: run.plant.plant_si()} | {m.at: m.plant.plant_si() for m in members}
+    held = {at: sampled(plant, period, delay) for at, plant in plants.items()}
+    loops = {at: closed_loop(G, K).S for at, G in held.items()}
+    figures = {at: sampled_figures(loop) for at, loop in loops.items()}
+    at_rest = statics(
+        plants[nominal], K, bandwidth=bandwidth, omega_low=run.problem.inner.omega_low
+    )
+    most = run.problem.inner.compliance_max
+    if kind_of(run.problem).as_designed:
+        most = structured_of(run.problem).compliance_max
+    found = Deployment(
+        orders=tuple(orders), rate_hz=rate_hz, delay=delay, conversion=conversion,
+        plant=held[nominal], realisation=realisation, sampled=figures.pop(nominal),
+        members=tuple(MemberLoop(at, item) for at, item in figures.items()),
+        unverified=_unverified(run), statics=at_rest, compliance_max=most, **way,
+    )  # fmt: skip
+    if most is None or not found.stable:
+        return found
+    gains = {at: sampled_compliance(plants[at], loop) for at, loop in loops.items()}
+    return replace(found, compliance=max(gains.items(), key=lambda pair: pair[1]))
+
+
+def _unverified(run: FinishedRun) -> str:
+    """Why the run is not verified; empty where it is, or where no run is behind the design."""
+    status = run.result.get("status", "verified")
+    return "" if status == "verified" else str(run.result.get("reason") or status)

@@ -17,7 +17,7 @@ from ccd_casadi.inner_problem.problem import (
     plant_of,
     scaled_system,
 )
-from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_by
+from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds
 from ccd_casadi.kernels.design import failed_row
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant, modal_plant
@@ -68,8 +68,6 @@ class Elements:
 # Stated error of the frequencies up to which matrices pass for the model's own: what every verdict
 # asks a loop to survive.
 OWN = LEAST_SHIFT
-# Name of a bound -> the figure that it is on, in words.
-FIGURES = {"S_max": "peak of S", "S_low": "|S(jω_low)|", "compliance_max": "compliance"}
 
 
 @dataclass(frozen=True)
@@ -156,7 +154,7 @@ def searched(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> Look
         look = _look(choice, knobs, elements, point, How.SEARCHED, began)
         return replace(look, result=found)
     certified = [row for row in found.rows if row.certified]
-    row = min(certified or found.rows, key=lambda row: _excess(choice, row))
+    row = min(certified or found.rows, key=choice.inner.excess)
     look = _look(choice, knobs, elements, (row.omega_S, row.omega_T), How.SEARCHED, began)
     standing = Standing.MISSED if look.standing is Standing.KEPT else look.standing
     return replace(look, standing=standing, reason=found.shortfall, result=found)
@@ -215,16 +213,6 @@ def judged(
     """What may be said of a design's figures, and why no more; `broken`: constraints on θ."""
     if not figures.certified:
         return Standing.REFUSED, figures.outcome.value
-    missed = [
-        f"{FIGURES[name]} {missed_by(getattr(figures, of), most)} where {name} = {most:g} is "
-        "required"
-        for name, (of, most) in problem.inner.bounds.items()
-        if getattr(figures, of) > most
-    ]
+    missed = missed_bounds(problem.inner, figures)
     missed += [f"the constraint {name} on θ is not met" for name in broken]
     return (Standing.MISSED, "; ".join(missed)) if missed else (Standing.KEPT, "")
-
-
-def _excess(problem: CoDesignProblem, row: DesignFigures) -> float:
-    ratios = [getattr(row, of) / bound for of, bound in problem.inner.bounds.values()]
-    return max(float(np.nan_to_num(ratio, nan=np.inf)) for ratio in ratios)

@@ -1,7 +1,9 @@
 """ω_b* over two parameters: the run's surrogate where it still answers, and every sample known."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -15,6 +17,20 @@ def run_surrogate(folder: Path) -> GaussianProcess | None:
         return bandwidth_process(load(folder / "surrogate.json")[0])
     except (OSError, SurrogateFileError):
         return None
+
+
+def steepest_axes(
+    known: Mapping[tuple[float, ...], float], lower: Sequence[float], upper: Sequence[float]
+) -> tuple[int, ...]:
+    """The two parameters over whose ranges the samples θ -> ω_b* rise or fall most, in their order.
+
+    By the plane of least squares; of no samples the first two. NaN: infeasible.
+    """
+    rows = [(1.0, *np.subtract(theta, lower), hz) for theta, hz in known.items() if hz == hz]
+    table = np.array(rows).reshape(-1, len(lower) + 2)
+    plane = np.linalg.lstsq(table[:, :-1], table[:, -1])[0]
+    changes = np.abs(plane[1:] * np.subtract(upper, lower))
+    return tuple(sorted(np.argsort(-changes)[:2].tolist()))
 
 
 def landscape_of(

@@ -18,8 +18,9 @@ from bokeh.plotting import figure
 
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.drawing.content import Landscape
+from ccd_casadi.drawing.maps import GROUND, RING
 from ccd_casadi.drawing.page import escape
-from ccd_casadi.drawing.svg import GREY, ORANGE
+from ccd_casadi.drawing.svg import ORANGE
 from ccd_casadi.explorer.controls import DARK
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.explorer.painter import FEW
@@ -60,10 +61,11 @@ class MapFigure:
         made.xaxis[0].ticker.desired_num_ticks = FEW
         made.image("image", "x", "y", "dw", "dh", source=self._image, color_mapper=self._colours)
         by_value = {"field": "hz", "transform": self._colours}
-        made.scatter("x", "y", source=self._designs, size=3, fill_color="white", line_color=GREY)
-        made.scatter("x", "y", source=self._dots, size=8, fill_color=by_value, line_color="white")
+        made.scatter("x", "y", source=self._designs, size=4, fill_color=RING, line_color=GROUND)
+        made.scatter("x", "y", source=self._dots, size=11, fill_color=GROUND, line_color=GROUND)
+        made.scatter("x", "y", source=self._dots, size=8, fill_color=by_value, line_color=RING)
         made.scatter("x", "y", source=self._here, marker="star", size=18, fill_color=ORANGE,
-                     line_color="white")  # fmt: skip
+                     line_color=GROUND)  # fmt: skip
         bar = ColorBar(color_mapper=self._colours, title="ω_b (Hz)", width=10,
                        formatter=NumeralTickFormatter(format="0.[00]"))  # fmt: skip
         made.add_layout(bar, "right")
@@ -73,6 +75,11 @@ class MapFigure:
         """All of it, to be placed on the page."""
         fill: Any = "stretch_width"
         return column(row(*self._selects), self._figure, self._words, sizing_mode=fill)
+
+    def choose(self, axes: Sequence[int]) -> None:
+        """The parameters across and up."""
+        for select, i in zip(self._selects, axes, strict=False):
+            select.value = self.names[i]
 
     @property
     def axes(self) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from ccd_casadi.explorer.controls import Controls
 from ccd_casadi.explorer.curves import curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Look
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.explorer.landscape import landscape_of, run_surrogate
+from ccd_casadi.explorer.landscape import landscape_of, run_surrogate, steepest_axes
 from ccd_casadi.explorer.map_figure import MapFigure
 from ccd_casadi.explorer.message import Message
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure, cursor, legend_html
@@ -28,6 +28,7 @@ from ccd_casadi.explorer.pins import Kept, Pins
 from ccd_casadi.explorer.session import Session, searched_exactly
 from ccd_casadi.explorer.structured import Designed, anchored, designed
 from ccd_casadi.explorer.words import machine_html, move_words, standing_html
+from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.package_text import package_text
@@ -61,7 +62,7 @@ class Page:
             self.controls.put(kept.knobs)
         self.pins = Pins(parameters, self.figures, kept, dark, session.case.objective.cost_unit)
         self.map = MapFigure(parameters, self.draw_map, dark)
-        run = session.run
+        run, problem = session.run, session.problems.at(session.start)
         self._surrogate = None if run is None else run_surrogate(run.folder)
         self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
         self._of_search = False
@@ -69,6 +70,9 @@ class Page:
         self._seen: list[Look] = []  # to be written into the store
         self._newest: Knobs | None = None  # to be searched, while a search is under way
         self.now: Drawn | None = None
+        truths = read_truths(session.store.path, problem)
+        known = known_bandwidths(problem, self._surrogate, truths)
+        self.map.choose(steepest_axes(known, problem.lower, problem.upper))
         self.solve: Solve | None = None
         self._output: list[str] = []
         self._solved = session.folder

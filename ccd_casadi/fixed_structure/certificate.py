@@ -18,7 +18,7 @@ from scipy.linalg import expm, matrix_balance
 from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds, ChannelPeaks, LoopPeaks
 from ccd_casadi.fixed_structure.certificate_curves import (
     crossing_and_bandwidth,
-    frequency_grid,
+    grid_through,
     padded,
     peaks,
     with_crossings,
@@ -167,7 +167,7 @@ def judged(
     zeros = [] if K.D.any() else [K.zeros(_size(K))]
     for i in good:
         roots = [poles[i], np.linalg.eigvals(G[i].A), own, free[i].zeros(_size(free[i])), *zeros]
-        grids.append(frequency_grid(roots, sampling, bounds.omega_low, _size(free[i]), corner))
+        grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner))
     grid, rows = padded(grids), np.arange(len(good))
     table = LoopTable([free[i] for i in good], [G[i] for i in good], held, sampling, bounds)
     if len(free[0].C) > 1:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable
+from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.support.arrays import Array
 
@@ -24,7 +25,7 @@ ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing
 SECTIONS = 17  # of a bracket in ten: to rounding
 
 
-def frequency_grid(
+def grid_through(
     roots: Sequence[np.ndarray],
     sampling: Sampling | None,
     omega_low: float,
@@ -50,11 +51,9 @@ def frequency_grid(
     if sampling is not None:
         top = np.pi / sampling.period
     count = int(PER_DECADE * np.log10(top / bottom))
-    near = (np.abs(joint.imag)[:, None] + np.abs(joint.real)[:, None] * FLANKS).ravel()
-    grid = np.concatenate([np.geomspace(bottom, top, count), near, np.abs(joint), [omega_low]])
-    grid = np.unique(grid[(grid >= bottom) & (grid <= top)])
+    special = (root_flanks(joint, FLANKS), np.abs(joint), np.array([omega_low]))
     # Of two points that rounding parts one may be the maximum, and its bracket end at the other.
-    return grid[np.append(True, np.diff(grid) > APART * grid[1:])]
+    return frequency_grid(bottom, top, count, *special, apart=APART)
 
 
 def padded(grids: Sequence[Array]) -> Array:

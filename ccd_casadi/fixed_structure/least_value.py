@@ -136,10 +136,11 @@ def least_value(
     sampling: Sampling | None = None,
     least_bandwidth: float = 0.0,
     initial: Sequence[Array] = (),
+    only_initial: bool = False,
     progress: Progress | None = None,
 ) -> LeastValue:
-    """From `initial` (κ in SI), or a certified design and its other local optima, to the least
-    value of the goal: from the latter where nothing is given or that leads to no certified design.
+    """From `initial` (κ in SI), a certified design and its other local optima to the least value
+    of the goal; with `only_initial` from the latter where the former lead to no certified design.
 
     `least_bandwidth` in rad/s. What the judge does not confirm is not handed out: the design that
     it began with is, then. A local optimum, as any search from given starts finds.
@@ -165,8 +166,8 @@ def least_value(
     slower = max(SLOWER * design.bandwidth, least_bandwidth)
     given = [(slower, tuple(map(float, item))) for item in initial]
     for bandwidth, kappa in [*given, own, *others]:
-        if (bandwidth, kappa) == own and best.design is not design:
-            break  # one that was given has led to a design: these are climbed from where none does
+        if only_initial and (bandwidth, kappa) == own and best.design is not design:
+            break
         if bandwidth < least_bandwidth:
             continue
         begin = in_problem_units(problem, np.array(kappa))

@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.lti.hold import Sampling, delayed, in_w, moments, transfer
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -271,7 +271,7 @@ def _loop_plant(plant: ScaledPlant, name: str, omega_0: float, force: float) -> 
         raise PlantError(f"{name} {words}")
     W = np.linalg.inv(V)
     b, c = W @ B, C @ V
-    system = StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))
+    system = strictly_proper(A, B, C)
     direct = system.at(PROBES)
     modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (PROBES[:, None] - poles), b)
     if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():

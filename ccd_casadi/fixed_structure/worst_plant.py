@@ -9,7 +9,6 @@ corners are tried. An unstable loop is worst of all. For what lies between there
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -38,6 +37,17 @@ LARGEST = 2  # constraints of a plant that are followed
 STEPS = (1.0, 0.3, 0.1, 0.03)  # towards the corner that a constraint points to: ridges are narrow
 PEAK = 0.1  # ln of the frequency: rows of one bound nearer than that are one peak
 CLIMBS = 4  # rounds of them
+
+
+@dataclass(frozen=True)
+class BoundedLoop:
+    """A controller κ in SI and its ω_b (rad/s), with the bounds that its loops have to keep."""
+
+    structure: Structure | ChannelStructure
+    kappa: Array
+    bandwidth: float
+    bounds: Bounds
+    sampling: Sampling | None = None
 
 
 @dataclass(frozen=True)
@@ -73,31 +83,19 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
 
 
 def excesses(
-    uncertain: UncertainPlant,
-    points: Sequence[tuple[int, Array]],
-    structure: Structure | ChannelStructure,
-    kappa: Array,
-    bandwidth: float,
-    bounds: Bounds,
-    sampling: Sampling | None,
+    uncertain: UncertainPlant, points: Sequence[tuple[int, Array]], loop: BoundedLoop
 ) -> Array:
-    """The largest c of every plant's loop, with SI parameters κ and ω_b in rad/s."""
-    plants = uncertain.plants(points)
-    return _looked_at(plants, structure, kappa, bandwidth, bounds, sampling)[0]
+    """The largest c of the loop with every plant."""
+    return _looked_at(uncertain.plants(points), loop)[0]
 
 
 def _looked_at(
-    plants: Sequence[ScaledPlant],
-    structure: Structure | ChannelStructure,
-    kappa: Array,
-    bandwidth: float,
-    bounds: Bounds,
-    sampling: Sampling | None,
+    plants: Sequence[ScaledPlant], loop: BoundedLoop
 ) -> tuple[Array, LoopProblem, Constraints | None]:
     """The largest c of every plant's loop; the problem, and the constraints it is one of."""
-    problem = problem_for(plants, structure, bounds, sampling)
-    scaled = in_problem_units(problem, kappa)
-    tau = float(np.log(bandwidth / problem.plants.omega_0))
+    problem = problem_for(plants, loop.structure, loop.bounds, loop.sampling)
+    scaled = in_problem_units(problem, loop.kappa)
+    tau = float(np.log(loop.bandwidth / problem.plants.omega_0))
     found = assess(problem, scaled, tau, each=True)
     out = np.full(len(plants), -np.inf)
     if found.peaks is not None:
@@ -108,23 +106,14 @@ def _looked_at(
 
 
 def worst_plants(
-    uncertain: UncertainPlant,
-    structure: Structure | ChannelStructure,
-    kappa: Array,
-    bandwidth: float,
-    bounds: Bounds,
-    sampling: Sampling | None = None,
-    *,
-    seed: int = 0,
-    count: int = LATTICE,
+    uncertain: UncertainPlant, loop: BoundedLoop, *, seed: int = 0, count: int = LATTICE
 ) -> tuple[list[Excess], int]:
     """The worst plants found, the worst first, and how many were looked at."""
-
-    n, loop = len(uncertain.names), (structure, kappa, bandwidth, bounds, sampling)
+    n = len(uncertain.names)
     if n > FEW:
         return _climbed(uncertain, loop, min(count, UNDAMPED), seed)
     points = lattice(uncertain, count, seed)
-    value = excesses(uncertain, points, *loop)
+    value = excesses(uncertain, points, loop)
     looked, first = len(points), np.argsort(-value)[:SEARCHES]
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
@@ -147,19 +136,19 @@ def worst_plants(
 
 def _tried(
     uncertain: UncertainPlant, heads: list[Excess], steps: Sequence[tuple[int, Array]],
-    loop: tuple[Any, ...],
+    loop: BoundedLoop,
 ) -> bool:  # fmt: skip
     """Moves heads by steps (a head's number, a point) that raise them; whether one by `WITHIN`."""
     before = [head.value for head in heads]
     points = [(heads[row].option, point) for row, point in steps]
-    for (row, point), end in zip(steps, excesses(uncertain, points, *loop).tolist(), strict=True):
+    for (row, point), end in zip(steps, excesses(uncertain, points, loop).tolist(), strict=True):
         if end > heads[row].value:
             heads[row] = Excess(heads[row].option, point, end)
     return any(head.value > value + WITHIN for head, value in zip(heads, before, strict=True))
 
 
 def _climbed(
-    uncertain: UncertainPlant, loop: tuple[Any, ...], count: int, seed: int
+    uncertain: UncertainPlant, loop: BoundedLoop, count: int, seed: int
 ) -> tuple[list[Excess], int]:
     """`worst_plants` of many parameters: ascents from the worst plants of distinct peaks."""
     own = np.array([name == "damping" for name in uncertain.names])
@@ -167,7 +156,7 @@ def _climbed(
         (option, np.where(own & (i % EVENLY > 0), uncertain.box[0], point))
         for i, (option, point) in enumerate(lattice(uncertain, count, seed))
     ]
-    value, problem, peaks = _looked_at(uncertain.plants(points), *loop)
+    value, problem, peaks = _looked_at(uncertain.plants(points), loop)
     found = dict[tuple[int, ...], Excess]()
     for i in np.argsort(-value).tolist():
         option, point = points[i]
@@ -189,12 +178,12 @@ def _climbed(
 
 
 def _towards_corners(
-    uncertain: UncertainPlant, heads: Sequence[Excess], loop: tuple[Any, ...]
+    uncertain: UncertainPlant, heads: Sequence[Excess], loop: BoundedLoop
 ) -> list[tuple[int, Array]]:
     """Steps from every head that is stable: the head's number and the point."""
-    box, kappa = uncertain.box, loop[1]
+    box = uncertain.box
     plants = [uncertain.sloped(head.point, head.option) for head in heads]
-    _, problem, peaks = _looked_at(plants, *loop)
+    _, problem, peaks = _looked_at(plants, loop)
     if peaks is None:
         return []
     of = problem.plants_of(peaks)
@@ -203,7 +192,7 @@ def _towards_corners(
         for own in (np.flatnonzero(of == row) for row in range(len(heads)))
     ]
     rows = np.concatenate(chosen)
-    slopes = to_theta(problem, in_problem_units(problem, kappa), peaks.only(rows))
+    slopes = to_theta(problem, in_problem_units(problem, loop.kappa), peaks.only(rows))
     found: list[tuple[int, Array]] = []
     for row, slope in zip(of[rows].tolist(), slopes, strict=True):
         head = heads[row]

@@ -17,7 +17,7 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_plant_set import plants_of, structured_of, uncertain_plant
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
@@ -83,10 +83,9 @@ def stated_time(
 ) -> tuple[float, Yield | None]:
     """The time that a design is told to need (s), whose smooth time on the set is `value`, and how
     many fresh plants need no longer."""
-    uncertain, structured = free_box(problem, theta), structured_of(problem)
-    motion, seed = motion_of(problem, theta), structured.seed
-    scenarios = [(option, np.array(point)) for option, point in structured.scenarios]
-    on_set = exact_times(problem, motion, uncertain.plants(scenarios or uncertain.corners()), K)
+    uncertain, seed = free_box(problem, theta), structured_of(problem).seed
+    motion, of_set = motion_of(problem, theta), plants_of(replace(problem, suspension=FREE), theta)
+    on_set = exact_times(problem, motion, of_set, K)
     told = max(value, float(on_set.max()), latest_plant(problem, theta, K, seed + FRESH_SEED)[0])
     if not uncertain.names:
         return told, None

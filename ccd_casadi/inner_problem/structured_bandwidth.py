@@ -15,7 +15,7 @@ from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.fixed_structure import SectionsDesign, Structure
 from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
-from ccd_casadi.fixed_structure.least_value import Goal, RmsError, least_value
+from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import Progress, SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
@@ -89,7 +89,7 @@ def structured_value(problem: CoDesignProblem, theta: Sequence[float]) -> Struct
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
             break
         made = again
-    return value_of_design(problem, theta, plants, made, spent)
+    return value_of_design(problem, theta, plants, made, spent, only_initial=True)
 
 
 def value_of_design(
@@ -98,21 +98,23 @@ def value_of_design(
     plants: Sequence[ScaledPlant],
     design: SectionsDesign,
     spent: int,
+    only_initial: bool = False,
 ) -> StructuredValue:
-    """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least of another
-    figure."""
+    """A design of largest bandwidth as a value of ω_b*(θ), or as a start to the least of another
+    figure beside the warm starts; with `only_initial` where these lead to no certified design."""
     point = tuple(float(v) for v in theta)
     error, envelope = np.nan, None
+    if problem.figure is not BANDWIDTH:
+        design = too_slow(problem, design)
     if design.certified and problem.figure is not BANDWIDTH:
-        design, error, envelope = _least(problem, theta, plants, design)
+        found = least_at(problem, theta, plants, design, only_initial)
+        design, error, envelope = found.design, found.value, found.envelope
     elif design.certified:
         envelope = bandwidth_envelope(plants, bounds_of(problem), design, problem.sampling)
-    bandwidth = design.bandwidth if design.certified else np.nan
+    bandwidth = float(design.bandwidth) if design.certified else np.nan
     gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
     slope = tuple(map(float, gradient))
-    return StructuredValue(
-        point, float(bandwidth), slope, design, spent, envelope, error=float(error)
-    )
+    return StructuredValue(point, bandwidth, slope, design, spent, envelope, error=error)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
@@ -125,7 +127,7 @@ def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
 def too_slow(problem: CoDesignProblem, design: SectionsDesign) -> SectionsDesign:
     """The design, no longer a certified one where what is minimised asks for more bandwidth."""
     least = structured_of(problem).bandwidth_least
-    if design.bandwidth >= least:
+    if not design.certified or design.bandwidth >= least:
         return design
     words = f"no controller was found above {design.bandwidth / HZ:.4g} Hz"
     words += f", inner.bandwidth_least_hz requires {least / HZ:.4g} Hz"
@@ -147,21 +149,20 @@ def goal_of(
     return MoveTime(tuple(free), structure, sampling, motion_of(problem, theta))
 
 
-def _least(
+def least_at(
     problem: CoDesignProblem,
     theta: Sequence[float],
     plants: Sequence[ScaledPlant],
     design: SectionsDesign,
-) -> tuple[SectionsDesign, float, Envelope | None]:
-    """The design of the least value, that in SI, and its gradients to θ."""
+    only_initial: bool = False,
+    progress: Progress | None = None,
+) -> LeastValue:
+    """The least of the problem's figure from a certified design and the problem's warm starts."""
     structured, bounds = structured_of(problem), bounds_of(problem)
-    design = too_slow(problem, design)
-    if not design.certified:
-        return design, np.nan, None
     started = with_structured(problem, warm_starts=structured.error_warm_starts)
-    found = least_value(
+    return least_value(
         plants, bounds, design, goal_of(problem, theta, plants), sampling=structured.sampling,
         least_bandwidth=structured.bandwidth_least,
         initial=warm_starts_at(started, structure_of(problem), plants, bounds),
+        only_initial=only_initial, progress=progress,
     )  # fmt: skip
-    return found.design, found.value, found.envelope

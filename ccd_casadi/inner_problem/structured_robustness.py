@@ -17,7 +17,13 @@ from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
+from ccd_casadi.fixed_structure.worst_plant import (
+    WITHIN,
+    BoundedLoop,
+    Excess,
+    lattice,
+    worst_plants,
+)
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -79,10 +85,9 @@ def violations(
 ) -> tuple[Excess, tuple[Scenario, ...]]:
     """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
     structured = structured_of(problem)
-    heads, count = worst_plants(
-        uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem), structured.sampling,
-        seed=structured.seed + turn,
-    )  # fmt: skip
+    loop = BoundedLoop(structure_of(problem), kappa, bandwidth, bounds_of(problem),
+                       structured.sampling)  # fmt: skip
+    heads, count = worst_plants(uncertain, loop, seed=structured.seed + turn)
     if progress is not None:
         progress(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
@@ -106,19 +111,22 @@ def worse_elsewhere(
     turns: range,
     workers: Pool,
     progress: Progress,
-) -> tuple[Scenario, ...]:
-    """What the first of several searches for the worst plants finds that exceeds a bound; as many
-    at a time as there are workers."""
+) -> tuple[Excess, tuple[Scenario, ...]]:
+    """The worst plant of several searches, and those to add of the first that finds any; as many at
+    a time as there are workers."""
+    seen: list[Excess] = []
     for first in turns[:: workers.count]:
         own = range(first, min(first + workers.count, turns.stop))
         tasks = {turn: (problem, theta, design, turn) for turn in own}
         found = dict(results(workers, worst_case, tasks))
-        largest = max(worst.value for worst, _ in found.values())
-        progress(f"{100.0 * np.exp(largest):.6g} % of a bound at most, searched from elsewhere")
-        for turn in own:
-            if found[turn][1]:
-                return found[turn][1]
-    return ()
+        seen += [worst for worst, _ in found.values()]
+        largest = max(seen, key=lambda one: one.value)
+        words = f"{100.0 * np.exp(largest.value):.6g} % of a bound at most"
+        progress(f"{words}, searched from elsewhere")
+        added = next((found[turn][1] for turn in own if found[turn][1]), ())
+        if added:
+            break
+    return largest, added
 
 
 def certify_lattice(

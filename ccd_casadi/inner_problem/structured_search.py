@@ -11,19 +11,18 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.least_value import LeastValue, least_value
+from ccd_casadi.fixed_structure.least_value import LeastValue
 from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import (
-    goal_of,
+    least_at,
     searched,
     structured_value,
     too_slow,
 )
 from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
     plants_of,
     structured_of,
     uncertain_plant,
@@ -166,19 +165,12 @@ def least_from(
     The problem has the plants then that were found worse on the way, and that design as the first
     of its warm starts.
     """
-    if problem.figure is not BANDWIDTH and design.certified:
-        design = too_slow(problem, design)
-    if problem.figure is BANDWIDTH or not design.certified:
+    if problem.figure is BANDWIDTH or not (design := too_slow(problem, design)).certified:
         return problem, design, None
     wider = problem
     for turn in range(ROUNDS_OF_ERROR):
-        problem, structured = wider, structured_of(wider)
-        plants = plants_of(problem, theta)
-        found = least_value(
-            plants, bounds_of(problem), design, goal_of(problem, theta, plants),
-            sampling=structured.sampling, least_bandwidth=structured.bandwidth_least,
-            initial=[np.array(kappa) for kappa in structured.error_warm_starts], progress=progress,
-        )  # fmt: skip
+        problem = wider
+        found = least_at(problem, theta, plants_of(problem, theta), design, progress=progress)
         wider = _wider(problem, theta, found.design, turn, progress)[1] or problem
         if wider is problem:
             break

@@ -16,24 +16,27 @@ holds where the model does.
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.limits import LoopCurve
+from ccd_casadi.kernels.limits import LoopCurve, warped
 from ccd_casadi.kernels.loop_point import (
     FREE,
     GV,
     LEFT,
+    RATE,
     RIGHT,
     SHARE,
     US,
+    G,
     K,
     M,
     S,
     V,
+    closed,
     gain_of,
-    opened,
     room,
     row_of,
 )
-from ccd_casadi.kernels.sections import second_slopes
+from ccd_casadi.kernels.modes import response
+from ccd_casadi.kernels.sections import gains_and_slopes, second_slopes
 
 LEAST_GAP = 1e-2  # of two singular values, relative, that the model counts with
 
@@ -42,17 +45,22 @@ LEAST_GAP = 1e-2  # of two singular values, relative, that the model counts with
 def second(curve, number, which, v, loop):
     """∂²ln σ/∂κ² (M, n, n) of M rows at their v."""
     at, of, g, sigma = room(loop)
-    (m, c), p, n, channel = loop.into.shape, loop.out.shape[1], g.size, loop.channel
+    factors, values, channel, into, out, terms, residues, T, delay, _, own = loop
+    (m, c), p, n = into.shape, out.shape[1], g.size
     z = np.complex128
-    out, bend = np.empty((v.size, n, n)), np.empty((n, n), z)
+    bends, bend = np.empty((v.size, n, n)), np.empty((n, n), z)
     crossed, moved = np.empty((c, c), z), np.empty((c, c), z)
     back, ahead = np.empty((m, c), z), np.empty((m, c), z)
     for j in range(v.size):
-        opened(curve[j], which[j], v[j], loop, at, of, g)
-        σ, place = gain_of(curve[j], number[j], loop.into, loop.out, loop.rows, at, of, sigma)
+        gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
+        response(terms, residues, T, delay, which[j], v[j], False, at, G)
+        if curve[j] == LoopCurve.GS:
+            response(terms, residues, 0.0, 0.0, which[j], warped(T, v[j])[0], False, at, FREE)
+        closed(into, out, of[K], at)
+        σ, place = gain_of(curve[j], number[j], into, out, own, at, of, sigma)
         columns = m if curve[j] == LoopCurve.GS else p
-        _by_channel(curve[j], number[j], place, loop, at, of, crossed, moved, back, ahead)
-        second_slopes(loop.factors, g, bend)
+        _by_channel(curve[j], number[j], place, into, p, own, at, of, crossed, moved, back, ahead)
+        second_slopes(factors, g, bend)
         for a in range(n):
             i = channel[a]
             for b in range(a + 1):
@@ -68,8 +76,8 @@ def second(curve, number, which, v, loop):
                         zb = ahead[q, h] * g[b] + (back[q, h] * g[b]).conjugate()
                         total += za.conjugate() * zb * _over_gap(σ, sigma[q])
                 first = (of[SHARE, i] * g[a]).real * (of[SHARE, h] * g[b]).real
-                out[j, a, b] = out[j, b, a] = total.real - 2.0 * first
-    return out
+                bends[j, a, b] = bends[j, b, a] = total.real - 2.0 * first
+    return bends
 
 
 @compiled
@@ -82,11 +90,11 @@ def _over_gap(σ, other):
 
 
 @compiled
-def _by_channel(curve, number, place, loop, at, of, crossed, moved, back, ahead):
+def _by_channel(curve, number, place, into, p, own, at, of, crossed, moved, back, ahead):
     """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
     of z_m (m, c).
     """
-    into, (m, c), p = loop.into, loop.into.shape, loop.out.shape[1]
+    m, c = into.shape
     rows, columns = m if curve == LoopCurve.KS else p, m if curve == LoopCurve.GS else p
     z = np.complex128
     R, P, Q = np.zeros((c, c), z), np.zeros((m, c), z), np.zeros((m, c), z)
@@ -114,7 +122,7 @@ def _by_channel(curve, number, place, loop, at, of, crossed, moved, back, ahead)
                         entry += at[FREE, b, d] * at[V, d, q]
                 Q[q, i] += at[US, i, b] * entry
     if number >= p:
-        row_of(loop.rows[int(curve == LoopCurve.KS), number - p], P, rows, c)
+        row_of(own[int(curve == LoopCurve.KS), number - p], P, rows, c)
         rows = 1
     for i in range(c):
         for h in range(c):

@@ -21,9 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.limits import LoopCurve, offset, warped
-from ccd_casadi.kernels.modes import response
-from ccd_casadi.kernels.sections import gains_and_slopes, inverse
+from ccd_casadi.kernels.limits import LoopCurve
+from ccd_casadi.kernels.sections import inverse
 from ccd_casadi.kernels.small import invert, singular
 
 # What a point, one plant's loop at one frequency, has of matrices (10, w, w) and of vectors (9, w)
@@ -56,17 +55,6 @@ def room(loop):
     w = max(loop.into.shape[0], loop.into.shape[1])
     z = np.complex128
     return np.zeros((10, w, w), z), np.zeros((9, w), z), np.zeros(loop.values.size, z), np.zeros(w)
-
-
-@compiled
-def opened(curve, i, v, loop, at, of, g):
-    """Fills the point with all that a row of this curve needs, slopes too."""
-    T, terms, residues = loop.period, loop.terms, loop.residues
-    gains_and_slopes(loop.factors, loop.values, complex(0.0, v), of[K], of[RATE], g)
-    response(terms, residues, T, loop.delay, i, v, True, at, G)
-    if curve == LoopCurve.GS:
-        response(terms, residues, 0.0, 0.0, i, warped(T, v)[0], True, at, FREE)
-    closed(loop.into, loop.out, of[K], at)
 
 
 @compiled
@@ -164,48 +152,39 @@ def gain_of(curve, number, into, out, own, at, of, sigma):
                 own[int(curve == LoopCurve.KS), number - p, a] * at[M, 0, 0].conjugate() * scale
             )
     for a in range(p):
-        of[W, a], of[X, a] = at[V, a, place], 0.0
+        total = at[V, a, place]
         if curve == LoopCurve.GS:
-            of[W, a] = 0.0
+            total = 0.0j
             for b in range(m):
-                of[W, a] += at[FREE, a, b] * at[V, b, place]
-    for a in range(m):
-        of[Y, a] = 0.0
+                total += at[FREE, a, b] * at[V, b, place]
+        of[W, a] = total
     for i in range(c):
-        of[LEFT, i], of[RIGHT, i] = 0.0, 0.0
+        total = 0.0j
         for b in range(p):
-            of[RIGHT, i] += at[US, i, b] * of[W, b]
+            total += at[US, i, b] * of[W, b]
+        of[RIGHT, i], total = total, 0.0j
         if curve == LoopCurve.KS:
             for a in range(m):
-                of[LEFT, i] += of[U, a] * into[a, i]
-            for b in range(p):
-                of[X, b] -= of[LEFT, i] * of[K, i] * at[US, i, b]
-    if curve != LoopCurve.KS:
-        sign = 1.0 if curve == LoopCurve.T else -1.0
-        for b in range(p):
+                total += of[U, a] * into[a, i]
+        of[LEFT, i] = total  # so far ũᵀV
+    sign = 1.0 if curve == LoopCurve.T else -1.0
+    for b in range(p):
+        total = 0.0j
+        if curve == LoopCurve.KS:
+            for i in range(c):
+                total -= of[LEFT, i] * of[K, i] * at[US, i, b]
+        else:
             for a in range(p):
-                of[X, b] += sign * of[U, a] * at[S, a, b]
+                total += sign * of[U, a] * at[S, a, b]
+        of[X, b] = total
     for i in range(c):
+        total = of[LEFT, i]
         for a in range(p):
-            of[LEFT, i] += of[X, a] * at[GV, a, i]
-        for a in range(m):
-            of[Y, a] += into[a, i] * of[K, i] * of[RIGHT, i]
-        of[SHARE, i] = of[LEFT, i] * of[K, i] * of[RIGHT, i]
+            total += of[X, a] * at[GV, a, i]
+        of[LEFT, i], of[SHARE, i] = total, total * of[K, i] * of[RIGHT, i]
+    for a in range(m):
+        total = 0.0j
+        for i in range(c):
+            total += into[a, i] * of[K, i] * of[RIGHT, i]
+        of[Y, a] = total
     return sigma[place], place
-
-
-@compiled
-def value_and_slope(curve, number, v, loop, at, of, sigma):
-    """ln of one gain over its bound, its slope to ln v, and the column of its v in V."""
-    (m, c), p = loop.into.shape, loop.out.shape[1]
-    σ, place = gain_of(curve, number, loop.into, loop.out, loop.rows, at, of, sigma)
-    ω, chain = warped(loop.period, v)
-    level, slope = offset(curve, number, ω, chain, loop.limits)
-    for i in range(c):
-        slope += (of[SHARE, i] * of[RATE, i]).real
-    for a in range(p):
-        for b in range(m):
-            slope += (of[X, a] * at[DG, a, b] * of[Y, b]).real
-            if curve == LoopCurve.GS:
-                slope -= chain * (of[X, a] * at[DFREE, a, b] * at[V, b, place]).real
-    return np.log(σ) + level, slope, place

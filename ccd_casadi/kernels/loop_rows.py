@@ -8,7 +8,10 @@ import numpy as np
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.limits import LoopCurve, offset, warped
 from ccd_casadi.kernels.loop_point import (
+    DFREE,
+    DG,
     FREE,
+    RATE,
     SHARE,
     G,
     K,
@@ -17,14 +20,13 @@ from ccd_casadi.kernels.loop_point import (
     X,
     Y,
     closed,
+    gain_of,
     matrix,
-    opened,
     room,
     row_of,
-    value_and_slope,
 )
 from ccd_casadi.kernels.modes import response
-from ccd_casadi.kernels.sections import gains
+from ccd_casadi.kernels.sections import gains, gains_and_slopes
 from ccd_casadi.kernels.small import largest_gain, singular
 
 
@@ -91,23 +93,36 @@ def rows(curve, number, which, v, loop):
     Rows at the same frequency of the same plant that follow each other share their loop.
     """
     at, of, g, sigma = room(loop)
-    channel, count, m, p = loop.channel, v.size, loop.into.shape[0], loop.out.shape[1]
+    # Unpacked once: to hand all of them to a function costs as much as a row.
+    factors, values, channel, into, out, terms, residues, T, delay, limits, own = loop
+    count, (m, c), p = v.size, into.shape, out.shape[1]
     value, slope, to_kappa = np.empty(count), np.empty(count), np.empty((count, g.size))
     x, sides = np.empty((count, p), np.complex128), np.zeros((2, count, m), np.complex128)
     for j in range(count):
-        before = j - 1
+        before, of_gs, (ω, chain) = j - 1, curve[j] == LoopCurve.GS, warped(T, v[j])
         known = j > 0 and v[j] == v[before] and which[j] == which[before]
-        if not known or (curve[j] == LoopCurve.GS and curve[before] != LoopCurve.GS):
-            opened(curve[j], which[j], v[j], loop, at, of, g)
-        found = value_and_slope(curve[j], number[j], v[j], loop, at, of, sigma)
-        value[j], slope[j], place = found
-        for a in range(g.size):
-            to_kappa[j, a] = (of[SHARE, channel[a]] * g[a]).real
+        if not known:
+            gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
+            response(terms, residues, T, delay, which[j], v[j], True, at, G)
+            closed(into, out, of[K], at)
+        if of_gs and not (known and curve[before] == LoopCurve.GS):
+            response(terms, residues, 0.0, 0.0, which[j], ω, True, at, FREE)
+        σ, place = gain_of(curve[j], number[j], into, out, own, at, of, sigma)
+        level, rise = offset(curve[j], number[j], ω, chain, limits)
+        for i in range(c):
+            rise += (of[SHARE, i] * of[RATE, i]).real
         for a in range(p):
             x[j, a] = of[X, a]
+            for b in range(m):
+                rise += (of[X, a] * at[DG, a, b] * of[Y, b]).real
+                if of_gs:
+                    rise -= chain * (of[X, a] * at[DFREE, a, b] * at[V, b, place]).real
+        value[j], slope[j] = np.log(σ) + level, rise
+        for a in range(g.size):
+            to_kappa[j, a] = (of[SHARE, channel[a]] * g[a]).real
         for b in range(m):
             sides[0, j, b] = of[Y, b]
-            if b < p or curve[j] == LoopCurve.GS:
+            if b < p or of_gs:
                 sides[1, j, b] = at[V, b, place]
     return value, slope, to_kappa, x, sides[0], sides[1]
 
@@ -122,39 +137,43 @@ def close(curve, number, which, start, low, high, loop, tolerances):
     """
     flat, narrowest, most = tolerances
     top, closed_in = start.copy(), np.zeros(start.size, np.bool_)
-    point = room(loop)
+    fa, end = rows(curve, number, which, start, loop)[1], low.copy()
     for j in range(start.size):
-        row = (curve[j], number[j], which[j])
-        a = np.log(start[j])
-        fa = slope_at(row, start[j], loop, point)
-        end = high[j] if fa > 0.0 else low[j]
-        b = np.log(end)
-        fb = slope_at(row, end, loop, point)
-        if not (fa * fb < 0.0 and np.isfinite(fa) and np.isfinite(fb)):
-            continue
-        closed_in[j] = True
-        narrow = narrowest * abs(b - a)
-        before, wider = np.inf, np.inf  # widths one and two steps ago
-        for _ in range(int(most)):
-            width = abs(b - a)
-            x = 0.5 * (a + b) if width > 0.5 * wider else b - fb * (b - a) / (fb - fa)
-            wider, before = before, width
-            fx = slope_at(row, np.exp(x), loop, point)
-            if fx * fb < 0.0:
-                a, fa = b, fb
+        if fa[j] > 0.0:
+            end[j] = high[j]
+    fb = rows(curve, number, which, end, loop)[1]
+    a, b, x = np.log(start), np.log(end), np.empty(start.size)
+    narrow, before, wider = np.empty(start.size), np.empty(start.size), np.empty(start.size)
+    going, left = np.empty(start.size, np.int64), 0  # the brackets that are still too wide
+    for j in range(start.size):
+        if fa[j] * fb[j] < 0.0 and np.isfinite(fa[j]) and np.isfinite(fb[j]):
+            closed_in[j], going[left] = True, j
+            narrow[j] = narrowest * abs(b[j] - a[j])
+            before[j], wider[j] = np.inf, np.inf  # widths one and two steps ago
+            left += 1
+    for _ in range(int(most)):
+        going = going[:left]
+        if left == 0:
+            break
+        for j in going:
+            width = abs(b[j] - a[j])
+            x[j] = b[j] - fb[j] * (b[j] - a[j]) / (fb[j] - fa[j])
+            if width > 0.5 * wider[j]:
+                x[j] = 0.5 * (a[j] + b[j])
+            wider[j], before[j] = before[j], width
+        fx = rows(curve[going], number[going], which[going], np.exp(x[going]), loop)[1]
+        left = 0
+        for k in range(fx.size):
+            j = going[k]
+            if fx[k] * fb[j] < 0.0:
+                a[j], fa[j] = b[j], fb[j]
             else:
-                fa *= 0.5
-            b, fb = x, fx
-            if abs(fx) < flat or abs(b - a) <= narrow:
-                break
-        top[j] = np.exp(b)
+                fa[j] *= 0.5
+            b[j], fb[j] = x[j], fx[k]
+            if abs(fx[k]) >= flat and abs(b[j] - a[j]) > narrow[j]:
+                going[left] = j
+                left += 1
+    for j in range(start.size):
+        if closed_in[j]:
+            top[j] = np.exp(b[j])
     return top, closed_in
-
-
-@compiled
-def slope_at(row, v, loop, point):
-    """That of a row (curve, number, plant) to ln v."""
-    curve, number, i = row
-    at, of, g, sigma = point
-    opened(curve, i, v, loop, at, of, g)
-    return value_and_slope(curve, number, v, loop, at, of, sigma)[1]

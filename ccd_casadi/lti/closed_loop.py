@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
 
 
@@ -35,14 +35,12 @@ class ClosedLoop:
     @cached_property
     def T(self) -> StateSpace:
         """r to y: GK(1 + GK)⁻¹."""
-        nothing = np.zeros((len(self.C_y), self.B_r.shape[1]))
-        return StateSpace(self.A, self.B_r, self.C_y, nothing, period=self.period)
+        return strictly_proper(self.A, self.B_r, self.C_y, self.period)
 
     @cached_property
     def GS(self) -> StateSpace:
         """d to y: (1 + GK)⁻¹G."""
-        nothing = np.zeros((len(self.C_y), self.B_d.shape[1]))
-        return StateSpace(self.A, self.B_d, self.C_y, nothing, period=self.period)
+        return strictly_proper(self.A, self.B_d, self.C_y, self.period)
 
     @cached_property
     def KS(self) -> StateSpace:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
 
 INSTANT = 1e-9  # share of a period that counts as none
@@ -110,12 +110,11 @@ def delayed(A: np.ndarray, gains: Sequence[np.ndarray], C: np.ndarray, T: float)
     n, m = gains[0].shape
     kept = m * (len(gains) - 1)
     older = np.hstack([np.zeros((n, 0)), *gains[1:]])
-    return StateSpace(
+    return strictly_proper(
         np.block([[A, older], [np.zeros((kept, n)), np.eye(kept, k=-m)]]),
         np.vstack([gains[0], np.eye(kept, m)]),
         np.hstack([C, np.zeros((len(C), kept))]),
-        np.zeros((len(C), m)),
-        period=T,
+        T,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, sensitivity, sigma_max
 from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.hold import Sampling, sampled, transfer, tustin
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
 
 PER_DECADE = 60
@@ -129,8 +129,8 @@ class Loop:
 def at_instants(loop: ClosedLoop, period: float) -> ClosedLoop:
     """A continuous loop at instants `period` s apart, r and d constant in between; exact."""
     both = np.hstack([loop.B_r, loop.B_d])
-    joint = StateSpace(loop.A, both, loop.C_y, np.zeros((len(loop.C_y), both.shape[1])))
-    held, count = sampled(joint, period, 0.0), loop.B_r.shape[1]
+    held = sampled(strictly_proper(loop.A, both, loop.C_y), period, 0.0)
+    count = loop.B_r.shape[1]
     return replace(loop, A=held.A, B_r=held.B[:, :count], B_d=held.B[:, count:], period=period)
 
 

@@ -136,6 +136,11 @@ class StateSpace:
         )
 
 
+def strictly_proper(A: Array, B: Array, C: Array, period: float = 0.0) -> StateSpace:
+    """The system with D = 0."""
+    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), period=period)
+
+
 def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
     """T⁻¹AT, T⁻¹B, CT with a diagonal T of powers of two that evens out the states' scales.
 

@@ -109,8 +109,7 @@ class ActiveSet:
 
     def free(self, mu: Array) -> Array:
         """Orthonormal directions (n, k) that leave what has a multiplier as it is."""
-        strong = self.rows[mu > 0.0]
-        return null_space(strong) if len(strong) else np.eye(self.gradient.size)
+        return np.asarray(null_space(self.rows[mu > 0.0]))
 
     def certificate(
         self, mu: Array, residual: float, second: float | None, kink: Kink | None = None

@@ -51,7 +51,7 @@ def jumps(a: Local, b: Local) -> bool:
 def descend(
     at: Callable[[Array], Local | None],
     start: Local,
-    known: Sequence[Local],
+    known: Callable[[], Sequence[Local]],
     constraints: Constraints,
     *,
     steps: int,
@@ -62,11 +62,11 @@ def descend(
     jump of J.
 
     `at` gives None where J is not known; `constraints` λ (m,) and ∇λ (m, n). `settled` is relative
-    to J, `first` the first radius, a share of the box. `known` are further points that were met
-    before; `start` keeps λ <= 0.
+    to J, `first` the first radius, a share of the box. `known` gives all points that were met, at
+    any time, each as it is known by then; `start` keeps λ <= 0.
     """
     n = start.z.size
-    model = _Pieces(at, [start, *known], constraints)
+    model = _Pieces(at, start, known, constraints)
     end = minimise(
         model, model.iterate(start), np.zeros((n, n)), Radius(first, LEAST, LARGEST), steps=steps,
         penalty=model.size, least_gain=settled * abs(start.value),
@@ -80,11 +80,12 @@ class _Pieces(Model[Local]):
     carried = True
 
     def __init__(
-        self, J: Callable[[Array], Local | None], pieces: list[Local], constraints: Constraints
-    ) -> None:
-        self.J, self.pieces, self.constraints = J, pieces, constraints
-        self.low, self.high = np.zeros(pieces[0].z.size), np.ones(pieces[0].z.size)
-        self.size = max(float(np.abs(pieces[0].gradient).max()), 1e-300)
+        self, J: Callable[[Array], Local | None], start: Local,
+        known: Callable[[], Sequence[Local]], constraints: Constraints,
+    ) -> None:  # fmt: skip
+        self.J, self.known, self.constraints = J, known, constraints
+        self.low, self.high = np.zeros(start.z.size), np.ones(start.z.size)
+        self.size = max(float(np.abs(start.gradient).max()), 1e-300)
 
     def iterate(self, here: Local) -> Iterate[Local]:
         """J counts in the merit, and of the model the pieces alone."""
@@ -94,20 +95,18 @@ class _Pieces(Model[Local]):
         """A point with λ <= 0, and one piece more."""
         z = _restored(np.clip(x, 0.0, 1.0), self.constraints)
         there = None if z is None else self.J(z)
-        if there is None:
-            return None
-        self.pieces.append(there)
-        return self.iterate(there)
+        return None if there is None else self.iterate(there)
 
     def rows(self, here: Iterate[Local], radius: float) -> Rows:
         """The pieces near by less J, and λ, which no σ pays for."""
         best, n = here.data, here.x.size
-        away = np.array([best.z - piece.z for piece in self.pieces])
+        pieces = [best, *(one for one in self.known() if (one.z != best.z).any())]
+        away = np.array([best.z - piece.z for piece in pieces])
         far = np.abs(away).max(axis=1)
         near = np.argsort(far, kind="stable")[: PIECES * n]
         chosen = near[far[near] <= NEAR * radius]
-        slopes, away = np.array([self.pieces[i].gradient for i in chosen]), away[chosen]
-        value = np.array([self.pieces[i].value for i in chosen]) + (slopes * away).sum(axis=1)
+        slopes, away = np.array([pieces[i].gradient for i in chosen]), away[chosen]
+        value = np.array([pieces[i].value for i in chosen]) + (slopes * away).sum(axis=1)
         steepest = float(np.abs(best.gradient).max())
         below = np.maximum(best.value - value, BENT * steepest * (away**2).sum(axis=1))
         g, jacobian = self.constraints(best.z)

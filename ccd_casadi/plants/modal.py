@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -85,7 +85,7 @@ class ModalPlant:
         A[:n, n:], A[n:, :n], A[n:, n:] = np.diag(scale), -self.K / scale, -self.D
         B = np.vstack([np.zeros_like(self.B), self.B])
         C = np.hstack([self.C / scale, np.zeros_like(self.C)])
-        return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))
+        return strictly_proper(A, B, C)
 
 
 def modal_plant(

@@ -11,7 +11,7 @@ import numpy as np
 
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.lti.grid import frequency_grid, root_flanks
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balanced, strictly_proper
 from ccd_casadi.plants.channels import Channel, find_channels
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
@@ -86,13 +86,12 @@ class ScaledPlant:
     @property
     def system(self) -> StateSpace:
         """The scaled plant, time in 1/ω₀."""
-        return _system(self.A, self.B, self.C)
+        return strictly_proper(self.A, self.B, self.C)
 
     def plant_si(self) -> StateSpace:
         """The plant, force to displacement, time in s."""
         w0 = self.omega_0
-        D = np.zeros((self.C.shape[0], self.B.shape[1]))
-        return StateSpace(w0 * self.A, w0 / self.force * self.B, self.C.copy(), D)
+        return strictly_proper(w0 * self.A, w0 / self.force * self.B, self.C.copy())
 
     def changes_si(self) -> list[tuple[Array, Array, Array]]:
         """∂A, ∂B and ∂C of `plant_si` to each parameter."""
@@ -102,8 +101,7 @@ class ScaledPlant:
 
     def controller_si(self, A: Array, B: Array, C: Array) -> StateSpace:
         """A controller of the scaled plant, error in to force out, time in s."""
-        D = np.zeros((C.shape[0], B.shape[1]))
-        return StateSpace(self.omega_0 * A, self.omega_0 * B, self.force * C, D)
+        return strictly_proper(self.omega_0 * A, self.omega_0 * B, self.force * C)
 
 
 def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledPlant:
@@ -201,12 +199,8 @@ def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
 
 def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
     """A logarithmic grid with points crowded around lightly damped poles and zeros."""
-    system = _system(A, B, C)
+    system = strictly_proper(A, B, C)
     roots = np.concatenate([system.poles, system.zeros()])
     roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
     wide = np.maximum(np.abs(roots.real), 1e-9 * roots.imag) + 1j * roots.imag
     return np.ascontiguousarray(frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS)))
-
-
-def _system(A: Array, B: Array, C: Array) -> StateSpace:
-    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))

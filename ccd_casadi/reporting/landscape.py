@@ -73,8 +73,7 @@ def landscape_data(
     if process is not None:
         field = process.predict(thetas).reshape(count, count) / HZ
     forbidden = None
-    plant = plant_of(problem)
-    if plant.constraint_names:
+    if plant_of(problem).constraint_names:
         bad = [bool(violated(problem, tuple(place))) for place in thetas]
         forbidden = np.array(bad).reshape(count, count)
     region = None

@@ -87,32 +87,34 @@ def cycle_chapter(
     heat = R / k**2 * (force**2).sum(axis=1)
     end = c.Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
     mean = c.Level(told["power"], "mean")
-    ms = 1e3 * time
+    ms, late = 1e3 * time, 0.0 if settled is None else settled - profile.duration
     panels = [
         c.Panel("time (ms)", "force of a motor (N)", (c.Curve(ms, force[:, 0]),), levels=(end,)),
+        c.Panel("time (ms)", "its current (A)", (c.Curve(ms, force[:, 0] / k),)),
         c.Panel("time (ms)", "heat (W)", (c.Curve(ms, heat),), levels=(mean,)),
     ]
     if not own.required:
         watts = told["power"] * np.linspace(0.1, 2.0, 39)
         limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
         times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
-        late = 0.0 if settled is None else settled - profile.duration
         curve = c.Curve(watts, 1e3 * (np.array(times) + late))
-        panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
+        here = c.Level(told["power"], "this design", vertical=True)
+        panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,),
+                              levels=(here,)))  # fmt: skip
     share = f"{number(100.0 * told['heat_share'], 3)} % of the heat"
     if motor.peak_current[0] < UNLIMITED:
         share += f" and {number(100.0 * told['peak_share'], 3)} % of the peak force"
     settling = "it does not settle on the whole set" if settled is None else (
-        f"on every plant of the set it has settled after {number(1e3 * settled, 4)} ms"
+        f"on every plant of the set it has settled {number(1e3 * late, 3)} ms after that"
     )  # fmt: skip
     words = (
         f"A cycle of {number(ms[-1], 4)} ms: {number(told['peak_force'], 4)} N and "
         f"{number(told['peak_current'], 3)} A at most, {number(told['rms_force'], 4)} N RMS, "
         f"{number(told['power'], 4)} W: {share} that the motor allows. The setpoint takes "
         f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
-        f"{settling}."
+        f"{settling}.{'' if own.required else ' The last curve has the settling of this design.'}"
     )
-    lines = c.Lines((tuple(panels),), "A cycle of the motor", (3.0,))
+    lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]
 
 
@@ -154,7 +156,10 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     panels, force = [], []
     for large in (True, False):  # those that are flat beside the large ones by themselves
         same = [way for way in kept if (FLAT * way[2] > top) == large]
-        unit, scale = display_unit("m", max((peak for _, _, peak, _ in same), default=0.0))
+        most = max((peak for _, _, peak, _ in same), default=0.0)
+        unit, scale = display_unit("m", most)
+        window = [c.Level(sign * scale * first.window, "window" if sign > 0 else "")
+                  for sign in (1, -1) if most < FLAT * first.window]  # fmt: skip
         curves, bands = [], []
         for name, each, _, colour in same:
             error = scale * np.array([_over(time, e, _error(e)) for e in each])
@@ -164,7 +169,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
                 bands.append(c.Band(ms, error.min(axis=0), error.max(axis=0), "", colour))
         if curves:
             panels.append(c.Panel("time (ms)", f"error ({unit})", tuple(curves), tuple(bands),
-                                levels=(end,)))  # fmt: skip
+                                levels=(end, *window)))  # fmt: skip
             end = replace(end, text="")  # said once
     heights = (*[2.6] * len(panels), 2.2)
     panels.append(c.Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,), legend=None))
@@ -199,7 +204,7 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     when = "does not settle" if np.isinf(settled) else (
-        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "never out of its window"
+        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "stays within its window"
     )  # fmt: skip
     words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))

@@ -71,14 +71,15 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
     def hz(value: float | None) -> str:
         return "not known" if value is None else f"{number(value, 4)} Hz"
 
-    loop = "sampled" if sampled else "continuous"
+    loop, v = "sampled" if sampled else "continuous", problem.figure
+    least = "" if v.larger_is_better else f", of the least {v.words}"
     whole = f"{counted(result['certificate']['plants'], 'plant')} of the set"
     bound = hz(gap.get("bandwidth_bound_hz"))
     rows = [
         ("no controller of any order exceeds", gap.get("plants", "the model"), loop, bound),
         ("sections", "the model alone", loop, hz(costs["on_model_hz"])),
         *([("sections", whole, "continuous", hz(costs["continuous_hz"]))] if sampled else []),
-        ("sections: the design", whole, loop, hz(result["bandwidth_hz"])),
+        (f"sections: the design{least}", whole, loop, hz(result["bandwidth_hz"])),
     ]
     words = (
         "The first row is a certified bound under the same bounds on S, KS, T and GS. The others "
@@ -124,11 +125,11 @@ def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fac
          f"{robust['words']}; the worst plant that a search found is at "
          f"{100.0 + 100.0 * robust['worst_excess']:.6g} % of a bound; "
          f"{r['proof']['words']}"),
-        ("Optimality (KKT residual)", number(kkt, 2),
+        ("Optimality (KKT residual)", number(kkt, 3),
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
          "controller"),
         ("A multi-start search at this θ", optima or "–",
-         f"local optima (searches); {counted(r['rounds'], 'round')} of the outer problem"),
+         f"local optima of ω_b (searches); {counted(r['rounds'], 'round')} of the outer problem"),
         ("Cost", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]  # fmt: skip
 

@@ -59,10 +59,8 @@ def worst_state(result: Mapping[str, Any]) -> State:
 
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """`survives      warned   stable for ...`, wrapped under their words."""
-    found = []
-    for line in lines_of(result):
-        found.append(wrapped(f"{line.name:14s}{line.state:9s}{line.words}", columns(sys.stdout)))
-    return found
+    lines = [f"{line.name:14s}{line.state:9s}{line.words}" for line in lines_of(result)]
+    return [wrapped(line, columns(sys.stdout)) for line in lines]
 
 
 def head_of(

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.grid import resonant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -31,8 +32,7 @@ from ccd_casadi.support.arrays import Array
 
 KAPPA = (0.0, 10.0, 3.0, 1.0)  # a larger one asks for a finer grid
 SEEN = 1e-9  # share of the strongest residue under which a mode is in no loop
-LIGHT = 0.3  # damping ratio of the loop's poles around which the grid is dense
-FLANKS = np.linspace(-12.0, 12.0, 97)  # in their real parts
+FLANKS = np.linspace(-12.0, 12.0, 97)  # in real parts of the loop's resonances
 SAME = 1e-6  # relative
 ROUNDS, FINE = 8, 8  # refinements around the worst frequency, and points a side
 BISECTIONS = 25
@@ -65,8 +65,7 @@ def structured_bound(
     kept = np.flatnonzero(~modal.rigid & (residue > SEEN * residue.max()))
     if kept.size == 0:
         return None
-    poles = np.linalg.eigvals(closed_loop(plant.plant_si(), controller).A)
-    poles = poles[(poles.imag > 0.0) & (np.abs(poles.real) < LIGHT * np.abs(poles))]
+    poles = resonant(closed_loop(plant.plant_si(), controller).S.poles)
     around = np.abs(poles.imag + np.outer(FLANKS, poles.real)).ravel() / (2.0 * np.pi)
     new = np.unique(np.concatenate([hz, around]))
     new = new[np.diff(new, prepend=0.0) > SAME * new]  # twins would hide what lies beside them

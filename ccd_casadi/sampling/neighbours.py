@@ -97,6 +97,5 @@ def _nearest(
 
 def _away(problem: CoDesignProblem, thetas: Theta | Sequence[Theta], theta: Theta) -> Array:
     """How far θ lie from one, in shares of the box."""
-    return np.asarray(
-        np.abs(np.subtract(thetas, theta) / np.subtract(problem.upper, problem.lower)).max(-1)
-    )
+    width = np.subtract(problem.upper, problem.lower)
+    return np.asarray(np.abs(np.subtract(thetas, theta) / width).max(-1))

@@ -33,6 +33,7 @@ from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 
 LOCAL_POINTS = (7, 7)
 LOCAL_FACTOR = 1.25  # the small range reaches from ω/1.25 to 1.25 ω
+STATUS = {True: "verified", False: "not_verified"}
 AnyDesign = Any  # Sensitivities or SectionsDesign: what a baseline gives and takes back
 
 
@@ -52,16 +53,6 @@ class Answer:
     value: float
     slope: Array
     frequencies: tuple[float, float] = (np.nan, np.nan)
-
-
-@dataclass(frozen=True)
-class Figures:
-    """A design under the contract's keys, whether it keeps its bounds, and ω_b in rad/s."""
-
-    entries: dict[str, Any]
-    feasible: bool
-    bandwidth: float
-    active: list[str]
 
 
 class Baseline(ABC):
@@ -84,8 +75,8 @@ class Baseline(ABC):
         """The design of a sample of ω_b*(θ)."""
 
     @abstractmethod
-    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
-        """A design's figures."""
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> dict[str, Any]:
+        """A design under the contract's keys, with its status and what is active."""
 
     @abstractmethod
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
@@ -106,17 +97,16 @@ class MixedBaseline(Baseline):
             return None, spent
         figures = design.figures
         slope = design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
-        frequencies = (figures.omega_S, figures.omega_T)
-        omega = figures.bandwidth
-        return Answer(design, omega, omega, np.asarray(slope, float), frequencies), spent
+        omega, at = figures.bandwidth, (figures.omega_S, figures.omega_T)
+        return Answer(design, omega, omega, np.asarray(slope, float), at), spent
 
     def design_of(self, sample: InnerSample) -> Sensitivities:
         return true_design(self.problem, sample.theta, sample.omega_S, sample.omega_T)
 
-    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> dict[str, Any]:
         found, inner = design.figures, self.problem.inner
         active = list(active_constraints(inner, found))
-        return Figures(figures_dict(found), inner.feasible(found), found.bandwidth, active)
+        return figures_dict(found) | {"status": STATUS[inner.feasible(found)], "active": active}
 
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
         at = (design.figures.omega_S, design.figures.omega_T)
@@ -141,9 +131,9 @@ class StructuredBaseline(Baseline):
     def design_of(self, sample: InnerSample) -> SectionsDesign:
         return structured_value(self.problem, sample.theta).design
 
-    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> dict[str, Any]:
         entries = design_dict(self.problem, theta, design)
-        return Figures(entries, design.certified, design.bandwidth, active_of(design))
+        return entries | {"status": STATUS[design.certified], "active": active_of(design)}
 
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
         assert design.controller is not None

@@ -1,15 +1,16 @@
 """report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.analysis.loop_view import LoopView
+import numpy as np
+
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.drawing.content import Chapter, Figure, Head, Page, Source, Table, Verdict, Words
-from ccd_casadi.drawing.svg import axis_label
+from ccd_casadi.drawing import content as c
+from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
@@ -20,42 +21,41 @@ from ccd_casadi.reporting.verdict import lines_of, worst_state
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.conclusions import LABELS
-from ccd_casadi.studies.methods import cost_figure, theta_paths
-from ccd_casadi.support.units import number
+from ccd_casadi.support.units import HZ, number
 
 
-def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Page:
+def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> c.Page:
     """report.html of a comparison; reads the folder's samples."""
     problem, found = comparison.problem, answer["conclusions"]
     best = found["best"]
     chapters = [
-        Chapter("The methods", _methods(problem, answer)),
-        Chapter("What it shows", tuple(map(Words, found["sentences"]))),
-        Chapter("Cost", (cost_figure(comparison.methods),)),
+        c.Chapter("The methods", _methods(problem, answer)),
+        c.Chapter("What it shows", tuple(map(c.Words, found["sentences"]))),
+        c.Chapter("Cost", (cost_figure(comparison.methods),)),
     ]
     if len(problem.names) == 2:
-        paths = _paths(folder, comparison, best)
-        chapters.append(Chapter("Paths over the landscape", (paths,)))
+        chapters.append(c.Chapter("Paths over the landscape", (_paths(folder, comparison, best),)))
     if best is not None:
-        loops = _loops(comparison, best)
-        chapters.append(Chapter("Sensitivity, baseline against co-design", (loops,)))
+        chapters.append(
+            c.Chapter("Sensitivity, baseline and co-design", (_loops(comparison, best),))
+        )
         thetas = {
             name: comparison.method(name).figures.get("theta") for name in ("sequential", best)
         }
         stages = {LABELS[name]: tuple(theta.values()) for name, theta in thetas.items() if theta}
         chapters += stage_chapters(problem, stages)
     chapters += [
-        Chapter(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
+        c.Chapter(f"Verdict: {LABELS[method.name]}", (c.Verdict(lines_of(method.figures)),))
         for method in comparison.methods
         if lines_of(method.figures)
     ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
-    with_seed = Words(f"{versions}; seed {answer['seed']}.")
-    chapters.append(Chapter("The case", (with_seed, Source(case_to_toml(comparison.case)))))
+    with_seed = c.Words(f"{versions}; seed {answer['seed']}.")
+    chapters.append(c.Chapter("The case", (with_seed, c.Source(case_to_toml(comparison.case)))))
     ours = [method.figures for method in comparison.methods if method.solution]
     verified = all(figures["status"] == "verified" for figures in ours)
     warned = any(worst_state(figures) is not State.PASSED for figures in ours)
-    head = Head(
+    head = c.Head(
         f"Comparison: {comparison.case.path.name}",
         "bad" if not verified else "warn" if warned else "good",
         "verified" if verified else "not verified",
@@ -63,10 +63,10 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
         " ".join(found["sentences"][1:2]), decision=found["sentences"][0],
     )  # fmt: skip
-    return Page(head, tuple(chapters), index="")
+    return c.Page(head, tuple(chapters), index="")
 
 
-def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, Words]:
+def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[c.Table, c.Words]:
     """All methods in one table, the paper's figures below them."""
     factors = {name: factor for name, _, factor in theta_axes(problem)}
     names = [axis_label(name, unit) for name, unit, _ in theta_axes(problem)]
@@ -102,7 +102,7 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, W
             "with K held fixed and the landscape over the weights' frequencies, which sections "
             "do not have."
         )
-    return Table(head, tuple(rows)), Words(words)
+    return c.Table(head, tuple(rows)), c.Words(words)
 
 
 def _row(figures: Mapping[str, Any], factors: Mapping[str, float]) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ def _row(figures: Mapping[str, Any], factors: Mapping[str, float]) -> tuple[str,
     )
 
 
-def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
+def _paths(folder: Path, comparison: Comparison, best: str | None) -> c.Figure:
     """The landscape from the nested surrogate, the way of each iterative method over it."""
     problem, process = comparison.problem, None
     nested = comparison.method("nested").solution
@@ -126,7 +126,6 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
             problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, process, truths)
-    walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]
     optimum = None
     if best is not None:
         theta = comparison.method(best).figures["theta"]
@@ -135,28 +134,79 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
         "Colours: ω_b*(θ) predicted by the nested formulation's surrogate; dots: its true samples "
         "in the same colours."
     )
-    land = replace(land, paths=theta_paths(walked), optimum=optimum)
-    return Figure(land, caption)
+    return c.Figure(replace(land, paths=theta_paths(comparison.methods), optimum=optimum), caption)
 
 
-def _loops(comparison: Comparison, best: str) -> Figure:
+def _loops(comparison: Comparison, best: str) -> c.Figure:
     """σ_max(S) of the sequential baseline against the best co-design (the paper's figure 11)."""
     loops = [
-        _loop(comparison.problem, comparison.method(name))
-        for name in ("sequential", best)
-        if comparison.method(name).figures.get("objective") is not None
-    ]
+        design_view(
+            comparison.problem, tuple(method.figures["theta"].values()), method.controller,
+            bandwidth_hz=method.figures["bandwidth_hz"], label=LABELS[method.name],
+        )
+        for method in (comparison.method("sequential"), comparison.method(best))
+        if method.controller is not None
+    ]  # fmt: skip
     words = "; ".join(
         f"{loop.label}: ω_b = {loop.bandwidth_hz:.2f} Hz, ‖S‖∞ = {loop.sizes[0].max():.3f}"
         for loop in loops
     )
     caption = f"Largest singular values of the closed loop. {words}."
-    return Figure(figure_gains(loops, bounds=False), caption)
+    return c.Figure(figure_gains(loops, bounds=False), caption)
 
 
-def _loop(problem: CoDesignProblem, method: Method) -> LoopView:
-    figures = method.figures
-    theta = tuple(figures["theta"][name] for name in problem.names)
-    assert method.controller is not None
-    return design_view(problem, theta, method.controller, bandwidth_hz=figures["bandwidth_hz"],
-                       label=LABELS[method.name])  # fmt: skip
+def best_so_far(method: Method) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Syntheses spent, least J and its bandwidth (Hz) after each feasible design of a run."""
+    found, best = [], np.inf
+    for entry in method.trace:
+        if np.isfinite(entry.objective) and entry.objective < best:
+            best = entry.objective
+            found.append((entry.syntheses, best, entry.bandwidth / HZ))
+    if found:
+        spent_in_all = method.figures.get("syntheses", 0)  # what the last improvement took not
+        found.append((max(method.trace[-1].syntheses, spent_in_all), *found[-1][1:]))
+    spent, objective, bandwidth = np.array(found, float).reshape(-1, 3).T
+    return spent, objective, bandwidth
+
+
+def cost_figure(methods: Sequence[Method]) -> c.Figure:
+    """Least J and its bandwidth against true syntheses, every method on the same axes."""
+    curves_J, curves_b = [], []
+    for i, method in enumerate(methods):
+        spent, objective, bandwidth = best_so_far(method)
+        if not spent.size:
+            continue
+        label, colour = LABELS[method.name], CYCLE[i % len(CYCLE)]
+        marker = "o" if spent.size < 3 else ""
+        curves_J.append(c.Curve(*_steps(spent, objective), label, colour, marker=marker))
+        curves_b.append(c.Curve(*_steps(spent, bandwidth), "", colour, marker=marker))
+    x = "true syntheses spent (–)"
+    rows = (
+        (c.Panel(x, "least J so far (–)", tuple(curves_J), log_x=True),),
+        (c.Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True),),
+    )
+    lines = c.Lines(
+        rows, "Objective and bandwidth against the number of true syntheses", (3.6, 2.6)
+    )
+    return c.Figure(lines, "Further left is cheaper, lower is better.", (_cost_table(methods),))
+
+
+def _steps(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A staircase: a value holds until the next one is found."""
+    return np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]
+
+
+def _cost_table(methods: Sequence[Method]) -> c.Table:
+    """Every improvement of every method."""
+    rows = (
+        (LABELS[method.name], int(spent), float(objective), float(bandwidth))
+        for method in methods
+        for spent, objective, bandwidth in zip(*best_so_far(method), strict=True)
+    )
+    return c.Table(("method", "syntheses", "least J", "bandwidth (Hz)"), tuple(rows))
+
+
+def theta_paths(methods: Sequence[Method]) -> tuple[c.ThetaPath, ...]:
+    """The way over the two parameters of each method that is no formulation."""
+    walked = [method for method in methods if method.path and method.solution is None]
+    return tuple(c.ThetaPath(LABELS[method.name], np.array(method.path)) for method in walked)

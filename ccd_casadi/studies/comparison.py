@@ -26,7 +26,7 @@ from ccd_casadi.studies.published import PUBLISHED
 from ccd_casadi.studies.sequential import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.studies.steepest_descent import Descent, steepest_descent
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -45,7 +45,6 @@ class Method:
     path: tuple[tuple[float, ...], ...]
     trace: tuple[TraceEntry, ...]
     solution: Solution | None = None
-    descent: Descent | None = None
     controller: StateSpace | None = None
 
 
@@ -105,10 +104,8 @@ def compare(
     problem = _chosen(problem, methods)
     given = replace(given, problem=problem)
     descents = _descents(given)
-    for gradient in baseline_of(problem).gradients:
-        methods.append(_best_descent(problem, descents, gradient))
-    for name, starts in (("sequential", 0), ("sequential_global", 8)):
-        methods.append(_sequential(given, name, starts))
+    methods += [_best_descent(problem, descents, each) for each in baseline_of(problem).gradients]
+    methods += [_sequential(given, "sequential", 0), _sequential(given, "sequential_global", 8)]
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
 
 
@@ -148,24 +145,14 @@ def _descents(given: _Setting) -> list[Descent]:
     if base.starts > 1:
         spread = latin_hypercube(lower, upper, base.starts - 1, given.seed)
         starts += [tuple(float(v) for v in theta) for theta in spread]
-    tasks = [
-        (problem, start, gradient, step, base.max_iterations)
+    tasks = {
+        (gradient, start, step): (problem, start, gradient, step, base.max_iterations)
         for gradient in baseline_of(problem).gradients
         for start in starts
         for step in base.steps
-    ]
+    }
     bar = Progress(len(tasks), "steepest descent", quiet=given.quiet)
-    found = bar.over(given.workers.map_unordered(_descend, tasks))
-    return sorted(found, key=lambda d: (d.gradient, d.start, d.first_step))
-
-
-def _descend(task: tuple[CoDesignProblem, tuple[float, ...], Gradient, float, int]) -> Descent:
-    problem, start, gradient, step, iterations = task
-    began = perf_counter()
-    descent = steepest_descent(
-        problem, start, gradient=gradient, first_step=step, max_iterations=iterations
-    )
-    return replace(descent, seconds=perf_counter() - began)
+    return [run for _, run in sorted(bar.over(results(given.workers, steepest_descent, tasks)))]
 
 
 def _best_descent(
@@ -180,12 +167,11 @@ def _best_descent(
         "syntheses_of_all_runs": sum(run.syntheses for run in runs),
         "history": [asdict(iterate) for iterate in best.iterates],
     }
-    if best.design is None:
-        figures = {"status": "infeasible", "reason": best.stop.value}
-        figures |= spent_entry({"descent": best.syntheses})
-        return Method(name, json_values(figures | extra), (), (), descent=best)
-    theta = best.iterates[-1].theta
     spent = {"descent": best.syntheses}
+    if best.design is None:
+        figures = {"status": "infeasible", "reason": best.stop.value, **spent_entry(spent)}
+        return Method(name, json_values(figures | extra), (), ())
+    theta = best.iterates[-1].theta
     figures = _figures(problem, theta, best.design, spent, best.seconds) | extra
     trace = tuple(
         TraceEntry(item.syntheses, item.theta, item.bandwidth, item.objective)
@@ -193,7 +179,7 @@ def _best_descent(
     )
     path = tuple(item.theta for item in best.iterates)
     made = baseline_of(problem).controller(theta, best.design)
-    return Method(name, json_values(figures), path, trace, descent=best, controller=made)
+    return Method(name, json_values(figures), path, trace, controller=made)
 
 
 def _run_dict(descent: Descent) -> dict[str, Any]:
@@ -237,15 +223,12 @@ def _figures(
     seconds: float,
 ) -> dict[str, Any]:
     """The contract's keys for a design that no formulation made."""
-    cost = hardware_cost(plant_of(problem), theta)
     own = baseline_of(problem).figures(theta, design)
     return {
-        **own.entries,
-        "status": "verified" if own.feasible else "not_verified",
+        **own,
         "theta": dict(zip(problem.names, theta, strict=True)),
-        "hardware_cost": cost,
-        "objective": objective(problem, theta, own.bandwidth),
-        "active": own.active,
+        "hardware_cost": hardware_cost(plant_of(problem), theta),
+        "objective": objective(problem, theta, HZ * own["bandwidth_hz"]),
         "first_resonance_hz": _resonance(problem, theta),
         "surrogate_bandwidth_hz": None,
         "verification_error": None,
@@ -270,7 +253,7 @@ def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
         for run in comparison.descents
     ]
     published = PUBLISHED.get(problem.source.model or "", {})
-    answer = {
+    return json_values({
         "case": str(comparison.case.path),
         "methods": entries,
         "traces": {method.name: [asdict(entry) for entry in method.trace] for method in methods},
@@ -280,5 +263,4 @@ def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
         "seconds": comparison.seconds,
         "seed": seed,
         "versions": versions(),
-    }
-    return json_values(answer)
+    })  # fmt: skip

@@ -10,4 +10,3 @@ from typing import Any
 from ccd_casadi.support.package_text import package_text
 
 PUBLISHED: dict[str, dict[str, Any]] = json.loads(package_text("studies/published.json"))
-TWO_MASS = PUBLISHED["two_mass"]

@@ -20,7 +20,7 @@ from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
-from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.process_pool import Pool, results
 from surrogates import design
 
 ROUNDS, AGREED, KNOWN = 8, 1e-6, 3  # of a solve on what is known; relative in ω_1; θ that are known
@@ -64,21 +64,19 @@ def design_hardware(
     From the case's start and `starts` more: with none, the local solution next to the start,
     which need not be the least one (for the two masses it is the paper's equal-mass design).
     """
-    lower, upper = box(problem)
-    points = np.array([problem.start])
+    points = [problem.start]
     if starts > 0:
-        points = np.vstack([points, design("sobol", lower, upper, starts, seed)])
-    tasks = [(problem, resonance, tuple(float(v) for v in point)) for point in points]
-    pool: Pool = Workers(1) if workers is None else workers
-    found = sorted(pool.map_unordered(_from_start, tasks), key=lambda item: item.theta)
-    meeting = [item for item in found if item.met]
-    if meeting:
-        return min(meeting, key=lambda item: item.hardware_cost)
-    return max(found, key=lambda item: item.first_resonance)
+        points += map(tuple, design("sobol", *box(problem), starts, seed).tolist())
+    tasks = {start: (problem, resonance, start) for start in points}
+    found = [design for _, design in sorted(results(workers, _from_start, tasks))]
+    nearest = max(found, key=lambda item: item.first_resonance)
+    meeting = (item for item in found if item.met)
+    return min(meeting, key=lambda item: item.hardware_cost, default=nearest)
 
 
-def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> HardwareDesign:
-    problem, resonance, start = task
+def _from_start(
+    problem: CoDesignProblem, resonance: float, start: tuple[float, ...]
+) -> HardwareDesign:
     plant = plant_of(problem)
     known: tuple[tuple[float, ...], ...] = (start,)
     for _ in range(ROUNDS):

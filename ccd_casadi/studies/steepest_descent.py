@@ -23,13 +23,13 @@ and its envelope gradient the only one there is.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from time import perf_counter
 
 import numpy as np
 
 from ccd_casadi.inner_problem.objective import hardware_at, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.studies.baselines import Answer, AnyDesign, Gradient, baseline_of
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.studies.baselines import AnyDesign, Gradient, baseline_of
 
 
 class Stop(StrEnum):
@@ -70,7 +70,7 @@ class Descent:
     design: AnyDesign | None
     stop: Stop
     syntheses: int
-    seconds: float = 0.0
+    seconds: float
 
     @property
     def objective(self) -> float:
@@ -81,31 +81,21 @@ class Descent:
 def steepest_descent(
     problem: CoDesignProblem,
     start: Sequence[float],
-    *,
     gradient: Gradient = Gradient.FIXED,
     first_step: float = 0.05,
-    smallest_step: float = 1e-3,
     max_iterations: int = 100,
+    smallest_step: float = 1e-3,
 ) -> Descent:
     """Descend from `start`; steps are shares of the box of θ. Sections have a total gradient."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     width = upper - lower
-    spent = 0
-    baseline = baseline_of(problem)
-
-    def answered(theta: Array, around: tuple[float, float] | None) -> Answer | None:
-        nonlocal spent
-        found, used = baseline.answer(theta, gradient, around)
-        spent += used
-        return found
-
-    theta = np.array(start, float)
-    answer = answered(theta, None)
-    if answer is None:
-        return Descent(gradient, tuple(start), first_step, (), None, Stop.INFEASIBLE, spent)
-    step, history = first_step, []
-    stop = Stop.ITERATIONS
+    began, baseline, theta = perf_counter(), baseline_of(problem), np.array(start, float)
+    step, history, stop = first_step, list[DescentIterate](), Stop.ITERATIONS
+    answer, spent = baseline.answer(theta, gradient, None)
     for _ in range(max_iterations):
+        if answer is None:
+            stop = Stop.INFEASIBLE
+            break
         g = hardware_at(problem, theta).cost_gradient + problem.w2 * answer.slope * width
         J = objective(problem, theta, answer.value)
         places, slope = tuple(theta.tolist()), tuple(g.tolist())
@@ -121,16 +111,17 @@ def steepest_descent(
         if size <= 1e-9 * max(float(np.abs(g).max()), 1e-300):
             stop = Stop.STATIONARY
             break
-        accepted = None
         while step >= smallest_step:
             trial = np.clip(theta + step * direction / size * width, lower, upper)
-            found = answered(trial, answer.frequencies)
-            if found is not None and objective(problem, trial, found.value) < history[-1].objective:
-                accepted = trial, found
+            found, used = baseline.answer(trial, gradient, answer.frequencies)
+            spent += used
+            if found is not None and objective(problem, trial, found.value) < J:
+                theta, answer = trial, found
                 break
             step *= 0.5
-        if accepted is None:
+        else:
             stop = Stop.SMALL_STEP
             break
-        theta, answer = accepted
-    return Descent(gradient, tuple(start), first_step, tuple(history), answer.design, stop, spent)
+    design = None if answer is None else answer.design
+    seconds = perf_counter() - began
+    return Descent(gradient, tuple(start), first_step, tuple(history), design, stop, spent, seconds)

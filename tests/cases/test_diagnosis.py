@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from ccd_casadi.__main__ import main as ccd
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.diagnosis import diagnose
@@ -219,6 +220,29 @@ def test_a_stiffness_in_newton_per_micrometre_is_told(
     path = case_file(tmp_path, GOOD.replace("2e8 * chain", "200.0 * chain"))
     assert check([str(path)]) == 0
     assert "is the stiffness in another unit?" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "factor", "words"),
+    [
+        ("    stiffness = ", 1.0, ""),
+        ("    stiffness = ", 1e-3, "is the stiffness in another unit?"),  # N/mm
+        ("    stiffness = ", 1e-6, "is the stiffness in another unit?"),  # N/um
+        ('        "mass": ', 1e3, "and of mass and stiffness"),  # g
+    ],
+)
+def test_a_new_stage_in_another_unit_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, factor: float, words: str
+) -> None:
+    """What `ccd new` writes has none; its stiffness in N/mm or its masses in g have one."""
+    assert ccd(["new", str(tmp_path / "stage")]) == 0
+    plant = tmp_path / "stage" / "plant.py"
+    assert plant.read_text().count(line) == 1
+    plant.write_text(plant.read_text().replace(line, f"{line}{factor!r} * "))
+    assert check([str(tmp_path / "stage" / "case.toml"), "--quiet"]) == 0
+    found = [text for text in capsys.readouterr().out.splitlines() if text.startswith("warning")]
+    assert bool(found) == bool(words)
+    assert words in "".join(found)
 
 
 GRAMS = GOOD.replace("vertcat(m1, m2)", "vertcat(1e3 * m1, 1e3 * m2)")

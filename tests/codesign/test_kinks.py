@@ -71,15 +71,15 @@ def pieces(rng: np.random.Generator, n: int, count: int, bound: bool, bent: floa
 def test_pieces_lead_to_the_minimiser(seed: int, n: int, count: int, bound: bool) -> None:
     rng = np.random.default_rng(seed)
     of = pieces(rng, n, count, bound, 1.0)
-    asked = []
+    met = []
 
     def at(z: np.ndarray) -> Local:
         assert (of.constraints(z)[0] <= 0.0).all()
-        asked.append(z)
-        return of.at(z)
+        met.append(of.at(z))
+        return met[-1]
 
-    start = of.at(of.allowed(np.clip(of.minimiser + rng.normal(size=n) * 3e-3, 0.0, 1.0)))
-    end = descend(at, start, [], of.constraints, steps=30 * n, settled=1e-10)
+    start = at(of.allowed(np.clip(of.minimiser + rng.normal(size=n) * 3e-3, 0.0, 1.0)))
+    end = descend(at, start, lambda: met, of.constraints, steps=30 * n, settled=1e-10)
     assert end.value - J0 <= 1e-7 * abs(J0)  # 6.7e-9 at most on 1500 draws
     assert end.value <= start.value
 
@@ -92,9 +92,35 @@ def test_pieces_that_are_not_convex_lead_to_a_sharp_minimiser(seed: int, n: int)
     corners = np.vstack([np.eye(n), -np.ones(n)]) * rng.uniform(0.5, 2.0, (n + 1, 1))
     Q = rng.uniform(-2.0, 2.0, (n + 1, n, n))
     of = Pieces(np.full(n, 0.4), corners, Q + Q.transpose(0, 2, 1), np.zeros((0, n)))
-    start = of.at(of.minimiser + rng.uniform(-0.02, 0.02, n))
-    end = descend(of.at, start, [], of.constraints, steps=30 * n, settled=1e-10)
+    met = [of.at(of.minimiser + rng.uniform(-0.02, 0.02, n))]
+
+    def at(z: np.ndarray) -> Local:
+        met.append(of.at(z))
+        return met[-1]
+
+    end = descend(at, met[0], lambda: met, of.constraints, steps=30 * n, settled=1e-10)
     assert abs(end.value - J0) <= 1e-7 * abs(J0)  # 9.7e-9 at most on 1500 draws
+
+
+def test_what_is_known_better_by_now_does_not_hold_a_descent() -> None:
+    """The start belongs to a poor branch, which is known to be poor as soon as another is met."""
+    met = {0.55: Local(np.array([0.55]), 7.0, np.array([-10.0]))}
+
+    def smooth(z: float) -> Local:
+        return Local(np.array([z]), 5.0 + (z - 0.2) ** 2, np.array([2.0 * (z - 0.2)]))
+
+    def at(z: np.ndarray) -> Local:
+        met[float(z[0])] = smooth(float(z[0]))
+        met[0.55] = smooth(0.55)
+        return met[float(z[0])]
+
+    def free(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(0), np.zeros((0, 1))
+
+    end = descend(
+        at, met[0.55], lambda: list(met.values()), free, steps=12, settled=1e-9, first=0.1
+    )
+    assert end.z == pytest.approx([0.2], abs=1e-3)
 
 
 def envelope_of(slopes: np.ndarray, slack: float = 0.0) -> Envelope:

@@ -121,7 +121,12 @@ def test_a_failed_programme_is_no_optimum_on_kinks(failing, count: int) -> None:
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_failed_programme_is_no_optimum_in_a_bundle(failing, count: int) -> None:
     p = pieces(np.random.default_rng(0), 3, 3, bound=False, bent=0.3)
-    z = np.full(3, 0.35)
+    met = [p.at(np.full(3, 0.35))]
+
+    def at(z: np.ndarray) -> of_pieces.Local:
+        met.append(p.at(z))
+        return met[-1]
+
     failing(count)
-    best = of_pieces.descend(p.at, p.at(z), [], p.constraints, steps=80, settled=1e-12)
+    best = of_pieces.descend(at, met[0], lambda: met, p.constraints, steps=80, settled=1e-12)
     assert np.abs(best.z - p.minimiser).max() <= 1e-4

@@ -20,7 +20,7 @@ from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_s
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.explorer.known_plant import KnownPlant, frequency_error
-from ccd_casadi.explorer.landscape import landscape_of
+from ccd_casadi.explorer.landscape import landscape_of, steepest_axes
 from ccd_casadi.explorer.panels import FIGURES, drawn
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import machine_html, move_words, standing_html, survival_words
@@ -261,6 +261,20 @@ def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searc
     assert np.isnan(known.get(live.theta, np.nan))  # one synthesis is no ω_b*(θ)
     drawn, _ = landscape_of(problem, searched_look.theta, None, None, session.store.path, (0, 1))
     assert searched_look.theta in {(x, y) for x, y, _ in drawn.truths.tolist()}
+
+
+@pytest.mark.parametrize("steep", [(0, 1), (1, 3), (2, 4)])
+def test_the_map_opens_over_the_two_parameters_that_matter(steep):
+    rng = np.random.default_rng(0)
+    lower, width = rng.uniform(-1.0, 1.0, 5), 10.0 ** rng.uniform(-3.0, 2.0, 5)
+    slopes = np.where(np.isin(np.arange(5), steep), (8.0, -8.0, 8.0, -8.0, 8.0), 2.0)
+    places = rng.uniform(size=(40, 5))
+    hz = 70.0 + places @ slopes + rng.normal(size=40)
+    hz[::9] = np.nan  # infeasible
+    known = {tuple(lower + width * x): value for x, value in zip(places, hz, strict=True)}
+    assert steepest_axes(known, lower, lower + width) == steep
+    assert steepest_axes({}, lower, lower + width) == (0, 1)
+    assert steepest_axes({}, lower[:1], lower[:1] + 1.0) == (0,)
 
 
 def test_a_saved_case_is_the_one_on_the_sliders(session):

@@ -19,7 +19,7 @@ from fixed_structure_loops import (
 
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
-from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
+from ccd_casadi.fixed_structure.certificate_curves import grid_through
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import (
     assess,
@@ -282,7 +282,7 @@ def test_plants_that_cannot_be_in_a_set_are_refused() -> None:
 def test_grid_points_that_rounding_parts_count_as_one() -> None:
     """Two of them at a peak left the judge a bracket without it."""
     pair = np.array([-1.0 + 100.0j, (-1.0 + 100.0j) * (1.0 + 1e-13)])
-    grid = frequency_grid([pair], None, 1.0, 100.0, 0.0)
+    grid = grid_through([pair], None, 1.0, 100.0, 0.0)
     assert (np.diff(grid) > 1e-10 * grid[1:]).all()
     assert np.abs(grid - 100.0).min() < 1e-9
 

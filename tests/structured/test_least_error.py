@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from fixed_structure_loops import BOUNDS, FAST, loop, plant
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.fixed_structure import Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure import Structure, certify, local_search, synthesise_sections
+from ccd_casadi.fixed_structure import least_value as module
 from ccd_casadi.fixed_structure.least_value import RmsError, least_value
 from ccd_casadi.support.units import HZ
 
@@ -59,6 +61,34 @@ def test_the_least_error_keeps_bounds_and_bandwidth_and_is_stationary() -> None:
     # What may be slower need not err more.
     slower = least_value(plants, KEPT, first, goal, sampling=FAST, least_bandwidth=0.9 * floor)
     assert slower.value <= found.value * (1.0 + 1e-4)
+
+
+def test_a_search_at_the_end_climbs_from_its_design_beside_the_warm_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plants = [plant(0.01)]
+    problem, kappa = loop(3, PID, FAST)
+    initial = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
+    first = synthesise_sections(plants, PID, KEPT, sampling=FAST, initial=[initial],
+                                only_initial=True)  # fmt: skip
+    goal, begun = RmsError(tuple(plants), PID, BUDGET, FAST), []
+
+    def descend(model: Any, start: Any, *others: Any) -> Any:
+        begun.append(start.x[:-1])
+        return local_search.descend(model, start, *others)
+
+    monkeypatch.setattr(module, "descend", descend)
+    known = least_value(plants, KEPT, first, goal, sampling=FAST).design.kappa
+    begun.clear()
+    alone, both = (
+        least_value(plants, KEPT, first, goal, sampling=FAST, initial=[known], only_initial=only)
+        for only in (True, False)
+    )
+    warm, *more = (PID.in_units(x, problem.plants.omega_0, problem.plants.force) for x in begun)
+    assert warm == pytest.approx(known)
+    assert more[0] == pytest.approx(known)
+    assert more[1:] == [pytest.approx(first.kappa)]
+    assert both.value <= alone.value
 
 
 @pytest.mark.parametrize(

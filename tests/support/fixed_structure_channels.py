@@ -156,8 +156,7 @@ def closed(
     patch: pytest.MonkeyPatch, slope: Callable[[float], float], brackets: Brackets
 ) -> tuple[Array, np.ndarray]:
     """The kernel's false position, interpreted, on curves of this slope to ln v."""
-    patch.setattr(loop_rows, "room", lambda loop: None)
-    patch.setattr(loop_rows, "slope_at", lambda row, v, *loop: slope(v))
+    patch.setattr(loop_rows, "rows", lambda *places: (None, np.vectorize(slope)(places[3])))
     run = getattr(loop_rows.close, "py_func", loop_rows.close)
     ends = (brackets.start, brackets.low, brackets.high)
     return run(brackets.curve, brackets.row, brackets.row, *ends, None, (FLAT, NARROW, CLOSINGS))
