@@ -109,7 +109,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="sections: start one search from the controller of this run, not many",
     )
     add_break_frequencies(arguments, "of a weight; with both: one synthesis, no search")
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
+    ahead = "ccd_casadi.inner_problem.structured_search"
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"], ahead=ahead)
 
 
 if __name__ == "__main__":

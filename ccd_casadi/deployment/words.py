@@ -109,6 +109,6 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
         allowed = 100.0 * found.target.excess
         parts.append(
             f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; "
-            f"{allowed:.2g} % are allowed to a deployment"
+            f"{allowed:.2g} % is allowed for a deployment"
         )
     return "; ".join(parts)

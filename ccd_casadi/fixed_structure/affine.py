@@ -8,8 +8,13 @@ discs for the remainders.) Every operation widens `rest` by `ROUND` times the si
 on, several times what double precision loses there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from operator import add, mul, neg
+from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from ccd_casadi.support.arrays import Array
@@ -82,10 +87,20 @@ class Affine:
         if len(self.slope) != len(other.slope):
             raise ValueError(f"{len(self.slope)} and {len(other.slope)} variables: use `of`")
 
-    def of(self, variables: int) -> "Affine":
-        """The same of more variables, of which the first are its own."""
-        more = np.zeros((variables - len(self.slope), self.slope.shape[1]), self.slope.dtype)
-        return Affine(self.centre, np.concatenate([self.slope, more]), self.rest)
+    def of(self, variables: int, first: int = 0) -> "Affine":
+        """The same of more variables, of which those from `first` on are its own."""
+        slope = np.zeros((variables, *self.slope.shape[1:]), self.slope.dtype)
+        slope[first : first + len(self.slope)] = self.slope
+        return Affine(self.centre, slope, self.rest)
+
+
+def product(how: str, f: Affine, g: Affine) -> Affine:
+    """Sums of products of two arrays of forms, as `einsum` takes them."""
+    of = partial(np.einsum, how)
+    slope = [of(a, g.centre) + of(f.centre, b) for a, b in zip(f.slope, g.slope, strict=True)]
+    rest = of(f.reach, g.reach) + of(f.rest, g.size) + of(np.abs(f.centre) + f.reach, g.rest)
+    rest += ROUND * g.centre.shape[1] * of(f.size, g.size)
+    return Affine(of(f.centre, g.centre), np.array(slope), rest)
 
 
 def variable(low: Array, high: Array, index: int, variables: int) -> Affine:
@@ -133,3 +148,48 @@ def root(f: Affine) -> Affine:
         slope = 0.5 * f.slope / value
     return Affine(np.where(good, value, 1.0), np.where(good, slope, 0.0),
                   np.where(good, rest, np.inf))  # fmt: skip
+
+
+def sine(f: Affine) -> Affine:
+    """Of a real form."""
+    turned = exponential(f * 1j)
+    return Affine(turned.centre.imag, turned.slope.imag, turned.rest)
+
+
+OPERATIONS: dict[int, Callable[..., Any]] = {
+    ca.OP_ADD: add,
+    ca.OP_SUB: lambda f, g: f + -g,
+    ca.OP_MUL: mul,
+    ca.OP_DIV: lambda f, g: f * (inverse(g) if isinstance(g, Affine) else 1.0 / g),
+    ca.OP_NEG: neg,
+    ca.OP_TWICE: lambda f: f * 2.0,
+    ca.OP_SQ: lambda f: f * f,
+    ca.OP_INV: inverse,
+    ca.OP_SQRT: root,
+    ca.OP_EXP: exponential,
+    ca.OP_SIN: sine,
+    ca.OP_COS: lambda f: sine(f + 0.5 * np.pi),
+}
+
+
+def outputs(graph: ca.Function, x: list[Affine]) -> list[Affine]:
+    """The dense outputs (N, rows, columns) of a graph of scalars at x (N,), the entries of its
+    input, operation by operation; nan where one is not of `OPERATIONS`."""
+    work: dict[int, Any] = {}
+    shapes = [(len(x[0].rest), *graph.size_out(i)) for i in range(graph.n_out())]
+    found = [Affine(np.zeros(s), np.zeros((len(x), *s)), np.zeros(s)) for s in shapes]
+    for k in range(graph.n_instructions()):
+        kind, (to, *place) = graph.instruction_id(k), graph.instruction_output(k)
+        if kind == ca.OP_INPUT:
+            work[to] = x[graph.instruction_input(k)[1]]
+        elif kind == ca.OP_CONST:
+            work[to] = graph.instruction_constant(k)
+        elif kind == ca.OP_OUTPUT:
+            value = work[graph.instruction_input(k)[0]]
+            column, row = divmod(place[0], shapes[to][1])
+            for part, default in (("centre", value), ("slope", 0.0), ("rest", 0.0)):
+                getattr(found[to], part)[..., row, column] = getattr(value, part, default)
+        else:
+            values = (work[i] for i in graph.instruction_input(k))
+            work[to] = OPERATIONS.get(kind, lambda *_: np.nan)(*values)
+    return found

@@ -40,7 +40,7 @@ class ProofOutcome(StrEnum):
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has several outputs and not as many channels"
     NOT_MODAL = "a given damping matrix couples the modes"
-    VARIES = "a theta that varies moves the modes, so its range was searched"
+    VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,6 @@ def prove(
     outputs, inputs = structure.directions
     if len(uncertain.options[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
         return Proof(ProofOutcome.NOT_SQUARE, slack, names)
-    if uncertain.ranges:
-        return Proof(ProofOutcome.VARIES, slack, names)
     models = [uncertain.plant(uncertain.nominal, i).plant_si()
               for i in range(len(uncertain.options))]  # fmt: skip
     K = structure.state_space(kappa)
@@ -138,7 +136,8 @@ def prove(
     for option in range(len(models)):
         plant = modal_sum(uncertain, option, unit)
         if plant is None:
-            return Proof(ProofOutcome.NOT_MODAL, slack, names)
+            why = ProofOutcome.VARIES if uncertain.ranges else ProofOutcome.NOT_MODAL
+            return Proof(why, slack, names)
         families.append(LoopFamily(
             plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay
         ))  # fmt: skip

@@ -146,8 +146,9 @@ def hessians(
     out[:, k:-1, k:-1] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
     v = (rows.v * np.exp([[0.0], [STEP], [-STEP]])).ravel()
     found = evaluate_rows(problem, kappa, tau, np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
-    (slope, *slopes), (own, *to_kappa) = (np.split(part, 3) for part in found[1:3])
-    c_xx, c_xk = ((up - down) / (2.0 * STEP) for up, down in (slopes, to_kappa))
+    slopes, to_kappa = found[1].reshape(3, m), found[2].reshape(3, m, n)
+    slope, own = slopes[0], to_kappa[0]
+    c_xx, c_xk = ((part[1] - part[2]) / (2.0 * STEP) for part in (slopes, to_kappa))
     end = rows.curve == LoopCurve.CROSSING
     fixed = end | (rows.curve == LoopCurve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))

@@ -120,11 +120,7 @@ def all_rows(problem: LoopProblem, kappa: Array, tau: float, found: Assessment) 
     """The peaks, and after them the values near."""
     assert found.peaks is not None
     assert found.near is not None
-    parts = (found.peaks, constraints(problem, kappa, tau, *found.near))
-    return Constraints(*(
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("curve", "plant", "v", "value", "to_kappa", "to_tau")
-    ))  # fmt: skip
+    return found.peaks.and_those(constraints(problem, kappa, tau, *found.near))
 
 
 def ascend(

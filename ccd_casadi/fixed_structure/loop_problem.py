@@ -13,7 +13,7 @@ rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u a
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -200,8 +200,21 @@ class Problem(LoopProblem):
     structure: Structure
 
 
+class Columns:
+    """Arrays with a row of each for one thing."""
+
+    def only(self, chosen: np.ndarray | slice) -> Self:
+        """Some rows, by mask, index or slice."""
+        return type(self)(*(part[chosen] for part in vars(self).values()))
+
+    def and_those(self, *others: Self) -> Self:
+        """These and others."""
+        parts = zip(*(vars(one).values() for one in (self, *others)), strict=True)
+        return type(self)(*map(np.concatenate, parts))
+
+
 @dataclass(frozen=True)
-class Constraints:
+class Constraints(Columns):
     """M constraints c <= 0: curve, plant, v (over ω₀), value, derivatives to κ (M, n) and τ."""
 
     curve: np.ndarray
@@ -210,11 +223,6 @@ class Constraints:
     value: Array
     to_kappa: Array
     to_tau: Array
-
-    def only(self, chosen: np.ndarray | slice) -> "Constraints":
-        """Some of them, by mask, index or slice."""
-        parts = (self.curve, self.plant, self.v, self.value, self.to_kappa, self.to_tau)
-        return Constraints(*(part[chosen] for part in parts))
 
 
 class Places(NamedTuple):

@@ -6,6 +6,7 @@ With hold and delay D = 1 - e^{(p-s)T}, N the answer of the pole to them. (Discs
 Nyquist plane: Delissen, van Keulen and Langelaar 2023.)
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from ccd_casadi.fixed_structure.boxes import Axis, Pair
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
 
+FIRST = 1e30  # share of what is divided before anything else: where modes are not enclosed
 TURNS = np.exp(1j * np.pi * np.arange(-2, 3) / 4)  # half planes that 1/D is looked for in
 
 
@@ -39,43 +41,60 @@ def discs_of(
         Discs(np.zeros(count[::2], complex), np.zeros(count[::2]), np.zeros(count))
         for _ in range(2)
     )
-    damped = np.ones(count[2], bool)
+    moved: Sequence[Sequence[Affine | None]] = [(None, None)] * count[0]
+    q, known = sum(name.startswith("theta.") for name in names), np.ones(count[2], bool)
+    if plant.moving is not None:
+        moved, known = plant.moving(low[-q:], high[-q:])
+    damped = known
     for i in range(count[0]):
         own = [k for k, name in enumerate(names)
                if name == plant.shift_of(i) or not name.startswith("mode_shift")]  # fmt: skip
-        poles, calm = plant.poles(i, tuple(names[k] for k in own), low[own], high[own])
-        damped &= calm
         rows = [0, *(1 + k for k in own)]
-        _fill(held, i, rows, *(axis.factor(p, residue) for p, residue in poles))
+        w, strength = (f and f.of(len(rows), len(rows) - q) for f in moved[i])
+        poles, decay = plant.poles(i, tuple(names[k] for k in own), low[own], high[own], w)
+        damped = damped & (decay >= 0.0)
+        T = axis.period  # of Re D, what it is not below
+        least = decay * axis.x.lowest if T is None else -np.expm1(-decay * T)
+        _fill(held, i, rows, [axis.factor(*pole) for pole in poles], least, strength)
         if free:
             s = axis.s.of(len(rows))
-            _fill(bare, i, rows, *((s - p, residue) for p, residue in poles))
+            _fill(bare, i, rows, [(s - p, residue) for p, residue in poles], decay, strength)
+    if q:
+        held.shares[:, -q:] = np.where(known, held.shares[:, -q:], FIRST * (high - low)[-q:])
     return held, bare if free else held, damped
 
 
-def _fill(discs: Discs, i: int, rows: list[int], first: Pair, second: Pair) -> None:
+def _fill(
+    discs: Discs, i: int, rows: list[int], poles: list[Pair], least: Array, strength: Affine | None
+) -> None:
     """Mode i's disc: of both poles as one form, since far above a resonance they nearly cancel, or
-    a disc of each."""
-    (D, N), (E, M) = first, second
+    a disc of each; times its strength, which may pass through 0."""
+    (D, N), (E, M) = poles
     whole = N * inverse(D) + M * inverse(E)
-    one, two = quotient(N, D), quotient(M, E)
-    radius, apart = whole.reach + whole.rest, one[1] + two[1]
-    near = ~(radius <= apart)
-    discs.middle[i] = np.where(near, one[0] + two[0], whole.centre)
+    one, two = quotient(N, D, least), quotient(M, E, least)
+    middle, apart = one[0] + two[0], one[1] + two[1]
+    moves = one[2] + two[2]
+    if strength is not None:
+        whole, size, most = whole * strength, np.abs(strength.centre), np.abs(middle) + apart
+        apart = size * apart + (strength.reach + strength.rest) * most
+        middle, moves = strength.centre * middle, size * moves + np.abs(strength.slope) * most
+    radius = whole.reach + whole.rest
+    near = ~(radius <= apart) | np.isinf(radius)
+    discs.middle[i] = np.where(near, middle, whole.centre)
     discs.radius[i] = np.where(near, apart, radius) * (1.0 + 1e-12)
-    moves = np.abs(one[0]) * one[2] + np.abs(two[0]) * two[2]
     discs.shares[i, rows] = np.where(near, moves, np.abs(whole.slope))
 
 
-def quotient(N: Affine, D: Affine) -> tuple[np.ndarray, Array, Array]:
-    """Centre and radius of a disc around N/D, and how each variable moves it (n, N), relative.
+def quotient(N: Affine, D: Affine, least: Array | float = 0.0) -> tuple[np.ndarray, Array, Array]:
+    """Centre and radius of a disc around N/D, and how each variable moves it (n, N); Re D >= least.
 
     1/D lies in that of 1/D as a form, or where Re e^{-jθ}D >= d in the disc of diameter 1/d that
-    touches 0; N then turns and scales the latter, which keeps 0 on its edge.
+    touches 0; N then turns and scales the latter, which keeps 0 on its edge. Around 0, |N|/d holds.
     """
     form = inverse(D)
     turned = TURNS.conj()[:, None] * D.centre
     d = turned.real - np.abs((TURNS.conj()[:, None, None] * D.slope).real).sum(1) - D.rest
+    d[len(TURNS) // 2] = np.maximum(d[len(TURNS) // 2], least)
     best = np.argmax(d, axis=0)
     d = d[best, np.arange(len(best))]
     half = np.where(d > 0.0, 0.5 / np.where(d > 0.0, d, 1.0), np.inf) * (1.0 + 1e-15)
@@ -91,4 +110,8 @@ def quotient(N: Affine, D: Affine) -> tuple[np.ndarray, Array, Array]:
     chosen = ~(outer <= touching)
     edge = N.centre * TURNS[best].conj() * half * grown
     moves = np.abs(D.slope) / np.where(chosen, d, np.abs(D.centre)) + np.abs(along)
-    return np.where(chosen, edge, N.centre * centre), np.where(chosen, touching, outer), moves
+    middle, radius = np.where(chosen, edge, N.centre * centre), np.where(chosen, touching, outer)
+    plain = 2.0 * N.size * half
+    middle, radius = np.where(plain < radius, 0.0, middle), np.fmin(plain, radius)
+    # where nothing is bounded the relative ones say what to divide
+    return middle, radius, moves * np.where(np.isinf(radius), 1.0, np.abs(middle) + radius)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.loop_problem import LoopProblem, flanked
+from ccd_casadi.fixed_structure.loop_problem import Columns, LoopProblem, flanked
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.loop_rows import close, levels
 from ccd_casadi.support.arrays import Array
@@ -28,7 +28,7 @@ FINER = 12
 
 
 @dataclass(frozen=True)
-class Brackets:
+class Brackets(Columns):
     """Local maxima: curve, row, where on a grid, and the neighbours there."""
 
     curve: np.ndarray
@@ -36,15 +36,6 @@ class Brackets:
     start: Array
     low: Array
     high: Array
-
-    def only(self, chosen: np.ndarray) -> "Brackets":
-        """Some of them, by mask or index."""
-        return Brackets(*(part[chosen] for part in vars(self).values()))
-
-    def and_those(self, *others: "Brackets") -> "Brackets":
-        """These and others."""
-        parts = zip(*(vars(one).values() for one in (self, *others)), strict=True)
-        return Brackets(*(np.concatenate(part) for part in parts))
 
 
 def frequency_grid(

@@ -11,11 +11,14 @@ For a proof it is a sum of modes, poles and residues as affine forms of what is 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
+import casadi as ca
 import numpy as np
 
 from ccd_casadi.fixed_structure.affine import Affine, inverse, root, variable
+from ccd_casadi.fixed_structure.boxes import Pair
+from ccd_casadi.fixed_structure.moving_modes import moving_modes
 from ccd_casadi.plants.modal import ModalPlant, Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
@@ -32,7 +35,8 @@ class UncertainPlant:
     `options`: the same plant with other loads or positions, by their matrices; the model first.
     `damping` are the least and the largest factor. M_K in N/m scales all of them alike. `ranges`
     are parameters of the model itself, least, the model's, largest; `along` gives an option at
-    their values, with derivatives to θ and, last, to these.
+    their values, with derivatives to θ and, last, to these; `graph` its matrices as expressions of
+    these, where there are any.
     """
 
     options: tuple[Mechanics, ...]
@@ -44,6 +48,7 @@ class UncertainPlant:
     gain: float = 0.0
     ranges: tuple[tuple[str, float, float, float], ...] = ()
     along: Callable[[int, Array], Mechanics] | None = None
+    graph: Callable[[int], ca.Function | None] = lambda option: None
 
     @cached_property
     def modes(self) -> int:
@@ -170,7 +175,8 @@ class ModalSum:
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
     `rigid` ones have their suspension's instead, and stand first; the others are in the order of
-    their numbers. `drive` (n, m), `reading` (n, p) are b_i and c_i.
+    their numbers. `drive` (n, m), `reading` (n, p) are b_i and c_i. `moving` has ω and b_i c_i
+    over boxes of the parameters that modes move with, the last ones; see `moving_modes`.
     """
 
     omega: Array
@@ -180,19 +186,22 @@ class ModalSum:
     zeta: float
     drive: Array
     reading: Array
+    moving: Callable[[Array, Array], tuple[list[list[Affine]], np.ndarray]] | None = None
 
     def shift_of(self, i: int) -> str:
         """The parameter that shifts mode i alone; none shifts a rigid one."""
         return "" if self.rigid[i] else f"mode_shift {int((~self.rigid[: i + 1]).sum())}"
 
     def poles(
-        self, i: int, names: tuple[str, ...], low: Array, high: Array
-    ) -> tuple[list[tuple[Affine, Affine]], np.ndarray]:
+        self, i: int, names: tuple[str, ...], low: Array, high: Array, moved: Affine | None = None
+    ) -> tuple[list[Pair], Array]:
         """(p, residue) of mode i's two poles over boxes (n_p, N) of the parameters `names`, of unit
-        strength; where it stays damped. Variable 0 of the forms is left to the frequency.
+        strength; not above the rate (N,) at which they decay, 0 where none is known and below it
+        where they may not. Variable 0 of the forms is left to the frequency; `moved` is its ω.
         """
         n, m = len(low) + 1, low.shape[1]
         one = Affine(np.ones(m), np.zeros((n, m)), np.zeros(m))
+        w = one * self.omega[i] if moved is None else moved
         values = {name: variable(low[k], high[k], k + 1, n) for k, name in enumerate(names)}
         factor = values.get("damping", one)
         if self.rigid[i]:
@@ -200,7 +209,6 @@ class ModalSum:
             k, g = one * w_r**2, one * (2.0 * ratio * w_r) + factor * self.given[i]
             damped = _least(g) > 0.0
         else:
-            w = one * self.omega[i]
             for name in ("resonance_shift", self.shift_of(i)):
                 w = w * (values[name] + 1.0) if name in values else w
             own = w * (2.0 * self.zeta) + self.given[i]
@@ -212,11 +220,14 @@ class ModalSum:
         swing = root(under * np.where(light, 1.0, -1.0)) * np.where(light, 1j, 1.0)
         gain = values["gain"] + 1.0 if "gain" in values else one
         residue = gain * inverse(swing * 2.0)
-        return [(swing - half, residue), (-swing - half, -residue)], damped
+        known = np.where(light & np.isfinite(swing.rest), _least(half), 0.0) * (1.0 - 1e-12)
+        poles = [(swing - half, residue), (-swing - half, -residue)]
+        return poles, np.where(damped, known, -1.0)
 
 
 def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum | None:
-    """None where a given damping matrix couples the modes."""
+    """None where a given damping matrix couples the modes. Modes that move need a graph, a damping
+    ratio, one force, one sensor, and to be apart at the model."""
     system = uncertain.options[option]
     modal = modal_plant(system, uncertain.suspension)
     zeta = float(system.damping_ratio or 0.0)
@@ -230,11 +241,20 @@ def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum |
     diagonal = np.diag(given)
     diagonal = np.where(np.abs(diagonal) > UNCOUPLED * size, diagonal, 0.0)
     order = np.append(np.flatnonzero(modal.rigid), modal.numbered)
-    return ModalSum(
+    found = ModalSum(
         modal.natural[order] / unit, modal.rigid[order],
         (w_r / unit, uncertain.suspension.damping_ratio), diagonal[order] / unit, zeta,
         modal.B[order] / unit**2, modal.C.T[order],
     )  # fmt: skip
+    if not uncertain.ranges:
+        return found
+    graph, one = uncertain.graph(option), np.ones((len(order), 1))
+    if graph is None or not zeta or not found.drive.shape == found.reading.shape == one.shape:
+        return None
+    moving = partial(moving_modes, graph, int(modal.rigid.sum()), w_r, unit)
+    model = uncertain.nominal[-len(uncertain.ranges) :, None]
+    known = moving(model, model)[1].all()
+    return replace(found, drive=one, reading=one, moving=moving) if known else None
 
 
 def _least(f: Affine) -> Array:

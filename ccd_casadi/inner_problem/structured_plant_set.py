@@ -5,6 +5,7 @@ the warm starts as starts there.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, Structure
@@ -23,7 +24,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
-from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, nearby_model
+from ccd_casadi.plants.plant import Evaluate, FromExpressions, Mechanics, mechanics, nearby_model
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -127,10 +128,16 @@ def uncertain_plant(
     def along(option: int, values: Array) -> Mechanics:
         return mechanics(wider[option], (*theta, *values.tolist()))
 
+    def graph(option: int) -> ca.Function | None:
+        evaluate, x = wider[option].evaluate, ca.SX.sym("x", len(u.ranges))
+        if not isinstance(evaluate, FromExpressions):
+            return None
+        return ca.Function("graph", [x], evaluate.matrices.call([ca.vertcat(*theta, x)])[:5])
+
     return UncertainPlant(
         tuple(known) or tuple(mechanics(plant_of(option), theta) for option in options),
         problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
-        tuple((name, low, held[name], high) for name, low, high in u.ranges), along,
+        tuple((name, low, held[name], high) for name, low, high in u.ranges), along, graph,
     )  # fmt: skip
 
 

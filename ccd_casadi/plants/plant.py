@@ -8,7 +8,7 @@ options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one o
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -170,7 +170,7 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     return Plant(
         names=tuple(names),
         constraint_names=tuple(constraints),
-        evaluate=partial(_from_casadi, matrices, damping_ratio),
+        evaluate=FromExpressions(matrices, damping_ratio),
         hardware=ca.Function("hardware", [theta], [result["hardware_cost"], lam]),
         outputs=C.shape[0],
         inputs=B.shape[1],
@@ -277,16 +277,21 @@ def _require_finite(plant: Plant, system: Mechanics, place: str) -> None:
         raise PlantError(f"the plant is not finite {place}: {entry}; {remedy}")
 
 
-def _from_casadi(
-    matrices: ca.Function, damping_ratio: float | None, theta: Sequence[float]
-) -> Mechanics:
-    values = [np.array(value) for value in matrices(np.asarray(theta, float))]
-    M, D, K, B, C = values[:5]
-    slopes = tuple(
-        value.reshape(matrix.shape[1], matrix.shape[0], len(theta)).transpose(2, 1, 0).copy()
-        for matrix, value in zip(values[:5], values[5:], strict=True)
-    )
-    return Mechanics(M, D, K, B, C, damping_ratio, slopes)  # type: ignore[arg-type]
+@dataclass(frozen=True)
+class FromExpressions:
+    """θ -> Mechanics; `matrices`: θ to M, D, K, B, C and their Jacobians, a graph of scalars."""
+
+    matrices: ca.Function
+    damping_ratio: float | None
+
+    def __call__(self, theta: Sequence[float]) -> Mechanics:
+        values = [np.array(value) for value in self.matrices(np.asarray(theta, float))]
+        M, D, K, B, C = values[:5]
+        slopes = tuple(
+            value.reshape(matrix.shape[1], matrix.shape[0], len(theta)).transpose(2, 1, 0).copy()
+            for matrix, value in zip(values[:5], values[5:], strict=True)
+        )
+        return Mechanics(M, D, K, B, C, self.damping_ratio, slopes)  # type: ignore[arg-type]
 
 
 def hardware_cost(plant: Plant, theta: Sequence[float] | Array) -> float:

@@ -37,7 +37,7 @@ def glance(
     words = (
         f"The machine at this design{on}. S stays out of the shaded area: its peak, "
         f"{number(peak, 4)}, is {100.0 * peak / S_max:.4g} % of S_max, so that "
-        f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
+        f"{'L' if view.scalar else 'every eigenvalue of L'} stays at least {number(1.0 / peak, 3)} "
         f"from -1 in the Nyquist plot.{margin_words(view)} {move.caption}"
     )
     if isinstance(rows[0][0], Table):

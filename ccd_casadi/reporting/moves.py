@@ -204,7 +204,7 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     when = "does not settle" if np.isinf(settled) else (
-        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "never out of its window"
+        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "stays within its window"
     )  # fmt: skip
     words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))

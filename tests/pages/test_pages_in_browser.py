@@ -14,7 +14,7 @@ from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.insight import main as insight
 from ccd_casadi.robustness import main as robustness
 
-WIDTHS, SCHEMES = (1300, 390), ("light", "dark")
+WIDTHS, SCHEMES = (1300, 800, 390), ("light", "dark")
 HEAVIEST = 1.5e6  # bytes of a page
 # Numbers that are broken over two lines: of a text node's own boxes there is more than one height.
 SPLIT = r"""() => {
@@ -28,6 +28,27 @@ SPLIT = r"""() => {
       if (new Set([...range.getClientRects()].map(box => Math.round(box.top))).size > 1)
         found.push(m[0])
     }
+  }
+  return found
+}"""
+# Words of a figure outside of it, or two on each other (boxes of 9 px letters have some air).
+LABELS = r"""() => {
+  const found = []
+  for (const svg of document.querySelectorAll("svg[role=img]")) {
+    if (!svg.checkVisibility()) continue
+    const frame = svg.getBoundingClientRect()
+    const texts = [...svg.querySelectorAll("text")].filter(each => each.checkVisibility())
+      .map(each => [each.textContent.trim(), each.getBoundingClientRect()])
+      .filter(([words, box]) => words && box.width > 0)
+    texts.forEach(([words, a], i) => {
+      if (a.left < frame.left - 1 || a.right > frame.right + 1 || a.top < frame.top - 1
+          || a.bottom > frame.bottom + 1) found.push([words, "outside"])
+      for (const [other, b] of texts.slice(0, i)) {
+        const wide = Math.min(a.right, b.right) - Math.max(a.left, b.left)
+        const high = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top)
+        if (wide > 1.5 && high > 0.25 * Math.min(a.height, b.height)) found.push([words, other])
+      }
+    })
   }
   return found
 }"""
@@ -55,7 +76,7 @@ def complaints(page):
 
 
 def looked_at(browser, pages, schemes=SCHEMES):
-    """Every page at both widths in the themes, and printed."""
+    """Every page at all widths in the themes, and printed."""
     for scheme in schemes:
         context = browser.new_context(color_scheme=scheme)
         page = context.new_page()
@@ -66,6 +87,7 @@ def looked_at(browser, pages, schemes=SCHEMES):
                 page.set_viewport_size({"width": width, "height": 900})
                 assert page.evaluate("document.documentElement.scrollWidth") <= width, place
                 assert page.evaluate(SPLIT) == [], (place, width)
+                assert page.evaluate(LABELS) == [], (place, width)
             found = page.evaluate(CONTRAST)
             if page.locator("svg text").count():
                 assert found["words"] >= 4.5, (place, scheme)
@@ -202,6 +224,14 @@ def test_a_table_that_goes_on_has_a_shadow_there(browser, tmp_path, width):
     right = {"x": box["x"] + box["width"] - 4, "y": box["y"] + 4, "width": 4, "height": 4}
     shown = Image.open(BytesIO(page.screenshot(clip=right))).convert("L").getextrema()[0]
     assert (shown < 200) == (width == 390)  # a grey there, and else white
+
+
+def test_words_outside_and_on_each_other_are_noticed(browser):
+    page = browser.new_page()
+    words = [("in", 10, 20), ("on", 12, 22), ("out", 95, 50), ("free", 30, 80)]
+    texts = "".join(f'<text x="{x}" y="{y}">{word}</text>' for word, x, y in words)
+    page.set_content(f'<svg role="img" width="100" height="100">{texts}</svg>')
+    assert page.evaluate(LABELS) == [["on", "in"], ["out", "outside"]]
 
 
 @pytest.mark.slow
