@@ -117,13 +117,13 @@ def joint_search(
             settled = ends is not None
             if settled:
                 break
-            last = APART + (LOOKS + 1) * turn + LOOKS
-            looks = range(last - LOOKS, last)
+            final = APART + (LOOKS + 1) * turn + LOOKS
+            looks = range(final - LOOKS, final)
             asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
             best, near, problem = *finished(asked, models, best), asked.problem
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
-            scenarios = violations(problem, own, kappa, omega_b, last, tell)[1]
+            scenarios = violations(problem, own, kappa, omega_b, final, tell)[1]
             settled = near and not scenarios
             if settled:
                 break
