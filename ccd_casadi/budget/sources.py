@@ -194,9 +194,7 @@ class Source:
         assert isinstance(self.spectrum, ShapedSpectrum)
         if self.kind is not Kind.FLOOR_MOTION:
             return self.spectrum.filter()
-        if self.of_acceleration:
-            return self.spectrum.filter((self.path[0],))
-        return self.spectrum.filter(self.path)
+        return self.spectrum.filter(self.path[:1] if self.of_acceleration else self.path)
 
     def corners(self) -> Array:
         """Frequencies in rad/s at which the density bends: a table's points, a filter's roots."""

@@ -137,15 +137,13 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             raise fail(name, f"unknown table{closest(name, known)}")
         if not isinstance(table, Mapping):
             raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
-    for name in ("plant", "theta"):
+    required = (
+        name for name, kind in TABLES.items() if MISSING in [item.default for item in fields(kind)]
+    )
+    for name in ("plant", "theta", *required):
         if name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
-    tables = {}
-    for name, kind in TABLES.items():
-        required = any(item.default is MISSING for item in fields(kind))
-        if required and name not in data:
-            raise fail(name, f"is missing; add a table [{name}]")
-        tables[name] = table_of(kind, name, data.get(name, {}), fail)
+    tables = {name: table_of(kind, name, data.get(name, {}), fail) for name, kind in TABLES.items()}
     controller = tables["controller"]
     if controller.channel:
         own = data["controller"]["channel"]
