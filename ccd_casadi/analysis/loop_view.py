@@ -124,16 +124,11 @@ def loop_view(
     near = root_flanks(np.concatenate(roots), FLANKS) / HZ
     places = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
     hz = frequency_grid(low, high, points, near, places, apart=SAME)
-    sizes, opened, first = [], [], None
-    for loop in loops:
-        G, K = loop.responses(HZ * hz)
-        first = first or (G, K)
-        parts = responses_of(G, K)
-        sizes.append([sigma_max(parts[name]) for name in (*NAMES, "GS")])
-        opened.append(G @ K)
-    assert first is not None
+    pairs = [loop.responses(HZ * hz) for loop in loops]
+    every = [responses_of(G, K) for G, K in pairs]
+    sizes = np.array([[sigma_max(parts[name]) for parts in every] for name in (*NAMES, "GS")])
     return LoopView(
-        label, tuple(loops), hz, *first, np.array(sizes).swapaxes(0, 1), np.array(opened),
+        label, tuple(loops), hz, *pairs[0], sizes, np.array([G @ K for G, K in pairs]),
         np.asarray(bounded.over(hz)), bounded, bandwidth_hz, found, poles, zeros,
     )  # fmt: skip
 

@@ -80,20 +80,18 @@ def setpoint(limits: MoveLimits) -> Setpoint:
     Analytic in the limits, which may be complex: a step along the imaginary axis gives derivatives.
     """
     stroke, v, a, j, s = (getattr(limits, item.name) for item in fields(limits))
-    t4 = _least(j / s, (a / s) ** 0.5, (v / (2 * s)) ** (1 / 3), (stroke / (8 * s)) ** 0.25)
+    t4 = _longest(j / s, (a / s) ** 0.5, (v / (2 * s)) ** (1 / 3), (stroke / (8 * s)) ** 0.25)
     jerk = s * t4
     # what t3 does to the stroke, x² (x - t4) = stroke/(2 jerk) with x = 2 t4 + t3, by Cardano
     half, fourth = (t4 / 3) ** 3 + stroke / (4 * jerk), stroke / (4 * jerk)
     root = (fourth * (2 * (t4 / 3) ** 3 + fourth)) ** 0.5
     x = t4 / 3 + (half + root) ** (1 / 3) + (t4 / 3) ** 2 / (half + root) ** (1 / 3)
-    t3 = _least(a / jerk - t4, 0.5 * ((t4 * t4 + 4 * v / jerk) ** 0.5 - 3 * t4), x - 2 * t4)
-    t3 = _at_least_zero(t3)
+    t3 = _longest(a / jerk - t4, 0.5 * ((t4 * t4 + 4 * v / jerk) ** 0.5 - 3 * t4), x - 2 * t4)
     acceleration, rise = jerk * (t4 + t3), 2 * t4 + t3
-    t2 = _least(v / acceleration - rise,
-                0.5 * ((rise * rise + 4 * stroke / acceleration) ** 0.5 - 3 * rise))  # fmt: skip
-    t2 = _at_least_zero(t2)
+    t2 = _longest(v / acceleration - rise,
+                  0.5 * ((rise * rise + 4 * stroke / acceleration) ** 0.5 - 3 * rise))  # fmt: skip
     velocity = acceleration * (rise + t2)
-    t1 = _at_least_zero(stroke / velocity - (2 * rise + t2))
+    t1 = _longest(stroke / velocity - (2 * rise + t2))
     ramp = [t4, t3, t4]
     up = np.array([*ramp, t2, *ramp])
     durations = np.concatenate([up, [t1], up])
@@ -103,9 +101,7 @@ def setpoint(limits: MoveLimits) -> Setpoint:
                     jerk)  # fmt: skip
 
 
-def _least(*times: Any) -> Any:
-    return min(times, key=np.real)
-
-
-def _at_least_zero(time: Any) -> Any:
+def _longest(*bounds: Any) -> Any:
+    """The longest time within all bounds; zero where one of them is negative."""
+    time = min(bounds, key=np.real)
     return time if np.real(time) > 0.0 else 0.0 * time

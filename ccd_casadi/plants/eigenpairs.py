@@ -156,10 +156,7 @@ def build_resolvent(pencil: Pencil, modes: Array, F: Array, largest: float) -> R
 
     start = deflate(pencil.inverse(F))
     size = np.sqrt(np.einsum("ij,ij->j", start, pencil.mass(start)).max(initial=0.0))
-    empty = np.zeros((pencil.size, 0))
-    if size == 0.0:
-        return Resolvent(pencil.shift, empty, np.zeros((0, 0)), np.zeros((0, F.shape[1])))
-    V, MV, W = empty, empty, empty
+    V = MV = W = np.zeros((pencil.size, 0))
     block, norms = start, size
     for _ in range(60):
         block = deflate(block)

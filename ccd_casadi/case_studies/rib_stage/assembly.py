@@ -143,14 +143,10 @@ def build_sector(assembler: Assembler, symmetry: Symmetry) -> Sector:
     maps = []
     for box, block in enumerate(assembler.blocks):
         places = (3 * block.nodes[:, None] + np.arange(3)).ravel()
-        weight = folded.weight[places]
-        on_diagonal = block.cells[0] == block.cells[1]
-        if on_diagonal:
-            maps.append((box, places, weight, 1))
-        elif symmetry.diagonal:
-            maps.append((box, places, weight, 2))
-        else:
-            maps.append((box, places, weight, 1))
+        mirrored = block.cells[0] != block.cells[1]
+        copies = 2 if mirrored and symmetry.diagonal else 1
+        maps.append((box, places, folded.weight[places], copies))
+        if mirrored and not symmetry.diagonal:
             image = swap[places]
             maps.append((box, image, folded.weight[image], 1))
     sizes = [3 * len(block.nodes) for block in assembler.blocks]

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from ccd_casadi.case_studies.rib_stage import geometry as shape
@@ -141,9 +140,7 @@ def forget_spectra() -> None:
     _spectra.clear()
 
 
-@lru_cache(maxsize=16)
-def _rigid_function(geometry: Geometry, points: tuple[Point, ...]) -> ca.Function:
-    return rigid_fields(geometry, points)
+_rigid_function = lru_cache(maxsize=16)(rigid_fields)
 
 
 @lru_cache(maxsize=256)

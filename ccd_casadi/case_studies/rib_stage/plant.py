@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import casadi as ca
 
@@ -76,6 +75,15 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     def evaluator(variant: RibStage, derivatives: bool = False) -> Ordered:
         return Ordered(variant.mechanics, NAMES, names, derivatives)
 
+    def nearby(known: Sequence[Sequence[float]]) -> Ordered:
+        made = reduced.bases(stage, tuple(map(evaluate.own, known)))
+        return Ordered(lambda theta, _: reduced.mechanics(stage, made, theta), NAMES, names)
+
+    def drawing(thetas: Mapping[str, Sequence[float]]) -> Figure:
+        from ccd_casadi.case_studies.rib_stage import drawing  # matplotlib is slow to import
+
+        return drawing.drawing(stage.geometry, {k: evaluate.own(v) for k, v in thetas.items()})
+
     evaluate, theta = evaluator(stage, True), ca.SX.sym("theta", len(NAMES))
     mass, constraints = stage.hardware([theta[list(names).index(name)] for name in NAMES])
     count = ROWS.get(stage.outputs)
@@ -93,23 +101,10 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         inputs=count or len(stage.actuator_points),
         references={name: evaluator(variant) for name, variant in references.items()},
         values=evaluator(stage),
-        nearby=partial(_nearby, stage, evaluate, names) if reduced.applies(stage) else None,
+        nearby=nearby if reduced.applies(stage) else None,
         shapes=lambda theta, count: mode_shapes(stage, evaluate.own(theta), count),
-        drawing=partial(_drawing, stage, evaluate),
+        drawing=drawing,
     )
-
-
-def _nearby(
-    stage: RibStage, order: Ordered, names: Sequence[str], known: Sequence[Sequence[float]]
-) -> Ordered:
-    made = reduced.bases(stage, tuple(map(order.own, known)))
-    return Ordered(lambda theta, _: reduced.mechanics(stage, made, theta), NAMES, names)
-
-
-def _drawing(stage: RibStage, order: Ordered, thetas: Mapping[str, Sequence[float]]) -> Figure:
-    from ccd_casadi.case_studies.rib_stage.drawing import drawing  # matplotlib is slow to import
-
-    return drawing(stage.geometry, {name: order.own(theta) for name, theta in thetas.items()})
 
 
 def _points(points: Points) -> tuple[Point, ...] | None:
