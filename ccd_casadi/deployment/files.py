@@ -1,5 +1,6 @@
 """What a deployment leaves in its folder: deploy.json, controller.json, design.mat."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,12 @@ def write_files(
     if not found.stable:
         return
     write_json(folder / "controller.json", controller_dict(found))
-    K, held = found.realisation.system, found.plant
     systems = {
         "plant": named_plant(run.plant.plant_si()),
         "controller": named_controller(run.controller),
         "controller_reduced": named_controller(found.reduced),
-        "controller_discrete": named_controller(K),
-        "plant_discrete": named_plant(held),
+        "controller_discrete": named_controller(found.realisation.system),
+        "plant_discrete": named_plant(found.plant),
     }
     theta = dict(zip(run.problem.names, run.theta, strict=True))
     units = dict(zip(run.problem.names, run.problem.units, strict=True))
@@ -124,8 +124,6 @@ def _figures(figures: DesignFigures) -> dict[str, Any]:
 
 
 def _channel(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
-    K = item.chosen.controller
-    scalar = K.D.shape == (1, 1)
     return {
         "name": item.channel.name,
         "outputs": item.channel.outputs.tolist(),
@@ -139,24 +137,11 @@ def _channel(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
             | _figures(row.figures)
             for row in item.rows
         ],
-        "sections": _sections(item, run) if scalar else None,
+        "sections": _sections(item, run) if item.chosen.controller.D.shape == (1, 1) else None,
     }
 
 
 def _sections(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
     if item.designed is not None:
         return sections_dict(*item.designed)
-    found = sections_of(item.chosen.controller, run.figures.bandwidth)
-    return {
-        "gain": found.gain,
-        "gain_at_bandwidth": found.gain_at_bandwidth,
-        "sections": [
-            {
-                "kind": s.kind,
-                "zero": s.zero and vars(s.zero),
-                "pole": s.pole and vars(s.pole),
-                "depth_db": s.depth_db,
-            }
-            for s in found.sections
-        ],
-    }
+    return asdict(sections_of(item.chosen.controller, run.figures.bandwidth))

@@ -42,8 +42,7 @@ class Deployment:
     `sampled` are the exact figures of the sampled loop on the nominal plant, `members` those on
     every other plant of the run's [robust] set. `unverified`: why the run itself is not verified,
     empty where it is. `needed_hz`: the least rate that will do, None where none does.
-    `compliance`: the largest |GS| in m/N and on which plant, where the case
-    bounds it.
+    `compliance`: the largest |GS| in m/N and on which plant, where the case bounds it.
     """
 
     orders: tuple[ChannelOrders, ...]

@@ -184,19 +184,15 @@ def _assessed(
     most = run.problem.inner.compliance_max
     if kind_of(run.problem).as_designed:
         most = structured_of(run.problem).compliance_max
+    status = run.result.get("status", "verified")  # without it no run is behind the design
+    unverified = "" if status == "verified" else str(run.result.get("reason") or status)
     found = Deployment(
         orders=tuple(orders), rate_hz=rate_hz, delay=delay, conversion=conversion,
         plant=held[nominal], realisation=realisation, sampled=figures.pop(nominal),
         members=tuple(MemberLoop(at, item) for at, item in figures.items()),
-        unverified=_unverified(run), statics=at_rest, compliance_max=most, **way,
+        unverified=unverified, statics=at_rest, compliance_max=most, **way,
     )  # fmt: skip
     if most is None or not found.stable:
         return found
     gains = {at: sampled_compliance(plants[at], loop) for at, loop in loops.items()}
     return replace(found, compliance=max(gains.items(), key=lambda pair: pair[1]))
-
-
-def _unverified(run: FinishedRun) -> str:
-    """Why the run is not verified; empty where it is, or where no run is behind the design."""
-    status = run.result.get("status", "verified")
-    return "" if status == "verified" else str(run.result.get("reason") or status)

@@ -128,9 +128,19 @@ def _perturbation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | Non
 
 
 def _without_fast(K: StateSpace, whole: StateSpace, r: int) -> StateSpace:
-    """K with r states, balanced as in `_balanced`, those of the smallest values at rest."""
-    balanced, _ = _balanced(K, whole, len(K.A))
-    return balanced if r == len(K.A) else _residual(balanced, r)
+    """K with r states, balanced as in `_balanced`, those of the smallest values at rest.
+
+    ẋ₂ = 0 of these, so that K(0) is kept.
+    """
+    K, _ = _balanced(K, whole, len(K.A))
+    rest = np.linalg.solve(K.A[r:, r:], np.hstack([K.A[r:, :r], K.B[r:]]))
+    A2, B2 = rest[:, :r], rest[:, r:]
+    return StateSpace(
+        K.A[:r, :r] - K.A[:r, r:] @ A2,
+        K.B[:r] - K.A[:r, r:] @ B2,
+        K.C[:, :r] - K.C[:, r:] @ A2,
+        K.D - K.C[:, r:] @ B2,
+    )
 
 
 def _balanced(K: StateSpace, whole: StateSpace, order: int) -> tuple[StateSpace, Array]:
@@ -143,18 +153,6 @@ def _balanced(K: StateSpace, whole: StateSpace, order: int) -> tuple[StateSpace,
     size = np.sqrt(s[:order])
     turned, inverse = R @ Vt[:order].T / size, (U[:, :order] / size).T @ L.T
     return StateSpace(inverse @ K.A @ turned, inverse @ K.B, K.C @ turned, K.D), s
-
-
-def _residual(K: StateSpace, r: int) -> StateSpace:
-    """The last states at rest: ẋ₂ = 0, so that K(0) is kept."""
-    rest = np.linalg.solve(K.A[r:, r:], np.hstack([K.A[r:, :r], K.B[r:]]))
-    A2, B2 = rest[:, :r], rest[:, r:]
-    return StateSpace(
-        K.A[:r, :r] - K.A[:r, r:] @ A2,
-        K.B[:r] - K.A[:r, r:] @ B2,
-        K.C[:, :r] - K.C[:, r:] @ A2,
-        K.D - K.C[:, r:] @ B2,
-    )
 
 
 _METHODS: dict[Reduction, Callable[[ScaledPlant, StateSpace, int], StateSpace | None]] = {

@@ -151,8 +151,7 @@ def _section(zero: Root | None, pole: Root | None, bandwidth_hz: float) -> Secti
         return Section("lead" if abs(zero.hz) < abs(pole.hz) else "lag", zero, pole)
     at_zero = 1j * HZ * np.array([zero.hz])
     depth = abs(zero.response(at_zero) / pole.response(at_zero))[0]
-    near = 1.0 / NEAR < zero.hz / pole.hz < NEAR
-    if near:
+    if 1.0 / NEAR < zero.hz / pole.hz < NEAR:
         kind = "notch" if abs(zero.damping) < abs(pole.damping) else "inverse notch"
         return Section(kind, zero, pole, float(20.0 * np.log10(max(depth, 1e-300))))
     return Section("complex lead" if zero.hz < pole.hz else "complex lag", zero, pole)

@@ -57,29 +57,24 @@ def order_words(run: FinishedRun, found: Deployment) -> str:
     words = " + ".join(
         f"{order} of {item.rows[0].order}" for order, item in zip(orders, found.orders, strict=True)
     )
-    more = (
-        len(found.realisation.system.A) - found.order if found.conversion is Conversion.LEAD else 0
-    )
-    lead = f", and {more} of the lead filter" if more else ""
+    more = len(found.realisation.system.A) - found.order
+    lead = f", and {more} of the lead filter" if found.conversion is Conversion.LEAD else ""
     return f"{words} states ({len(run.controller.A)} synthesised){lead}"
 
 
 def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
     """Bandwidth and peak of S of every loop on the way: name, value and remark."""
-    loops: list[tuple[str, Any]] = [("Sampled", found.sampled)]
+    loops: list[tuple[str, Any]] = [("Full", run.figures), ("Reduced", found.reduced_figures)]
     if kind_of(run.problem).as_designed:
-        loops.insert(0, ("Continuous", run.figures))
-    else:
-        loops[:0] = [("Full", run.figures), ("Reduced", found.reduced_figures)]
+        loops = [("Continuous", run.figures)]
     rows = []
-    for name, figures in loops:
+    for name, figures in (*loops, ("Sampled", found.sampled)):
         if figures is not None and isfinite(figures.bandwidth):
             change = 100.0 * (figures.bandwidth / run.figures.bandwidth - 1.0)
             peak = against(figures.sensitivity_peak, run.problem.inner.S_max)
             words = f"peak {figures.sensitivity_peak:.6g} ({peak})"
-            words += (
-                "" if figures is run.figures else f", bandwidth {round(change, 2) + 0.0:+.2f} %"
-            )
+            if figures is not run.figures:
+                words += f", bandwidth {round(change, 2) + 0.0:+.2f} %"
             rows.append((name, f"{figures.bandwidth / HZ:.6g} Hz", words))
     return rows
 
@@ -98,9 +93,8 @@ def _over(run: FinishedRun, found: Deployment) -> float:
 
 def reason_words(run: FinishedRun, found: Deployment) -> str:
     """Why it is not verified; where it is, what hold and delay have taken of S_max."""
-    parts = []
-    if found.unverified:
-        parts.append(f"the run itself is not verified: {found.unverified}")
+    own = f"the run itself is not verified: {found.unverified}"
+    parts = [own] if found.unverified else []
     if found.shortfalls:
         return "; ".join([*parts, found.shortfalls[0]])
     S_max, over = run.problem.inner.S_max, _over(run, found)

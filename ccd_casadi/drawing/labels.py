@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Panel
+from ccd_casadi.drawing.content import Level, Mark, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -123,10 +123,8 @@ class Labels:
 
     def words(self) -> list[Put]:
         """Those of the marks and then of the levels, as far as there is a place for them."""
-        found = [self._beside(mark.x, mark.y, mark.text, mark.offset, mark.colour)
-                 for mark in self._panel.marks if mark.text]  # fmt: skip
-        found += [self._along(level.value, level.text, level.vertical, level.colour)
-                  for level in self._panel.levels if level.text]  # fmt: skip
+        found = [self._beside(mark) for mark in self._panel.marks if mark.text]
+        found += [self._along(level) for level in self._panel.levels if level.text]
         return [put for put in found if put is not None]
 
     def _corners(self, names: Sequence[str]) -> dict[str, Box]:
@@ -150,29 +148,27 @@ class Labels:
             points = np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
         self._curves = np.vstack([self._curves, points])
 
-    def _beside(
-        self, x: float, y: float, text: str, wish: tuple[float, float], colour: str
-    ) -> Put | None:
-        """Beside a point, at the offset `wish` in pt if that is free."""
-        a, b = self._at(x, y)
-        wide = LETTER * len(text)
+    def _beside(self, mark: Mark) -> Put | None:
+        """Beside a point, at its own offset in pt if that is free."""
+        a, b = self._at(mark.x, mark.y)
+        wide = LETTER * len(mark.text)
         places = []
-        for dx, dy in (wish, *AROUND):
+        for dx, dy in (mark.offset, *AROUND):
             left = a + dx - (0.5 * wide if dx == 0 else wide if dx < 0 else 0.0)
             bottom = b + dy - (LINE if dy < 0 else 0.0)
-            put = Put(text, x, y, dx, dy, colour)
+            put = Put(mark.text, mark.x, mark.y, dx, dy, mark.colour)
             places.append(((left, bottom, left + wide, bottom + LINE), put))
         return self._best(places)
 
-    def _along(self, value: float, text: str, vertical: bool, colour: str) -> Put | None:
+    def _along(self, level: Level) -> Put | None:
         """At a line across the axes; upright beside a vertical one, or level with a place on it
         where that alone keeps off the curves."""
-        left, bottom, right, top = self._inside
+        (left, bottom, right, top), vertical = self._inside, level.vertical
         corner = [low for low, _ in self._ranges]
-        corner[not vertical] = value
+        corner[not vertical] = level.value
         line = self._at(*corner)[not vertical]
         start, end = (bottom + 4.0, top) if vertical else (left + 3.0, right)
-        wide = LETTER * len(text)
+        wide = LETTER * len(level.text)
         places = []
         for long, across in ((wide, LINE), (LINE, wide))[: 1 + vertical]:
             for share in SHARES:
@@ -184,7 +180,8 @@ class Labels:
                         box, off = (b, a, b + across, a + long), off[::-1]
                     held, upright = (vertical, not vertical), vertical and long == wide
                     x, y, (dx, dy) = *corner, off
-                    places.append((box, Put(text, x, y, dx, dy, colour, held, upright)))
+                    put = Put(level.text, x, y, dx, dy, level.colour, held, upright)
+                    places.append((box, put))
         return self._best(places)
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
@@ -212,6 +209,4 @@ class Labels:
 
 
 def _meet(one: Box, other: Box) -> bool:
-    return not (
-        one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
-    )
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]

@@ -42,7 +42,7 @@ class Background:
     ) -> Future:  # fmt: skip
         """Do what the user waits for, one after the other; `told` hears how far the work is."""
 
-        def answered(_: None) -> Any:
+        def answered() -> Any:
             process = self._process = self._process or WorkerProcess()
             process.begin(_working, (self._user_code, work, task))
             try:
@@ -54,14 +54,14 @@ class Background:
                 raise value
             return value
 
-        return self._submit(self._asking, answered, None, then, failed)
+        return self._submit(self._asking, answered, then, failed)
 
     def renew(self, known: KnownPlant, then: Then) -> None:
         """Make the model of a slow plant anew; of megabytes, it stays in this process."""
-        self._submit(self._thread, lambda _: known.renew(), None, then, print_failure)
+        self._submit(self._thread, known.renew, then, print_failure)
 
     def _submit(
-        self, pool: Executor, work: Callable[[Any], Any], task: Any, then: Then, failed: Failed
+        self, pool: Executor, work: Callable[[], Any], then: Then, failed: Failed
     ) -> Future:
         def done(future: Future) -> None:
             if self._closed or future.cancelled():
@@ -72,7 +72,7 @@ class Background:
             else:
                 failed(error)
 
-        future = pool.submit(work, task)
+        future = pool.submit(work)
         future.add_done_callback(done)
         return future
 

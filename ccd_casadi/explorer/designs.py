@@ -122,9 +122,7 @@ def elements_at(problem: CoDesignProblem, theta: Sequence[float]) -> Elements:
     Raises PlantError where the model is no plant there.
     """
     plant = plant_of(problem)
-    if plant.values is not None:
-        return Elements(plant.values(theta))
-    return Elements(mechanics(plant, theta))
+    return Elements(mechanics(plant, theta) if plant.values is None else plant.values(theta))
 
 
 def present(

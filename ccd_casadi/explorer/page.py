@@ -254,13 +254,11 @@ class Page:
         if len(known.exact) > count:
             self.background.renew(known, self._then(lambda _: self.improved()))
         self.modes.text = modes
-        if newest is None or newest == look.knobs:
-            if self.controls.knobs() == look.knobs:
-                self.show(look)
-            else:
-                self._seen.append(look)
+        if newest in (None, look.knobs) and self.controls.knobs() == look.knobs:
+            self.show(look)
         else:
             self._seen.append(look)
+        if newest is not None and newest != look.knobs:
             self._search_behind(newest)
         self.settle()
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from bokeh.core.property.descriptors import UnsetValueError
 from bokeh.events import Reset
-from bokeh.model import Model
 from bokeh.models import (
     BoxZoomTool,
     ColumnDataSource,
@@ -29,7 +28,7 @@ from ccd_casadi.drawing.content import Curve, Panel
 from ccd_casadi.drawing.labels import LINE as TALL
 from ccd_casadi.drawing.labels import SIZE, Labels
 from ccd_casadi.drawing.lines import positive_range
-from ccd_casadi.drawing.svg import BLUE, GREY, THEME
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, THEME, VARIABLES
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.support.package_text import package_text
 
@@ -129,9 +128,10 @@ class PanelFigure:
         drawn = [
             Curve(c.x, c.y, c.label, colour, dash or c.line, width=max(c.width, 2.0)) for c in own
         ]
-        spots = [(c.x, c.y, colour if c.colour == BLUE else c.colour, c.marker)
-                 for c in panel.curves if c.marker]  # fmt: skip
-        spots += [(np.array([m.x]), np.array([m.y]), m.colour, m.marker)
+        spots = [(x, y, self._on(colour if c.colour == BLUE else c.colour), MARKERS[c.marker])
+                 for c in panel.curves if c.marker
+                 for x, y in zip(c.x, c.y, strict=True)]  # fmt: skip
+        spots += [(m.x, m.y, self._on(m.colour), MARKERS[m.marker])
                   for m in panel.marks if m.marker]  # fmt: skip
         areas = [(a.x, a.y, self._on(a.colour), 0.2) for a in panel.forbidden]
         areas += [(np.append(b.x, b.x[::-1]), np.append(b.low, b.high[::-1]), self._on(b.colour),
@@ -151,7 +151,7 @@ class PanelFigure:
             others.append(Curve(*line, "", v.colour, "--", width=0.9))
         found = [
             _rows(self.own, map(self._line, drawn)), _rows(self._lines, map(self._line, others)),
-            _rows(self._areas, areas), self._spotted(spots), self._worded(panel, ends),
+            _rows(self._areas, areas), _rows(self._spots, spots), self._worded(panel, ends),
         ]  # fmt: skip
         for axis, label in ((self.figure.xaxis, panel.x_label), (self.figure.yaxis, panel.y_label)):
             found.append((axis[0], {"axis_label": label}))
@@ -160,13 +160,10 @@ class PanelFigure:
             found.append((self._tips, {"tooltips": tips}))
             axes = zip((self.figure.x_range, self.figure.y_range), ends, wider, strict=True)
             found += [_ends(axis, *place) for axis, place, new in axes if new]
-        return [change for change in found if self._is_new(*change)]
-
-    def _is_new(self, model: Model, values: dict[str, Any]) -> bool:
-        """Whether it is not what was sent of it last."""
-        before = self._sent.get(model.id)
-        self._sent[model.id] = values
-        return before is None or not _same(before, values)
+        new = [(model, values) for model, values in found
+               if not _same(self._sent.get(model.id), values)]  # fmt: skip
+        self._sent |= {model.id: values for model, values in new}
+        return new
 
     def pin(self, pinned: Sequence[tuple[str, Panel]]) -> None:
         """Draw the present curves of other panels beside, each in its colour."""
@@ -181,13 +178,6 @@ class PanelFigure:
     def _line(self, c: Curve) -> tuple[Any, ...]:
         return (np.asarray(c.x, float), np.asarray(c.y, float), self._on(c.colour), DASHES[c.line],
                 c.width, c.label)  # fmt: skip
-
-    def _spotted(self, spots: Sequence[tuple[Any, Any, str, str]]) -> Change:
-        x, y = (np.concatenate([np.empty(0), *(spot[i] for spot in spots)]) for i in (0, 1))
-        each = [(self._on(colour), MARKERS[marker]) for at, _, colour, marker in spots for _ in at]
-        return self._spots, {
-            "data": {"x": x, "y": y, "colour": [a for a, _ in each], "marker": [b for _, b in each]}
-        }
 
     def _worded(self, panel: Panel, ranges: list[tuple[float, float]]) -> Change:
         """The words of marks and levels where they do not meet, in the size that the browser told
@@ -248,15 +238,12 @@ def legend_html(panel: Panel) -> str:
     items = [(SIGNS.get(c.marker) or SIGNS[c.line], c.colour, c.label) for c in panel.curves]
     items += [("▬", band.colour, band.label) for band in panel.bands]
     parts = [
-        f'<span style="color:var(--{_named(colour)})">{sign}</span> {escape(label)}'
+        f'<span style="color:{VARIABLES.get(colour, VARIABLES[BLACK])}">{sign}</span> '
+        f"{escape(label)}"
         for sign, colour, label in items
         if label
     ]
     return " · ".join(parts + (["shaded: beyond a bound"] if panel.forbidden else []))
-
-
-def _named(colour: str) -> str:
-    return next((name for name, (light, _) in THEME.items() if light == colour), "ink")
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -279,7 +266,7 @@ def _source(columns: Sequence[str], name: str = "") -> ColumnDataSource:
 
 
 def _rows(source: ColumnDataSource, rows: Any) -> Change:
-    """Rows as the columns of a source, numbers as one array."""
+    """Rows as the columns of a source."""
     names, rows = list(source.data), list(rows)
     columns: list[Any] = [[row[i] for row in rows] for i in range(len(names))]
     return source, {"data": dict(zip(names, columns, strict=True))}

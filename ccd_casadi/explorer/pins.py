@@ -55,9 +55,8 @@ class Pins:
         self, parameters: Sequence[Parameter], figures: Sequence[PanelFigure], kept: Kept,
         dark: bool, cost_unit: str,
     ) -> None:  # fmt: skip
-        self.names, self.figures, self.kept, self._dark = (
-            [p.name for p in parameters], figures, kept, dark,
-        )  # fmt: skip
+        self.names = [p.name for p in parameters]
+        self.figures, self.kept, self._dark = figures, kept, dark
         units = [display_unit(p.unit, p.upper) for p in parameters]
         self._scales = [scale for _, scale in units]
         self.source = ColumnDataSource(self._columns([]))

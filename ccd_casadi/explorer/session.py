@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 
@@ -168,10 +169,8 @@ class Session:
         return folder, place
 
     def _numbered(self, name: str, suffix: str) -> Path:
-        number = 1
-        while (self.folder / f"{name}_{number}{suffix}").exists():
-            number += 1
-        return self.folder / f"{name}_{number}{suffix}"
+        places = (self.folder / f"{name}_{number}{suffix}" for number in count(1))
+        return next(place for place in places if not place.exists())
 
 
 def searched_exactly(

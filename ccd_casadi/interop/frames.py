@@ -41,8 +41,7 @@ def samples_frame(run: FinishedRun) -> "pandas.DataFrame":
     """
     pandas = require("pandas", "notebook")
     with SampleStore(run.folder / "samples.sqlite") as store:
-        problem = run.problem.identity()
-        samples = store.select(problem_hash(problem))
+        samples = store.select(problem_hash(run.problem.identity()))
     rows = []
     for sample in samples:
         row = dict(zip(run.problem.names, sample.theta, strict=True))

@@ -20,13 +20,8 @@ def front_walk(run: FinishedRun, front: Front) -> tuple[Steps, ...]:
         return ()
     chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
     shown = [points[i] for i in chosen]
-    steps = tuple(
-        (
-            _words(problem, point),
-            Lines(((_machine(problem, point), None),), "A design of the front"),
-        )
-        for point in shown
-    )
+    drawn = (Lines(((_machine(problem, p), None),), "A design of the front") for p in shown)
+    steps = tuple(zip([_words(problem, p) for p in shown], drawn, strict=True))
     own = float(run.result["hardware_cost"])
     first = int(np.argmin([abs(point.hardware_cost - own) for point in shown]))
     return (Steps(steps, first, "lightest to heaviest"),)

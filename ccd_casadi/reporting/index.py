@@ -54,9 +54,7 @@ def write_index(folder: Path) -> None:
         result["status"] = str(result["status"])
     except (OSError, ValueError, KeyError):
         return
-    if (
-        result["status"] != "infeasible" and "objective" not in result
-    ):  # of `tune`, whose page is one
+    if result["status"] != "infeasible" and "objective" not in result:  # `tune` has one page
         return
     pages = _pages(folder)
     for place in pages:

@@ -222,9 +222,9 @@ def _caption(view: LoopView) -> str:
     tops = _high_peaks(view)
     words = ""
     if tops:
-        hz, gain = tops[0]
+        (hz, gain), on = tops[0], " on the model" if plants > 1 else ""
         words = (
-            f" The highest peak of S is {number(gain, 5)} at {number(hz, 4)} Hz, "
+            f" The highest peak of S{on} is {number(gain, 5)} at {number(hz, 4)} Hz, "
             f"{100.0 * gain / S_max:.2f} % of S_max = {S_max:g}"
         )
         others = [f"{number(g, 3)} at {number(h, 4)} Hz" for h, g in tops[1:3]]
@@ -234,8 +234,6 @@ def _caption(view: LoopView) -> str:
         f"The least ω_b of them is {number(view.bandwidth_hz, 5)} Hz." if plants > 1
         else f"{view.named('S')} first crosses -3 dB at ω_b = {number(view.bandwidth_hz, 5)} Hz."
     )  # fmt: skip
-    if plants > 1:
-        words = words.replace("peak of S is", "peak of S on the model is")
     near = [
         f"{view.named(name)} reaches {100.0 * share[i]:.4g} % of {view.bounded.words[k]} at "
         f"{number(float(view.hz[i]), 3)} Hz"

@@ -28,11 +28,7 @@ SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
 OVERSHOOT = 0.5  # of a step without feedforward
 BETWEEN = 1.1  # of the largest |S| on the lines of a response: what it may reach between them
 NO_SET = "[robust] names no plant"  # as verified_structured says it
-STATUS = {
-    "verified": "verified",
-    "not_verified": "not verified",
-    "infeasible": "no feasible design",
-}
+STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
 DECISION = re.compile(r'<p class="decision">(?:Do not b|B)uild this\b.*?</p>', re.DOTALL)
 TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
