@@ -50,10 +50,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         raise UserError(f"--out {folder}: {words}; choose another folder")
     timing = Timing(options.rate_hz, options.delay, options.delay_samples, options.lead == "on")
     channels = len(finished.plant.C) if finished.plant.channels else 1
-    moved = None
-    if kind_of(finished.problem).as_designed:
-        channels = 0
-    steps = channels + 2 + (options.saturation is not None)
+    reduced = 0 if kind_of(finished.problem).as_designed else channels
+    moved, steps = None, reduced + 2 + (options.saturation is not None)
     with Progress(steps, "deploying") as bar:
         found = deploy(
             finished, timing, saturation=options.saturation,

@@ -109,8 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="sections: start one search from the controller of this run, not many",
     )
     add_break_frequencies(arguments, "of a weight; with both: one synthesis, no search")
-    ahead = "ccd_casadi.inner_problem.structured_search"
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"], ahead=ahead)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":

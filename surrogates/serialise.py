@@ -104,12 +104,8 @@ def _decode(cls: Any, value: Any) -> Any:
     if is_dataclass(cls):
         hints = typing.get_type_hints(cls)
         names = {f.name for f in fields(cls)}
-        optional = {
-            f.name
-            for f in fields(cls)
-            if not (f.default is MISSING and f.default_factory is MISSING)
-        }
-        if not names - optional <= set(value) <= names:
+        needed = {f.name for f in fields(cls) if f.default is f.default_factory is MISSING}
+        if not needed <= set(value) <= names:
             raise ValueError(f"fields differ by {sorted(names ^ set(value))}")
         return typing.cast(Any, cls)(**{k: _decode(hints[k], value[k]) for k in sorted(value)})
     if typing.get_origin(cls) is np.ndarray:

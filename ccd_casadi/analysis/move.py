@@ -238,10 +238,8 @@ def forward_force(
     return r[0], r.T @ forward
 
 
-def driven_states(
-    closed: ClosedLoop, G: StateSpace, r: Array, force: Array, axis: int = 0
-) -> Array:
-    """States (N, n) of a sampled loop by the setpoint of an output and a force ahead (N, m)."""
-    driven = np.outer(r, closed.B_r[:, axis])
+def driven_states(closed: ClosedLoop, G: StateSpace, r: Array, force: Array) -> Array:
+    """States (N, n) of a sampled loop by its first setpoint and a force ahead (N, m)."""
+    driven = np.outer(r, closed.B_r[:, 0])
     driven[:, : len(G.A)] += force @ G.B.T
     return states(closed.A, driven)

@@ -75,25 +75,20 @@ class _Part:
 
 def restricted(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]]) -> CoDesignProblem:
     """The problem with each list as a range, or with a fixed parameter where it has one value."""
-    kept = [i for i, name in enumerate(problem.names) if len(lists.get(name, ())) != 1]
-    fixed = tuple(
-        (name, lists[name][0], problem.units[i])
-        for i, name in enumerate(problem.names)
-        if i not in kept
-    )
-    lower = [lists.get(problem.names[i], (problem.lower[i],))[0] for i in kept]
-    upper = [lists.get(problem.names[i], (problem.upper[i],))[-1] for i in kept]
+    units, start = problem.parameter_units, dict(zip(problem.names, problem.start, strict=True))
+    ends = zip(problem.names, problem.lower, problem.upper, strict=True)
+    ranges = {name: lists.get(name, (low, high)) for name, low, high in ends}
+    fixed = tuple((name, *one, units[name]) for name, one in ranges.items() if len(one) == 1)
+    kept = [name for name, values in ranges.items() if len(values) > 1]
+    lower, upper = ([ranges[name][end] for name in kept] for end in (0, -1))
     return replace(
         problem,
         source=replace(problem.source, fixed=(*problem.source.fixed, *fixed)),
-        names=tuple(problem.names[i] for i in kept),
-        units=tuple(problem.units[i] for i in kept),
+        names=tuple(kept),
+        units=tuple(units[name] for name in kept),
         lower=tuple(lower),
         upper=tuple(upper),
-        start=tuple(
-            float(np.clip(problem.start[i], low, high))
-            for i, low, high in zip(kept, lower, upper, strict=True)
-        ),
+        start=tuple(np.clip([start[name] for name in kept], lower, upper).tolist()),
         listed=(),
     )
 
@@ -131,11 +126,8 @@ def best_of_lists(
             break
         open_.remove(part)
         if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:
-            rows = product(*part.lists.values())
-            open_ += [
-                replace(part, lists={n: (v,) for n, v in zip(part.lists, row, strict=True)})
-                for row in rows
-            ]
+            rows = product(*([(v,) for v in values] for values in part.lists.values()))
+            open_ += [replace(part, lists=dict(zip(part.lists, row, strict=True))) for row in rows]
             continue
         own, whole = restricted(problem, part.lists), part.count == 1
         near = min(known, key=lambda item: away(part.lists, _point(item)), default=None)
@@ -201,11 +193,9 @@ def _children(width: Mapping[str, float], lists: Lists, theta: Mapping[str, floa
     parts: list[Lists] = []
     for name in several if on_values else [furthest]:
         middle = nearest[name] if on_values else theta[name]
-        for side in (
-            [v for v in lists[name] if v < middle],
-            [v for v in lists[name] if v > middle],
-        ):
-            parts += [held | {name: tuple(side)}] if side else []
+        below = tuple(v for v in lists[name] if v < middle)
+        above = tuple(v for v in lists[name] if v > middle)
+        parts += [held | {name: side} for side in (below, above) if side]
         held = held | {name: (nearest[name],)}
     return [lists | part for part in (*parts, *([held] if on_values else []))]
 

@@ -102,15 +102,14 @@ def recommendation(qualities: Sequence[Quality]) -> str:
         which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.loo.q2:.3g})" for q in rough)
         said.append(
             f"Left-out samples of {which} are predicted roughly, as those of a function with kinks "
-            "or jumps are: one smooth surrogate follows them only near the "
-            "design. "
-            + (
-                "Solve with --formulation lifted, whose outputs are smooth where the best "
-                "bandwidth is not."
-                if len(qualities) == 1
-                else "The larger of two local peaks is kinked where they are equal; the rounds "
-                "refit by the design, where one of them is the larger."
-            )
+            "or jumps are: one smooth surrogate follows them only near the design."
+        )
+        said.append(
+            "Solve with --formulation lifted, whose outputs are smooth where the best bandwidth "
+            "is not."
+            if len(qualities) == 1
+            else "The larger of two local peaks is kinked where they are equal; the rounds refit "
+            "by the design, where one of them is the larger."
         )
     beyond = [q.name.replace("_", " ") for q in qualities if q.extrapolates]
     if beyond:

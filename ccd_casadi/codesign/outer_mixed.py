@@ -158,9 +158,7 @@ class MixedOuter(Outer):
             inner_gap=end.gap,
             feasible=final.figures.certified and TrueDesign(problem, x, end.design).acceptable,
             unsuspended=unsuspended,
-            references=check_references(
-                problem, theta, final, workers=sampler.workers, quiet=sampler.quiet
-            ),
+            references=check_references(problem, theta, final, sampler.workers, sampler.quiet),
             robust=robust,
             damping=other_damping(problem, loops),
             survival=found,

@@ -88,9 +88,8 @@ def theta_kkt(
     Z = _steepest_first(at.free(nu), at.gradient)
     second = np.inf if Z.shape[1] == 0 else None
     if Z.shape[1] and truth is not None and kink is not None:
-        slopes = _slopes(
-            problem, beside or partial(_more, problem, truth, sample), sample, Z, at.size
-        )
+        more = beside or partial(_more, problem, truth, sample)
+        slopes = _slopes(problem, more, sample, Z, at.size)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
     elif Z.shape[1] and truth is not None and beside is None:
         second = reduced_curvature(Z, _hessian(problem, truth, sample, Z), at.size)

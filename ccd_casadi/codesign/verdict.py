@@ -176,9 +176,8 @@ def predicted(
     what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
     if not surrogate:
-        return VerdictLine(
-            State.PASSED, "nothing was predicted: the search used true values", figures
-        )
+        words = "nothing was predicted: the search used true values"
+        return VerdictLine(State.PASSED, words, figures)
     if left_out is not None:
         size = f"left_out_{unit.lower()}"
         figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}
@@ -200,9 +199,8 @@ def predicted(
     )
     if left_out <= tolerance or (sigmas is not None and sigmas <= SIGMAS and left_out <= 0.01):
         return VerdictLine(State.PASSED, words, figures)
-    return VerdictLine(
-        State.WARNED, f"{words}: the samples around do not support the design", figures
-    )
+    words += ": the samples around do not support the design"
+    return VerdictLine(State.WARNED, words, figures)
 
 
 def survives(

@@ -184,9 +184,8 @@ class VerifiedStructured(Verified):
         if not self.certified:
             return VerdictLine(State.FAILED, self.design.words, figures)
         if not self.feasible:
-            return VerdictLine(
-                State.FAILED, "certified, but a constraint on theta is not met", figures
-            )
+            words = "certified, but a constraint on theta is not met"
+            return VerdictLine(State.FAILED, words, figures)
         count = 0 if judged is None else len(judged.plants)
         where = "the model" if count == 1 else f"the {count} plants"
         words = f"stable and within every bound on {where} that it was designed on"
@@ -231,8 +230,9 @@ class VerifiedStructured(Verified):
     def gap_words(self) -> str:
         figure = self.problem.figure
         here, there = figure.shown(self.value), figure.shown(self.multistart.value)
-        found = f"found a controller with {there} instead of {here}"
-        return f"a multi-start search at this theta {found}"
+        return (
+            f"a multi-start search at this theta found a controller with {there} instead of {here}"
+        )
 
     def no_gradient_words(self) -> str:
         off = self.design.kkt_residual

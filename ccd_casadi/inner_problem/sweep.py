@@ -10,8 +10,10 @@ the sweep, feasible or nearly so, then starts a local constrained solve with exa
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import minimize
 
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -62,6 +64,15 @@ class InnerBounds:
         """ln of each bound, in that order."""
         return np.log([bound for _, bound in self.bounds.values()])
 
+    @property
+    def synthesis_options(self) -> dict[str, Any]:
+        """How each synthesis is made and measured, as keyword arguments."""
+        return {
+            "omega_low": self.omega_low,
+            "gamma_backoff": self.gamma_backoff,
+            "compliance": self.compliance_max is not None,
+        }
+
     def excess(self, figures: object) -> float:
         """ln of the largest figure over its bound, of a row or a stored sample; 0 is feasible."""
         bounds = self.bounds.values()
@@ -111,16 +122,7 @@ class InnerResult(NotebookHtml):
 
 def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> InnerResult:
     """The paper's sweep over the whole box, refined to the continuous optimum."""
-    omega_S, omega_T = problem.axes()
-    rows = sweep(
-        plant,
-        weights,
-        omega_S,
-        omega_T,
-        omega_low=problem.omega_low,
-        gamma_backoff=problem.gamma_backoff,
-        compliance=problem.compliance_max is not None,
-    )
+    rows = sweep(plant, weights, *problem.axes(), **problem.synthesis_options)
     return refine(plant, weights, problem, rows, sweep_starts(problem, rows))
 
 
@@ -167,13 +169,7 @@ def evaluate(
     plant: ScaledPlant, weights: Weights, problem: InnerBounds, point: tuple[float, float]
 ) -> Sensitivities:
     """One certified synthesis with derivatives at (ω_S, ω_T) in rad/s."""
-    return sensitivities(
-        plant,
-        weights.at(*point),
-        omega_low=problem.omega_low,
-        gamma_backoff=problem.gamma_backoff,
-        compliance=problem.compliance_max is not None,
-    )
+    return sensitivities(plant, weights.at(*point), **problem.synthesis_options)
 
 
 def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[tuple[float, float]]:
@@ -181,22 +177,15 @@ def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[tu
 
     Designs a little outside the bounds count too: a feasible sliver may lie between grid points.
     """
-    n_S, n_T = problem.sweep_points
-    merit = np.full((n_S + 2, n_T + 2), -np.inf)
-    each = [
+    merit = np.array([
         np.log(row.bandwidth) - 3.0 * _violation(problem, row) if row.certified else -np.inf
         for row in rows
-    ]
-    merit[1:-1, 1:-1] = np.reshape(each, (n_S, n_T))
-    found = []
-    for i in range(1, n_S + 1):
-        for j in range(1, n_T + 1):
-            here = merit[i, j]
-            if np.isfinite(here) and here >= merit[i - 1 : i + 2, j - 1 : j + 2].max():
-                row = rows[(i - 1) * n_T + j - 1]
-                found.append((here, (row.omega_S, row.omega_T)))
-    found.sort(key=lambda item: -item[0])
-    return [point for _, point in found[:STARTS]]
+    ])  # fmt: skip
+    around = np.pad(merit.reshape(problem.sweep_points), 1, constant_values=-np.inf)
+    highest = sliding_window_view(around, (3, 3)).max(axis=(2, 3)).ravel()
+    found = np.flatnonzero(np.isfinite(merit) & (merit >= highest))
+    best = found[np.argsort(-merit[found], kind="stable")][:STARTS]
+    return [(rows[i].omega_S, rows[i].omega_T) for i in best]
 
 
 def _violation(problem: InnerBounds, row: DesignFigures) -> float:

@@ -42,9 +42,8 @@ def find_channels(K: Array, D: Array, B: Array, C: Array) -> tuple[Channel, ...]
         return whole
     b, c = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
     live = (b > CERTAIN * b.max()) & (c > CERTAIN * c.max())
-    coupling = np.abs(K) + np.abs(D)
-    groups = _components(coupling > 0.0)
-    kept = [group for group in groups if live[group].any()]
+    coupled = _components(np.abs(K) + np.abs(D) > 0.0)
+    kept = [group for group in coupled if live[group].any()]
     residues = []
     for group in kept:
         scale = max(float(np.outer(c[group], b[group]).max()), 1e-300)
@@ -80,12 +79,11 @@ def _singular_vectors(residues: Array) -> tuple[Array, Array, Array]:
     that the same plant has the same channels.
     """
     rng = np.random.default_rng(0)
-    found = []
-    for _ in range(MIXTURES):
-        mixture = rng.uniform(0.5, 1.5, len(residues))
-        U, s, Vt = np.linalg.svd(np.tensordot(mixture, residues, 1))
-        found.append((float(-np.diff(s).max()), (U, s, Vt)))
-    return max(found, key=lambda item: item[0])[1]
+    found = [
+        np.linalg.svd(np.tensordot(rng.uniform(0.5, 1.5, len(residues)), residues, 1))
+        for _ in range(MIXTURES)
+    ]
+    return max(found, key=lambda parts: -np.diff(parts[1]).max())
 
 
 def _components(linked: np.ndarray) -> list[np.ndarray]:

@@ -85,12 +85,8 @@ class _Values:
         self._result = result
         constraints = dict(result.get("constraints", {}))
         self.constraint_names = tuple(constraints)
-        self.scalars = np.array(
-            [
-                _number(key, value)
-                for key, value in {"hardware_cost": result["hardware_cost"], **constraints}.items()
-            ]
-        )
+        scalars = {"hardware_cost": result["hardware_cost"], **constraints}
+        self.scalars = np.array([_number(key, value) for key, value in scalars.items()])
 
     @cached_property
     def system(self) -> Mechanics:
@@ -276,11 +272,10 @@ class DifferencedModel:
 
 
 def _number(key: str, value: Any) -> float:
-    if isinstance(value, int | float):
-        return float(value)
-    if ca.DM(value).shape != (1, 1):
-        raise PlantError(f"{key} is {ca.DM(value).shape}, not a scalar; return one number")
-    return float(ca.DM(value))
+    found = ca.DM(value)
+    if found.shape != (1, 1):
+        raise PlantError(f"{key} is {found.shape}, not a scalar; return one number")
+    return float(found)
 
 
 def _array(value: Any) -> Array:

@@ -139,15 +139,12 @@ class Resolvent:
         return self.basis @ np.linalg.solve(system, self.right)
 
 
-def build_resolvent(
-    pencil: Pencil, modes: Array, F: Array, largest: float, tolerance: float = 1e-10
-) -> Resolvent:
+def build_resolvent(pencil: Pencil, modes: Array, F: Array, largest: float) -> Resolvent:
     """Block Krylov space of A⁻¹M from A⁻¹F, M-orthogonal to `modes` (n, k, all known ones).
 
     (K - λM)x = F reads (1 - (λ + shift) A⁻¹M) x = A⁻¹F, and Krylov spaces do not depend on λ.
     With every mode up to λ deflated the operator is positive definite: Galerkin's method is
-    then that of conjugate gradients. Grown until the relative residual at `largest` is below
-    `tolerance`.
+    then that of conjugate gradients. Grown until the relative residual at `largest` is 1e-10.
     """
     modes = orthonormal(pencil, modes)
     M_modes = pencil.mass(modes)
@@ -186,7 +183,7 @@ def build_resolvent(
         residual = start - x + (largest + pencil.shift) * (W @ y)
         error = np.sqrt(np.einsum("ij,ij->j", residual, pencil.mass(residual)).max())
         block, norms = image, float(np.abs(T).max())
-        if error < tolerance * size:
+        if error < 1e-10 * size:
             break
     else:
         raise StageError("the stage's mode derivatives did not converge; retain another number")

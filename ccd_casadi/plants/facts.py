@@ -87,12 +87,8 @@ def modes_of(modal: ModalPlant) -> tuple[PlantMode, ...]:
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
     zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.diag(modal.K)))
-    return tuple(
-        PlantMode(float(w) / HZ, float(z), bool(r), float(drive), float(seen))
-        for w, z, r, drive, seen in zip(
-            modal.natural, zeta, modal.rigid, b / b.max(), c / c.max(), strict=True
-        )
-    )
+    columns = (modal.natural / HZ, zeta, modal.rigid, b / b.max(), c / c.max())
+    return tuple(map(PlantMode, *(column.tolist() for column in columns)))
 
 
 def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
@@ -112,9 +108,7 @@ def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
 
 def _zeros(plant: ScaledPlant, effort_hz: float, free: ScaledPlant | None) -> tuple[Zero, ...]:
     """Zeros up to three times the frequency at which effort ends, one of each conjugate pair."""
-    own = None
-    if free is not None:
-        own = free.system.zeros() * (free.omega_0 / plant.omega_0)
+    own = None if free is None else free.system.zeros() * (free.omega_0 / plant.omega_0)
     limit = 3.0 * effort_hz * HZ / plant.omega_0
     x, y = np.log(plant.grid), np.log(np.maximum(plant.gain, 1e-300))
     found = []

@@ -10,6 +10,7 @@ mixed-sensitivity problem singular; the suspension puts them at (ω_r, ζ_r).
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import eigh
@@ -102,15 +103,14 @@ def modal_plant(
         raise PlantError("the stiffness matrix has a negative eigenvalue; the plant is not stable")
     rigid = np.abs(lam) <= threshold
     lam = np.where(rigid, 0.0, lam)
-    modes = _aligned(modes, lam, rigid, system.C)
+    modes = _aligned(modes, lam, system.C)
     root = np.sqrt(lam)
     own = np.zeros(rigid.size)
     shifted = numbered(modes, rigid)[: len(perturbation.modes)]
     own[shifted] = perturbation.modes[: len(shifted)]
     ratio = (1.0 + perturbation.shift) * (1.0 + own)
     h = np.where(rigid, w_r**2, ratio**2 * lam)
-    given = system.damping_ratio is None
-    model = 0.0 if given else float(system.damping_ratio or 0.0)
+    model = system.damping_ratio or 0.0
     zeta = model * perturbation.damping * ratio  # of the model's own root: g is a function of λ
     g = np.where(rigid, 2.0 * suspension.damping_ratio * w_r, 2.0 * zeta * root)
 
@@ -172,7 +172,7 @@ def numbered(modes: Array, rigid: np.ndarray) -> np.ndarray:
     return flexible
 
 
-def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
+def _aligned(modes: Array, lam: Array, C: Array) -> Array:
     """Rotate modes of one frequency so that what the sensors do not see stands alone.
 
     Any orthogonal basis of an eigenspace is one of modes. In the singular vectors of its outputs
@@ -181,20 +181,12 @@ def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
     measured alike, as tip and tilt of a square stage, there is nothing to part, and they stay.
     """
     modes = modes.copy()
-    n = lam.size
-    start = 0
-    while start < n:
-        end = start + 1
-        while end < n and (
-            (rigid[start] and rigid[end])
-            or (not rigid[start] and lam[end] - lam[end - 1] <= 1e-9 * lam[end])
-        ):
-            end += 1
+    apart = np.flatnonzero(np.diff(lam) > 1e-9 * lam[1:]) + 1
+    for start, end in pairwise([0, *apart, lam.size]):
         if end - start > 1:
             seen, Vh = np.linalg.svd(C @ modes[:, start:end])[1:]
             if len(seen) < end - start or seen[0] - seen[-1] > ALIKE * seen[0]:
                 modes[:, start:end] = modes[:, start:end] @ Vh.T
-        start = end
     return modes
 
 

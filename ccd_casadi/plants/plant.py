@@ -228,7 +228,8 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
     cheaper = plant.values is not None and not derivatives
     system = plant.values(theta) if cheaper and plant.values else plant.evaluate(theta)
     M, K = system.M, system.K
-    _require_finite(plant, system, f"at theta = {named_values(plant.names, theta)}")
+    place = f"at theta = {named_values(plant.names, theta)}"
+    _require_finite(plant, system, place)
     for name, matrix in (("mass", M), ("stiffness", K)):
         gap = np.abs(matrix - matrix.T)
         if gap.max() > 1e-9 * np.abs(matrix).max():
@@ -236,15 +237,14 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
             entries = (
                 f"row {i + 1}, column {j + 1} is {matrix[i, j]:g}, its mirror {matrix[j, i]:g}"
             )
-            words = f"{name} is not symmetric at theta = {named_values(plant.names, theta)}"
-            raise PlantError(f"{words}: {entries}; make it symmetric")
+            raise PlantError(f"{name} is not symmetric {place}: {entries}; make it symmetric")
     try:
         np.linalg.cholesky(M)
     except np.linalg.LinAlgError:
         least = float(np.linalg.eigvalsh(M)[0])
-        words = f"mass is not positive definite at theta = {named_values(plant.names, theta)}"
+        words = f"mass is not positive definite {place}: its least eigenvalue is {least:.3g}"
         remedy = "give every coordinate a mass, or narrow the bounds of theta"
-        raise PlantError(f"{words}: its least eigenvalue is {least:.3g}; {remedy}") from None
+        raise PlantError(f"{words}; {remedy}") from None
     return system
 
 

@@ -192,15 +192,11 @@ def _scaled_channels(
 
 
 def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
-    """The frequency grid, and the least singular value of the plant on it."""
-    grid = _frequency_grid(A, B, C)
-    return grid, plant_gain(A, B, C, grid)
-
-
-def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
-    """A logarithmic grid with points crowded around lightly damped poles and zeros."""
+    """A logarithmic grid with points crowded around lightly damped poles and zeros, and the least
+    singular value of the plant on it."""
     system = strictly_proper(A, B, C)
     roots = np.concatenate([system.poles, system.zeros()])
     roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
     wide = np.maximum(np.abs(roots.real), 1e-9 * roots.imag) + 1j * roots.imag
-    return np.ascontiguousarray(frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS)))
+    grid = np.ascontiguousarray(frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS)))
+    return grid, plant_gain(A, B, C, grid)

@@ -98,9 +98,10 @@ def robustness(
 
 def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
-    sampled = loop.sampling is not None
+    sampled, modal = loop.sampling is not None, modal_plant(system, run.problem.suspension)
+    omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
-    view = loop_view([loop], bounded, bandwidth_hz=run.figures.bandwidth / HZ)
+    view = loop_view([loop], bounded, bandwidth_hz=omega_b / HZ)
     ends = [] if loop.sampling is None else [NYQUIST * 0.5 / loop.sampling.period]
     hz = np.append(view.hz, ends)
 
@@ -113,22 +114,13 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
         peaks=highest(sizes, HZ * hz) if sampled else norms(loop.closed),
         margins=margins(loop.responses, hz),
         noise=noise(loop, d.sensor, d.disturbance),
-        statics=statics(
-            run.plant.plant_si(),
-            run.controller,
-            bandwidth=run.figures.bandwidth,
-            omega_low=run.problem.inner.omega_low,
-        ),
+        statics=statics(loop.plant, loop.controller, bandwidth=omega_b, omega_low=low),
         shift=shift_line(run, system, d.shift),
         damping=damping_line(run, system, *d.damping),
         modes=single_modes(run, system, d.shift),
         box=worst_in_box(run, system, d.shift, d.damping),
         tolerances=tolerances(run, d.tolerance, d.samples, seed, workers),
-        structured=None
-        if sampled
-        else structured_bound(
-            run.plant, modal_plant(system, run.problem.suspension), run.controller, hz
-        ),
+        structured=None if sampled else structured_bound(run.plant, modal, run.controller, hz),
         setpoint=profile,
         moves=_moves(run, profile, d),
     )

@@ -75,22 +75,17 @@ class SampleStore:
         if not kinds:
             return  # new, or being made by another process in one transaction
         if any(kind in ("trigger", "view") for _, kind in kinds):
-            raise SampleStoreError(
-                f"{self.path}: holds statements (triggers, views) that no store of ours has; "
-                "choose another --out"
-            )
+            raise self._foreign("holds statements (triggers, views) that no store of ours has")
         if not {"meta", "problems", "samples", "results"} <= tables:
-            raise SampleStoreError(
-                f"{self.path}: is a database of another program; choose another --out"
-            )
+            raise self._foreign("is a database of another program")
         found = self._db.execute("select * from meta where name = 'schema'").fetchone()
         columns = self._columns() | {_ADDED}
         schema = None if found is None else found[1]
         if schema != str(SCHEMA) or not set(COLUMNS) <= columns:
-            raise SampleStoreError(
-                f"{self.path}: is a sample store of schema {schema}, not {SCHEMA}; "
-                "choose another --out"
-            )
+            raise self._foreign(f"is a sample store of schema {schema}, not {SCHEMA}")
+
+    def _foreign(self, words: str) -> SampleStoreError:
+        return SampleStoreError(f"{self.path}: {words}; choose another --out")
 
     def _columns(self) -> set[str]:
         return {row[1] for row in self._db.execute("pragma table_info(samples)")}

@@ -179,13 +179,7 @@ def _sweep(
         ]
         local = replace(inner, omega_S=ranges[0], omega_T=ranges[1], sweep_points=LOCAL_POINTS)
     plant = scaled_plant(problem, tuple(theta))
-    rows = sweep(
-        plant,
-        problem.weights,
-        *local.axes(),
-        omega_low=inner.omega_low,
-        gamma_backoff=inner.gamma_backoff,
-    )
+    rows = sweep(plant, problem.weights, *local.axes(), **inner.synthesis_options)
     feasible: list[DesignFigures] = [row for row in rows if inner.feasible(row)]
     if not feasible:
         if around is None:

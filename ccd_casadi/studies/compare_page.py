@@ -36,9 +36,8 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     if len(problem.names) == 2:
         chapters.append(c.Chapter("Paths over the landscape", (_paths(folder, comparison, best),)))
     if best is not None:
-        chapters.append(
-            c.Chapter("Sensitivity, baseline and co-design", (_loops(comparison, best),))
-        )
+        loops = _loops(comparison, best)
+        chapters.append(c.Chapter("Sensitivity, baseline and co-design", (loops,)))
         thetas = {
             name: comparison.method(name).figures.get("theta") for name in ("sequential", best)
         }
@@ -185,9 +184,8 @@ def cost_figure(methods: Sequence[Method]) -> c.Figure:
         (c.Panel(x, "least J so far (–)", tuple(curves_J), log_x=True),),
         (c.Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True),),
     )
-    lines = c.Lines(
-        rows, "Objective and bandwidth against the number of true syntheses", (3.6, 2.6)
-    )
+    title = "Objective and bandwidth against the number of true syntheses"
+    lines = c.Lines(rows, title, (3.6, 2.6))
     return c.Figure(lines, "Further left is cheaper, lower is better.", (_cost_table(methods),))
 
 

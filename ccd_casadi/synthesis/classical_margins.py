@@ -7,6 +7,7 @@ takes longer than all of a small co-design's margins together.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,15 +79,12 @@ def _at_least(values: Array, places: Array) -> float:
 def least_margins(respond: PlantAndController, omega: Array) -> ClassicalMargins:
     """The least of all loops broken one at a time at the plant's inputs."""
 
-    def broken(i: int) -> Callable[[Array], NDArray[np.complex128]]:
-        def L(at: Array) -> NDArray[np.complex128]:
-            G, K = respond(at)
-            return equivalent_open_loop(K @ G, i)
-
-        return L
+    def broken(at: Array, i: int) -> NDArray[np.complex128]:
+        G, K = respond(at)
+        return equivalent_open_loop(K @ G, i)
 
     inputs = respond(omega[:1])[0].shape[2]
-    return least_of([classical_margins(broken(i), omega) for i in range(inputs)])
+    return least_of([classical_margins(partial(broken, i=i), omega) for i in range(inputs)])
 
 
 def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:

@@ -67,10 +67,10 @@ def to_control(named: NamedSystem, name: str = "") -> "control.StateSpace":
     import control
 
     parts = [getattr(named.system, part).copy() for part in PARTS]
-    signals: dict[str, Any] = {"inputs": list(named.inputs), "outputs": list(named.outputs)}
-    if name:
-        signals["name"] = name
-    return control.ss(*parts, named.system.period, remove_useless_states=False, **signals)
+    return control.ss(
+        *parts, named.system.period, inputs=list(named.inputs), outputs=list(named.outputs),
+        name=name or None, remove_useless_states=False,
+    )  # fmt: skip
 
 
 def from_control(system: Any) -> StateSpace:
@@ -156,15 +156,13 @@ def mat_variables(path: Path) -> dict[str, Any]:
     """What a .mat file holds by name. Raises UserError where it cannot be read."""
     try:
         with path.open("rb") as stream:
-            content: dict[str, Any] = scipy.io.loadmat(stream)
-            return content
+            return dict(scipy.io.loadmat(stream))
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such file") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
     except NotImplementedError:  # how SciPy refuses the HDF5 files of MATLAB 7.3
-        words = "is a MATLAB 7.3 file; write it with save(…, '-v7')"
-        raise UserError(f"{path}: {words}") from None
+        raise UserError(f"{path}: is a MATLAB 7.3 file; write it with save(…, '-v7')") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
         words = " ".join(str(error).split())[:120]
         raise UserError(f"{path}: is not a readable .mat file: {words}") from None
@@ -211,22 +209,19 @@ def _system(path: Path, name: str, struct: Mapping[str, Any]) -> NamedSystem:
         sizes = ", ".join(str(part.shape) for part in (A, B, C, D))
         raise UserError(f"{path}: {name}: the sizes of A, B, C, D do not fit: {sizes}")
 
-    def text(key: str) -> tuple[str, ...]:
-        return _strings(struct.get(key))
-
     period = 0.0
     if "Ts" in struct:
         Ts = _matrix(path, f"{name}.Ts", struct["Ts"])
         if Ts.size != 1 or Ts[0, 0] < 0.0:
             raise UserError(f"{path}: {name}.Ts: is not a sampling period in s, or 0")
         period = float(Ts[0, 0])
-    inputs, outputs = text("InputName"), text("OutputName")
+    signals = ("InputName", "OutputName", "InputUnit", "OutputUnit")
+    inputs, outputs, *units = (_strings(struct.get(key)) for key in signals)
     return NamedSystem(
         StateSpace(A, B, C, D, period=period),
         inputs if len(inputs) == m else _names("u", m),
         outputs if len(outputs) == p else _names("y", p),
-        " ".join(text("InputUnit")),
-        " ".join(text("OutputUnit")),
+        *map(" ".join, units),
     )
 
 
@@ -248,11 +243,8 @@ def _strings(value: Any) -> tuple[str, ...]:
     """The texts of a cell array, or of one text."""
     if value is None:
         return ()
-    found = []
-    for item in np.asarray(value).ravel():
-        part = np.asarray(item)
-        found.append(str(part.ravel()[0]) if part.size else "")
-    return tuple(found)
+    parts = map(np.ravel, np.asarray(value).ravel())
+    return tuple(str(part[0]) if part.size else "" for part in parts)
 
 
 def _names(letter: str, count: int) -> tuple[str, ...]:

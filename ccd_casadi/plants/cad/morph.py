@@ -150,15 +150,12 @@ def read_morph(file: str | Path) -> Morph:
                 raise ValueError(f"its format is {data['format']}, not {FORMAT}")
             faces = {key[5:]: data[key] for key in data.files if key.startswith("face:")}
             arrays = ("lower", "upper", "exponents", "coefficients", "tets")
-            lower, upper, exponents, coefficients, tets = (data[key] for key in arrays)
+            fields = {key: data[key] for key in arrays}
             names = tuple(map(str, data["names"]))
-            morph = Morph(
-                names, lower, upper, exponents, coefficients, tets, faces, float(data["error"])
-            )
+            return Morph(names, faces=faces, error=float(data["error"]), **fields)
     except Exception as error:
         words = "write it with ccd_casadi.plants.cad.draw_morph"
         raise PlantError(f"{Path(file).name}: is not a morphed mesh ({error}); {words}") from None
-    return morph
 
 
 def _terms(unit: Array, exponents: np.ndarray) -> Array:

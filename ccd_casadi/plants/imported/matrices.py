@@ -6,8 +6,9 @@ names: Matrix Market .mtx, .npz, or .mat with one matrix in it), `damping` (moda
 (row of the matrices, from 0) and `gain`, as many rows a name as it takes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.io import loadmat, mmread
@@ -157,12 +158,11 @@ def _matrix(path: Path) -> csc_array:
         if path.suffix == ".mtx":
             value = mmread(path)
         elif path.suffix == ".npz":
-            value = _from_npz(path)
+            with np.load(path, allow_pickle=False) as file:
+                value = load_sparse(path) if "format" in file else _only(path, file)
         elif path.suffix == ".mat":
             held = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
-            if len(held) != 1:
-                raise PlantError(f"{path}: holds {', '.join(held) or 'nothing'}; save one matrix")
-            value = next(iter(held.values()))
+            value = _only(path, held)
         else:
             raise PlantError(f"{path}: is not a .mtx, .npz or .mat; save the matrix as one of them")
     except PlantError:
@@ -184,14 +184,10 @@ def _matrix(path: Path) -> csc_array:
     return matrix
 
 
-def _from_npz(path: Path) -> object:
-    with np.load(path, allow_pickle=False) as file:
-        if "format" not in file.files:
-            if len(file.files) != 1:
-                words = ", ".join(file.files) or "nothing"
-                raise PlantError(f"{path}: holds {words}; save one matrix")
-            return file[file.files[0]]
-    return load_sparse(path)
+def _only(path: Path, held: Mapping[str, Any]) -> Any:
+    if len(held) != 1:
+        raise PlantError(f"{path}: holds {', '.join(held) or 'nothing'}; save one matrix")
+    return next(iter(held.values()))
 
 
 def read_dofs(folder: Path, columns: Sequence[str]) -> Rows:
