@@ -104,8 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = "sections: start one search from the controller of this run, not many"
     add("--begin-at", metavar="FOLDER", type=Path, help=words)
     add_break_frequencies(arguments, "of a weight; with both: one synthesis, no search")
-    ahead = "ccd_casadi.inner_problem.structured_search"
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"], ahead=ahead)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":
