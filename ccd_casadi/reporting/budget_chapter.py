@@ -66,10 +66,7 @@ def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
 def _figure(model: BudgetFigures) -> Figure:
     shown = [item for item in model.sources if item.cumulative[-1] > 0.0]
     hz = np.unique(np.concatenate([item.hz for item in shown]))
-    parts = [
-        np.interp(hz, item.hz, item.cumulative, left=0.0, right=item.cumulative[-1])
-        for item in shown
-    ]
+    parts = [np.interp(hz, item.hz, item.cumulative, left=0.0) for item in shown]
     whole = np.sum(parts, axis=0)
     low = float(hz[np.searchsorted(whole, SHOWN**2 * whole[-1])])
     high = float(hz[min(np.searchsorted(whole, (1.0 - 1e-6) * whole[-1]), len(hz) - 1)])
