@@ -52,12 +52,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         about="the folder with index.csv and dofs.csv",
         without_effect=["--workers", "--seed", "--no-user-code"],
     )
-    arguments.add_argument(
-        "--modes", type=integer(1), default=10, metavar="N", help="modes of matrices (default: 10)"
-    )
-    arguments.add_argument(
-        "--static-correction", action="store_true", help="exact static compliance of matrices"
-    )
+    add = arguments.add_argument
+    words = "modes of matrices (default: 10)"
+    add("--modes", type=integer(1), default=10, metavar="N", help=words)
+    add("--static-correction", action="store_true", help="exact static compliance of matrices")
     return run(command, arguments, argv, needs=["ccd_casadi.plants.imported.results"])
 
 

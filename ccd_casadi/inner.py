@@ -99,18 +99,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser(
         "ccd_casadi.inner", "Find the best controller at one theta; print it as JSON."
     )
-    arguments.add_argument(
-        "--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"
-    )
-    arguments.add_argument(
-        "--begin-at",
-        metavar="FOLDER",
-        type=Path,
-        help="sections: start one search from the controller of this run, not many",
-    )
+    add = arguments.add_argument
+    add("--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none")
+    words = "sections: start one search from the controller of this run, not many"
+    add("--begin-at", metavar="FOLDER", type=Path, help=words)
     add_break_frequencies(arguments, "of a weight; with both: one synthesis, no search")
-    ahead = "ccd_casadi.inner_problem.structured_search"
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"], ahead=ahead)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":

@@ -58,13 +58,8 @@ def command(options: argparse.Namespace) -> ExitCode:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser("ccd_casadi.insight", "Trade hardware cost against bandwidth.")
-    arguments.add_argument(
-        "--points",
-        metavar="N",
-        type=integer(2, 9999),
-        default=20,
-        help="most points on the front (default: 20)",
-    )
+    words = "most points on the front (default: 20)"
+    arguments.add_argument("--points", metavar="N", type=integer(2, 9999), default=20, help=words)
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.insight"])
 

@@ -203,8 +203,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = "write no pages, for jobs that only need result.json"
     add("--no-report", action="store_true", help=words)
     add_scheduler(arguments)
-    ahead = "ccd_casadi.inner_problem.structured_search"
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"], ahead=ahead)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
 
 if __name__ == "__main__":

@@ -60,9 +60,7 @@ class Integral:
 
     def cumulative(self) -> Array:
         """The integral from the lowest frequency to each of `ends`, (rows, k + 1)."""
-        return np.concatenate(
-            [np.zeros((len(self.parts), 1)), np.cumsum(self.parts, axis=1)], axis=1
-        )
+        return np.pad(np.cumsum(self.parts, axis=1), ((0, 0), (1, 0)))
 
 
 def integrate(f: Callable[[Array], Array], ends: Array) -> Integral:

@@ -104,10 +104,8 @@ class ShapedSpectrum:
         """
         corners = [corner[0] for corner in self.poles]
         unit = HZ * float(np.exp(np.mean(np.log(corners)))) if corners else 1.0
-        top = np.polymul(
-            polynomial(self.zeros, unit),
-            np.array(path) * unit ** np.arange(len(path) - 1, -1, -1.0),
-        )
+        scaled = np.array(path) * unit ** np.arange(len(path) - 1, -1, -1.0)
+        top = np.polymul(polynomial(self.zeros, unit), scaled)
         bottom = polynomial(self.poles, unit)
         top = np.trim_zeros(np.atleast_1d(top), "f") * np.sqrt(self.level)
         if len(top) > len(bottom):

@@ -25,7 +25,7 @@ from ccd_casadi.cases.kinds import check_kind
 from ccd_casadi.cases.motion import check_motion
 from ccd_casadi.cases.places import checked_places
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
-from ccd_casadi.cases.tables import TABLES, Case
+from ccd_casadi.cases.tables import REQUIRED, TABLES, Case
 from ccd_casadi.plants.nodes import names_in
 from ccd_casadi.support.options import DEFAULT_CASE, one_line
 
@@ -137,10 +137,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             raise fail(name, f"unknown table{closest(name, known)}")
         if not isinstance(table, Mapping):
             raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
-    required = (
-        name for name, kind in TABLES.items() if MISSING in [item.default for item in fields(kind)]
-    )
-    for name in ("plant", "theta", *required):
+    for name in ("plant", "theta", *REQUIRED):
         if name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
     tables = {name: table_of(kind, name, data.get(name, {}), fail) for name, kind in TABLES.items()}

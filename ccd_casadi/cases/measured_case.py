@@ -52,9 +52,8 @@ def measured_case(path: Path) -> MeasuredCase | None:
     fail = Fail(path)
     for name, table in data.items():
         if name not in ("plant", *_TABLES):
-            raise fail(
-                name, f'has no effect on plant.model = "{MODEL}", which has no theta; drop it'
-            )
+            words = f'has no effect on plant.model = "{MODEL}", which has no theta; drop it'
+            raise fail(name, words)
         if not isinstance(table, Mapping):
             raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     response = _response(plant, path, fail)

@@ -27,7 +27,8 @@ def plant_report(
     """The diagnosis as plain values; frequencies in Hz, M_K in force over displacement."""
     plant = plant_of(problem)
     start = facts[0]
-    ranges = _ranges(facts)
+    values = constraint_values(plant, problem.start)
+    constraints = zip(plant.constraint_names, values, strict=True)
     return {
         "plant": case.plant.model or case.plant.function,
         "inputs": plant.inputs,
@@ -40,7 +41,7 @@ def plant_report(
         "inertia": start.inertia,
         "rigid_modes": sum(mode.rigid for mode in start.modes),
         "modes": [asdict(mode) for mode in start.modes],
-        "frequency_ranges_hz": ranges,
+        "frequency_ranges_hz": _ranges(facts),
         "zeros": [asdict(zero) for zero in start.zeros],
         "effort_hz": start.effort_hz,
         "bandwidth_window_hz": [share * start.effort_hz for share in WINDOW],
@@ -48,9 +49,7 @@ def plant_report(
         "M_K_for_bandwidth": _suitable(problem, start),
         "constraints": [
             {"name": name, "value": float(value), "met": bool(value <= 0.0)}
-            for name, value in zip(
-                plant.constraint_names, constraint_values(plant, problem.start), strict=True
-            )
+            for name, value in constraints
         ],
         "budget": [  # each source by the RMS of its spectrum; None where it is white
             {"name": s.name, "kind": s.kind.value, "rms": s.spectrum.rms(), "unit": s.unit}

@@ -43,9 +43,8 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
     known = model_named(model) if isinstance(model, str) else None
     if model is not None and known is None:
         hint = closest(str(model), model_names())
-        raise fail(
-            "plant.model", f"is {short_repr(model)}, not a known model{hint}; or use function"
-        )
+        words = f"is {short_repr(model)}, not a known model{hint}; or use function"
+        raise fail("plant.model", words)
     if function is not None:
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
         if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
@@ -92,11 +91,7 @@ def _option(value: Any) -> str | None:
     if too_large(value):
         return f"is {short_repr(value)}; write it as a float"
     if isinstance(value, list):
-        for item in value:
-            wrong = _option(item)
-            if wrong is not None:
-                return wrong
-        return None
+        return next(filter(None, map(_option, value)), None)
     if isinstance(value, str | bool | int | float):
         return None
     return f"is {short_repr(value)}; give a number, text, true or false, or a list of them"

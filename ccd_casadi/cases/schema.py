@@ -13,7 +13,7 @@ from ccd_casadi.cases.checks import check_of, unit_of
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.parameters import KEYS as THETA
-from ccd_casadi.cases.tables import TABLES
+from ccd_casadi.cases.tables import REQUIRED, TABLES
 from ccd_casadi.plants.registry import model_names
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
@@ -69,7 +69,6 @@ def case_schema() -> dict[str, Any]:
         spectrum["properties"]["unit"] = {"enum": list(units)}  # type: ignore[index]
         entry = tables["budget"]["properties"][kind.value]
         entry["anyOf"] = [spectrum, {"type": "array", "items": spectrum}]
-    required = [name for name, kind in TABLES.items() if any(_required(f) for f in fields(kind))]
     of_data = {"plant": {"properties": {"model": {"const": MEASURED}}, "required": ["model"]}}
     return {
         "$schema": DRAFT,
@@ -78,7 +77,7 @@ def case_schema() -> dict[str, Any]:
         "properties": tables,
         "required": ["plant", "inner"],
         "if": {"properties": of_data},
-        "else": {"required": ["theta", *required]},  # what was measured has no θ to choose
+        "else": {"required": ["theta", *REQUIRED]},  # what was measured has no θ to choose
         "additionalProperties": False,
     }
 

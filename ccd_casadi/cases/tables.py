@@ -5,7 +5,7 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -325,3 +325,6 @@ TABLES: dict[str, type] = {
     "motor": MotorTable,
     "move": MoveTable,
 }
+REQUIRED = tuple(  # tables with a key that has no default
+    name for name, kind in TABLES.items() if MISSING in [item.default for item in fields(kind)]
+)

@@ -72,10 +72,8 @@ def solve_nested(
     problem = sampler.problem
     lower, upper = box(problem)
     if given is None:
-        thetas = np.vstack(
-            [design(options.plan, lower, upper, options.points, seed), np.array(problem.start)]
-        )
-        thetas = _allowed(problem, np.unique(thetas, axis=0))
+        plan = design(options.plan, lower, upper, options.points, seed)
+        thetas = _allowed(problem, np.unique(np.vstack([plan, problem.start]), axis=0))
     else:
         thetas = given.thetas
     samples = sampler.values(thetas)
@@ -108,10 +106,9 @@ def solve_nested(
         surrogate = fit_bandwidth(problem, local, seed, options.kernel, gradients)
         program = nested_program(problem, to_casadi(surrogate, std=False))
         program = replace(program, lower=low, upper=high)
+        starts = _starts(problem, local, low, high, options.starts, seed + round_number)
         try:
-            solution = solve_program(
-                program, _starts(problem, local, low, high, options.starts, seed + round_number)
-            )
+            solution = solve_program(program, starts)
         except OuterFailure:
             radius *= 0.5
             continue
@@ -122,11 +119,10 @@ def solve_nested(
         iterate = _iterate(problem, best, sample, predicted, radius)
         iterates.append(iterate)
         samples.append(sample)
-        improved = iterate.objective < value_of(best)
+        change = iterate.objective - value_of(best)
+        improved = change < 0.0
         agreed = iterate.error <= options.tolerance
-        settled = abs(iterate.objective - value_of(best)) <= options.tolerance * abs(
-            iterate.objective
-        )
+        settled = abs(change) <= options.tolerance * abs(iterate.objective)
         if sampler.improvements > improvements:
             continue  # fitted to worse controllers than are known now
         if agreed and (iterate.step <= STEP or settled):

@@ -8,6 +8,7 @@ for, down to which the limited move ends in its window.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,33 +61,26 @@ def on_hardware(
         forward = feedforward(plant, K.period, delay)
     except UserError:
         forward = None
-
-    def made(
-        controller: Realisation, ahead: Array | None, electronics: Electronics | None = None
-    ) -> Move:
-        return move(
-            plant, controller, delay, profile, forward=ahead, window=window, hardware=electronics
-        )
-
+    made = partial(move, plant, delay=delay, profile=profile, window=window)
     progress("a move")
-    unlimited = made(free, None)
+    unlimited = made(free)
     ways = {"feedback alone": unlimited}
     if forward is not None:
-        ways["with feedforward"] = unlimited = made(free, forward)
+        ways["with feedforward"] = unlimited = made(free, forward=forward)
     if realisation.saturation is not None:
         clipped = replace(realisation, back_calculation=None)
         words = f"limited to {realisation.saturation:.4g} N, only clipped"
-        ways[words] = made(clipped, forward)
-        ways["limited, with back-calculation"] = made(realisation, forward)
+        ways[words] = made(clipped, forward=forward)
+        ways["limited, with back-calculation"] = made(realisation, forward=forward)
     if hardware is not None and not hardware.ideal:
-        ways["with the electronics"] = made(realisation, forward, hardware)
+        ways["with the electronics"] = made(realisation, forward=forward, hardware=hardware)
     peak, least = float(unlimited.peak_force.max()), np.nan
     if realisation.saturation is not None and np.isfinite(unlimited.settled):
         progress("least force")
         least = 1.0
         for share in SHARES:
             held = with_anti_windup(replace(free, saturation=share * peak), bandwidth)
-            if not np.isfinite(made(held, forward).settled):
+            if not np.isfinite(made(held, forward=forward).settled):
                 break
             least = share
     return OnHardware(profile, window, forward, ways, least)

@@ -8,6 +8,7 @@ block's four numbers.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import schur, solve_sylvester
@@ -35,11 +36,8 @@ class Realisation:
     @property
     def block_entries(self) -> Array:
         """The diagonal blocks of A, each row by row, one after the other."""
-        pieces, i = [np.zeros(0)], 0
-        for n in self.blocks:
-            pieces.append(self.system.A[i : i + n, i : i + n].ravel())
-            i += n
-        return np.concatenate(pieces)
+        ends = pairwise(np.cumsum([0, *self.blocks]))
+        return np.concatenate([np.zeros(0), *(self.system.A[i:j, i:j].ravel() for i, j in ends)])
 
 
 def realise(

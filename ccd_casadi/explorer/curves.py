@@ -104,9 +104,8 @@ def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
 
 def sampled_of(look: Look) -> AsSampled | None:
     """A certified design at the rate and delay of its sliders; None where it is designed for it."""
-    if look.controller is None or kind_of(look.problem).as_designed:
-        return None
-    if look.standing is Standing.REFUSED:
+    refused = look.standing is Standing.REFUSED
+    if look.controller is None or refused or kind_of(look.problem).as_designed:
         return None
     return as_sampled(look.plant, look.controller, look.knobs.rate_hz, look.knobs.delay_us)
 

@@ -58,8 +58,8 @@ def standing_html(
     shown = (
         f'<p class="{look.standing.name.lower()}"><b>{escape(standing)}</b></p>'
         f'<p class="answer"><b>{escape(answer)}</b> bandwidth ω_b</p>'
+        f"<p>{escape(' · '.join(facts))}</p><p class=how>{escape(how)}</p>"
     )
-    shown += f"<p>{escape(' · '.join(facts))}</p><p class=how>{escape(how)}</p>"
     if sampled is not None:
         shown += f"<p>{escape(sampled_words(sampled, look.problem.inner.S_max))}</p>"
     return shown

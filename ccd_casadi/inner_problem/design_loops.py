@@ -63,13 +63,9 @@ def loop_budget(
     """None for a problem without a budget; the controller in SI, as `controller.json` has it."""
     if problem.budget is None:
         return None
-    plants, hold = kind_of(problem).plants(theta), problem.sampling
-    model = evaluate_budget(plants[0].plant_si(), controller, problem.budget, hold)
-    found = [
-        variance_slopes(Loop(plant.plant_si(), controller, hold), problem.budget, ())
-        for plant in plants
-    ]
+    loops, hold = design_loops(problem, theta, controller), problem.sampling
+    model = evaluate_budget(loops[0].plant, controller, problem.budget, hold)
+    found = [variance_slopes(loop, problem.budget, ()) for loop in loops]
     largest = np.max([np.full(3, np.inf) if item is None else item.value for item in found], axis=0)
-    return LoopBudget(
-        model, len(plants), float(np.sqrt(largest[0])), float(np.sqrt(largest[2])), hold
-    )
+    error, force = np.sqrt(largest[[0, 2]]).tolist()
+    return LoopBudget(model, len(loops), error, force, hold)

@@ -1,7 +1,7 @@
 """A controller of fixed structure as a motion engineer reads it: sections in Hz and damping."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -83,13 +83,7 @@ def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict
     units = {Kind.GAIN: "N/m", Kind.FREQUENCY: "Hz", Kind.DAMPING: "1"}
     rows = zip(structure.names, structure.kinds, np.exp(kappa).tolist(), strict=True)
     return {
-        "structure": {
-            "integrator": structure.integrator,
-            "lead": structure.lead,
-            "biquads": structure.biquads,
-            "roll_off": structure.roll_off,
-            "least_damping": structure.least_damping,
-        },
+        "structure": asdict(structure),
         "order": structure.order,
         "parameters": [
             {"name": name, "value": value / HZ if kind is Kind.FREQUENCY else value,

@@ -165,8 +165,7 @@ def _marks(loop: LoopView, gains: Array) -> list[Mark]:
         inside = [hz for hz in places if loop.hz[0] <= hz <= loop.hz[-1]]
         for hz in inside[:MOST_MARKS]:
             y = float(gain[np.abs(loop.hz - hz).argmin()])
-            few = len(inside) <= 3
-            text = f"{number(hz, 4)} Hz" if few else ""
+            text = f"{number(hz, 4)} Hz" if len(inside) <= 3 else ""
             found.append(Mark(hz, y, text, marker, BLACK, (0.0, dy)))
     return found
 

@@ -55,27 +55,18 @@ def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
             f". MA and MSD: moving average and moving standard deviation over "
             f"{number(1e3 * (model.window or 0.0))} ms"
         )
-    exact = [item for item in model.sources if item.source.shaped]
-    tables = [item for item in model.sources if not item.source.shaped]
-    if exact:
-        worst = max(item.disagreement for item in exact)
-        words += (
-            ". Filters by Lyapunov's equation; the integral over frequency differs by "
-            f"{number(worst, 1)} (relative)"
-        )
-    if tables:
-        worst = max(item.disagreement for item in tables)
-        words += f". Tables by quadrature, relative error {number(worst, 1)} by its own estimate"
+    filters = "Filters by Lyapunov's equation; the integral over frequency differs by {} (relative)"
+    tables = "Tables by quadrature, relative error {} by its own estimate"
+    for shaped, sentence in ((True, filters), (False, tables)):
+        off = [item.disagreement for item in model.sources if item.source.shaped == shaped]
+        words += f". {sentence.format(number(max(off), 1))}" if off else ""
     return Words(words + "."), Table(tuple(head), tuple(rows))
 
 
 def _figure(model: BudgetFigures) -> Figure:
     shown = [item for item in model.sources if item.cumulative[-1] > 0.0]
     hz = np.unique(np.concatenate([item.hz for item in shown]))
-    parts = [
-        np.interp(hz, item.hz, item.cumulative, left=0.0, right=item.cumulative[-1])
-        for item in shown
-    ]
+    parts = [np.interp(hz, item.hz, item.cumulative, left=0.0) for item in shown]
     whole = np.sum(parts, axis=0)
     low = float(hz[np.searchsorted(whole, SHOWN**2 * whole[-1])])
     high = float(hz[min(np.searchsorted(whole, (1.0 - 1e-6) * whole[-1]), len(hz) - 1)])

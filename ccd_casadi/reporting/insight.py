@@ -221,16 +221,13 @@ def rule_sentence(bandwidth_hz: float, natural_hz: Sequence[float]) -> str:
     first = min(natural_hz)
     ratio = first / bandwidth_hz
     low, high = RULE
-    verdict = (
-        f"below the {low:g} to {high:g} of the rule of thumb: check the robustness to that "
-        "resonance"
-        if ratio < low
-        else f"within the {low:g} to {high:g} of the rule of thumb"
-        if ratio <= high
-        else f"above the {low:g} to {high:g} of the rule of thumb: by that rule it could be faster"
-    )
+    place, what_then = "within", ""
+    if ratio < low:
+        place, what_then = "below", ": check the robustness to that resonance"
+    elif ratio > high:
+        place, what_then = "above", ": by that rule it could be faster"
     return (
         f"The first resonance, {number(first, 4)} Hz, is {number(ratio, 3)} times the bandwidth, "
-        f"{verdict}. By the rule this stage would get {number(first / high, 3)} to "
-        f"{number(first / low, 3)} Hz."
+        f"{place} the {low:g} to {high:g} of the rule of thumb{what_then}. By the rule this stage "
+        f"would get {number(first / high, 3)} to {number(first / low, 3)} Hz."
     )

@@ -4,8 +4,6 @@ A mixed-sensitivity design at γ has |W_S S|² + |W_KS KS|² + |W_T T|² of abou
 pressed; the largest of the three shares at a frequency is what holds it there.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
@@ -50,13 +48,11 @@ def limit_sentences(loop: LoopView) -> list[str]:
     tops = [peak for peak in loop.peaks if peak[1] > 1.05]
     if tops:
         hz, gain = max(tops, key=lambda peak: peak[1])
+        kinds = {"resonance": loop.resonances_hz, "transmission zero": loop.antiresonances_hz}
         near = [
-            f"the plant's nearest {kind} is at {number(value, 4)} Hz"
-            for kind, value in (
-                ("resonance", _nearest(loop.resonances_hz, hz)),
-                ("transmission zero", _nearest(loop.antiresonances_hz, hz)),
-            )
-            if np.isfinite(value)
+            f"the plant's nearest {kind} is at {number(nearest, 4)} Hz"
+            for kind, places in kinds.items()
+            for nearest in sorted(places, key=lambda f: abs(np.log(f / hz)))[:1]
         ]
         top = f"S is largest, {number(gain, 4)}, at {number(hz, 4)} Hz"
         words.append("; ".join(filter(None, (top, " and ".join(near)))) + ".")
@@ -66,10 +62,6 @@ def limit_sentences(loop: LoopView) -> list[str]:
         listed = ", ".join(number(f, 4) for f in (*below, *close))
         words.append(f"Controlled resonances, below twice the bandwidth: {listed} Hz.")
     return words
-
-
-def _nearest(values: Sequence[float], hz: float) -> float:
-    return min(values, key=lambda v: abs(np.log(v / hz)), default=np.nan)
 
 
 def limit_blocks(loop: LoopView, *more: str) -> tuple[Block, ...]:

@@ -24,8 +24,7 @@ def nyquist_panel(
     """Loci (k,) complex over Hz, the first the model's; beside one other panel of this height in
     inches. `names`: of the first, and of the others. The first has its direction and frequencies.
     """
-    angle = np.linspace(0.0, 2.0 * np.pi, 200)
-    circle = np.exp(1j * angle)
+    circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
     curves = [
         Curve(line.real, line.imag, names[1] * (i == 1), others, width=1.0, hz=hz) if i
         else Curve(line.real, line.imag, names[0] * (len(loci) > 1), width=1.6, hz=hz)

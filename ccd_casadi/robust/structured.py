@@ -73,9 +73,8 @@ def structured_bound(
     allowed, worst = 1.0, float(new[0])  # |δ| = 1 leaves no stiffness
     for _ in range(1 + ROUNDS):
         K = controller.response(2.0 * np.pi * new)
-        M = np.array(
-            [_errors(modal, kept, 2.0 * np.pi * f, k) for f, k in zip(new, K, strict=True)]
-        )
+        each = zip(2.0 * np.pi * new, K, strict=True)
+        M = np.array([_errors(modal, kept, omega, k) for omega, k in each])
         mu = mu_bound(M)
         known = np.vstack([known, np.column_stack([new, mu])])
         found = _largest(M, 1.0 / mu.max(), allowed)
@@ -106,9 +105,8 @@ def _stand(M: NDArray, r: float) -> NDArray[np.bool_]:
         left = np.flatnonzero(~standing)
         if left.size == 0:
             break
-        turned = np.linalg.solve(
-            np.eye(M.shape[1]) - 1j * kappa * r * M[left] * side[left], M[left]
-        )
+        moved = np.eye(M.shape[1]) - 1j * kappa * r * M[left] * side[left]
+        turned = np.linalg.solve(moved, M[left])
         turned *= r * np.sqrt(1.0 + kappa**2)
         # cheapest first: the two norms that bound σ_max
         size = np.abs(turned)

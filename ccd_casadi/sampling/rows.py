@@ -51,7 +51,6 @@ class Sample:
 COLUMNS = tuple(field.name for field in fields(Sample))
 _REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
 _TEXTS = frozenset(f.name for f in fields(Sample) if f.type is str)
-_THETA, _CERTIFIED, _GRADIENTS = map(COLUMNS.index, ("theta", "certified", "gradients"))
 
 
 def to_row(sample: Sample) -> tuple[object, ...]:
@@ -71,19 +70,16 @@ def to_row(sample: Sample) -> tuple[object, ...]:
 
 def from_row(row: Sequence[Any]) -> Sample:
     """Its inverse. Raises sqlite3.DatabaseError for a row that `to_row` cannot have made."""
-    values: list[Any] = [
-        math.nan if value is None and name in _REALS else value
-        for name, value in zip(COLUMNS, row, strict=True)
-    ]
-    values[_THETA] = numbers_of(decoded(values[_THETA]))
-    values[_CERTIFIED] = bool(values[_CERTIFIED])
-    if values[_GRADIENTS] is not None:
-        values[_GRADIENTS] = numbers_of(decoded(values[_GRADIENTS]))
-    for name, value in zip(COLUMNS, values, strict=True):
-        if name in _TEXTS and not isinstance(value, str):
-            raise sqlite3.DatabaseError(DAMAGED)
-    numbers_of([value for name, value in zip(COLUMNS, values, strict=True) if name in _REALS])
-    return Sample(*values)
+    values: dict[str, Any] = dict(zip(COLUMNS, row, strict=True))
+    values |= {name: math.nan for name in _REALS if values[name] is None}
+    values["theta"] = numbers_of(decoded(values["theta"]))
+    values["certified"] = bool(values["certified"])
+    if values["gradients"] is not None:
+        values["gradients"] = numbers_of(decoded(values["gradients"]))
+    if not all(isinstance(values[name], str) for name in _TEXTS):
+        raise sqlite3.DatabaseError(DAMAGED)
+    numbers_of([values[name] for name in _REALS])
+    return Sample(**values)
 
 
 def numbers_of(items: Any) -> tuple[float, ...]:

@@ -1,7 +1,6 @@
 """The paper's own method: nested steepest descent on a swept inner problem, the baseline.
 
-At the first θ the sweep covers the whole box of (ω_S, ω_T), afterwards a small range around the
-last optimum (paper, section 3.1.2). The gradient of J is the paper's equation (10),
+The sweep is that of `baselines`. The gradient of J is the paper's equation (10),
 
     ∂J/∂θ = w1 ∂f/∂θ + w2 ∂ω_b/∂θ,
     ∂ω_b/∂θ = -(∂‖S‖₂/∂θ)/(∂‖S‖₂/∂ω_b)             (11, implicit functions)

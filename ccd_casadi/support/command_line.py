@@ -18,7 +18,7 @@ from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.terminal import kept_quiet, say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
-from ccd_casadi.support.worker_process import WorkerLost, import_ahead
+from ccd_casadi.support.worker_process import WorkerLost
 
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
@@ -92,13 +92,11 @@ def run(
     argv: Sequence[str] | None = None,
     *,
     needs: Sequence[str] = (),
-    ahead: str = "",
 ) -> int:
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line.
 
     The modules `needs` are what `main` imports that takes time: they are imported once the options
-    are known to be right, and while a Ctrl-C still finds nothing begun. `ahead` is what its worker
-    processes need.
+    are known to be right, and while a Ctrl-C still finds nothing begun.
     """
     code = ExitCode.INTERRUPTED
     try:
@@ -109,8 +107,6 @@ def run(
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
-    if ahead and options.workers > 1:
-        import_ahead(ahead)
     for module in needs:
         import_module(module)
     raise_on_ctrl_c()

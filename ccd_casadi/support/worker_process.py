@@ -10,7 +10,6 @@ import multiprocessing
 import os
 import pickle
 import signal
-import sys
 import threading
 import time
 import traceback
@@ -28,7 +27,6 @@ THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 GRACE = 2.0  # s of processor time beyond the deadline, after which the system ends the process
 STARTING = 60.0  # seconds that the process itself may take to come up
 _SPAWN = multiprocessing.get_context("spawn")  # a fork would copy locks that threads hold
-_started_by: list[Any] = [_SPAWN]  # last: how processes are started
 
 
 class WorkerLost(RuntimeError):
@@ -47,8 +45,7 @@ class WorkerProcess:
         with interrupts_held(), _one_thread_each():
             self.pipe, theirs = _SPAWN.Pipe()
             # A daemon: it is ended at exit even where the pool was not left properly.
-            start = _started_by[-1].Process
-            self.process = start(target=_serve, args=(theirs, module), daemon=True)
+            self.process = _SPAWN.Process(target=_serve, args=(theirs, module), daemon=True)
             self.process.start()
         theirs.close()  # the process holds it alone: its death is an end of file here
 
@@ -153,23 +150,6 @@ def _one_thread_each() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-def import_ahead(module: str) -> None:
-    """Begin to import a module once for all processes started later, which a server then forks.
-
-    It has no threads, so that it may; elsewhere than on Linux every process imports for itself.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    from multiprocessing import forkserver
-
-    track_resources()
-    context = multiprocessing.get_context("forkserver")
-    with suppress(OSError), interrupts_held(), _one_thread_each():  # no place for its socket
-        context.set_forkserver_preload([module])
-        forkserver.ensure_running()
-        _started_by.append(context)
 
 
 def track_resources() -> None:

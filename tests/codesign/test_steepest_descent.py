@@ -1,5 +1,6 @@
 """The descent of a fixed structure follows and accepts by what J counts."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -40,3 +41,16 @@ def test_a_step_is_accepted_by_what_its_gradient_is_of(
     assert len(values) > 3
     np.testing.assert_allclose(found.iterates[-1].theta, best, atol=0.5)
     assert values[-1] == pytest.approx(1.0 if of_error else -999.0, abs=0.5)
+
+
+def test_a_bound_on_the_compliance_is_measured_in_the_sweep() -> None:
+    """The best of a sweep keeps it, and a bound that nothing misses changes nothing."""
+    free = problem()
+    theta = np.array(free.start)
+    answers = []
+    for case in (free, replace(free, inner=replace(free.inner, compliance_max=1.0))):
+        answer, _ = module.baseline_of(case).answer(theta, module.Gradient.TOTAL, None)
+        assert answer is not None
+        answers.append(answer)
+    assert answers[1].bandwidth == pytest.approx(answers[0].bandwidth)
+    assert answers[1].design.figures.compliance < 1.0

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 from busy import HANGS
 
-from ccd_casadi.support import worker_process
 from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost, import_ahead
+from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost
 
 HERE = Path(__file__).parent
 
@@ -64,15 +63,6 @@ def pid_and_sleep(task: tuple[str, float]) -> None:
     time.sleep(seconds)
 
 
-@pytest.fixture(params=["spawned", "forked"])
-def started(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Workers that import for themselves, and those of a server that has imported."""
-    monkeypatch.setattr(worker_process, "_started_by", worker_process._started_by[:1])
-    if request.param == "forked":
-        import_ahead("numpy")
-        assert len(worker_process._started_by) == 1 + sys.platform.startswith("linux")
-
-
 # ---- results -------------------------------------------------------------------------------------
 
 
@@ -85,7 +75,6 @@ def test_every_task_gives_its_result_once(count: int, tasks: int) -> None:
     assert found == again == [i * i for i in range(tasks)]
 
 
-@pytest.mark.usefixtures("started")
 def test_workers_are_other_processes_with_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
@@ -141,7 +130,6 @@ def test_an_exception_reaches_the_caller(count: int) -> None:
         assert sorted(workers.map_unordered(square, [1, 2])) == [1, 4]
 
 
-@pytest.mark.usefixtures("started")
 def test_the_task_of_a_killed_worker_is_tried_again(tmp_path: Path) -> None:
     mark = str(tmp_path / "died")
     with Workers(2) as workers:
@@ -158,7 +146,6 @@ def test_equal_tasks_are_not_taken_for_the_same(tmp_path: Path) -> None:
         assert list(workers.map_unordered(dies_once, tasks)) == [4] * 4
 
 
-@pytest.mark.usefixtures("started")
 def test_a_task_that_kills_twice_is_told() -> None:
     with Workers(2) as workers, pytest.raises(WorkerLost, match="died twice") as caught:
         list(workers.map_unordered(dies, range(8)))
@@ -166,7 +153,6 @@ def test_a_task_that_kills_twice_is_told() -> None:
     assert workers._workers == []
 
 
-@pytest.mark.usefixtures("started")
 def test_a_call_in_a_process_of_its_own_gives_its_result_or_what_went_wrong() -> None:
     with Runner() as runner:
         assert runner.call(60.0, square, 3) == 9
@@ -177,7 +163,6 @@ def test_a_call_in_a_process_of_its_own_gives_its_result_or_what_went_wrong() ->
         assert runner.call(60.0, square, 2) == 4
 
 
-@pytest.mark.usefixtures("started")
 def test_an_abandoned_map_leaves_no_process() -> None:
     with Workers(2) as workers:
         results = workers.map_unordered(whereabouts, range(20))
@@ -226,18 +211,16 @@ def main(options):
         list(workers.map_unordered(pid_and_sleep, [(str(options.out), {2.0 * HANGS})] * 8))
 
 if __name__ == "__main__":
-    ahead = "ccd_casadi.sampling.samples" if "--seed" in sys.argv else ""
-    sys.exit(run(main, parser("parent", ""), ahead=ahead))
+    sys.exit(run(main, parser("parent", "")))
 """
 
 
-def parent(tmp_path: Path, forked: bool = False) -> subprocess.Popen[str]:
-    """A command that waits for its workers; those are `forked` or spawned."""
+def parent(tmp_path: Path) -> subprocess.Popen[str]:
     script, folder = tmp_path / "parent.py", tmp_path / "pids"
     script.write_text(PARENT)
     folder.mkdir()
     return subprocess.Popen(
-        [sys.executable, str(script), "--out", str(folder), *["--seed", "1"] * forked],
+        [sys.executable, str(script), "--out", str(folder)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
 
@@ -249,13 +232,10 @@ def children(tmp_path: Path) -> set[int]:
     return {int(path.name) for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("forked", [False, True], ids=["spawned", "forked"])
 @pytest.mark.parametrize("whole_group", [True, False], ids=["terminal", "parent-only"])
-def test_ctrl_c_ends_promptly_and_leaves_no_orphan(
-    tmp_path: Path, whole_group: bool, forked: bool
-) -> None:
+def test_ctrl_c_ends_promptly_and_leaves_no_orphan(tmp_path: Path, whole_group: bool) -> None:
     """A terminal sends SIGINT to every process of the group, `kill -INT` to one."""
-    process = parent(tmp_path, forked)
+    process = parent(tmp_path)
     pids = children(tmp_path)
     assert all(map(alive, pids))
     if whole_group:
@@ -287,11 +267,8 @@ def test_ctrl_c_while_the_workers_start_is_quiet(tmp_path: Path, delay: float) -
 @pytest.mark.parametrize(
     "kind", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("forked", [False, True], ids=["spawned", "forked"])
-def test_workers_end_with_a_killed_parent(
-    tmp_path: Path, kind: signal.Signals, forked: bool
-) -> None:
-    process = parent(tmp_path, forked)
+def test_workers_end_with_a_killed_parent(tmp_path: Path, kind: signal.Signals) -> None:
+    process = parent(tmp_path)
     pids = children(tmp_path)
     assert all(map(alive, pids))
     process.send_signal(kind)
