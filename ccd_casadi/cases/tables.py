@@ -23,6 +23,7 @@ from ccd_casadi.cases.checks import (
     numbers_of_modes,
     places,
     points,
+    rows,
     signed,
     tables,
     text_or_rows,
@@ -262,6 +263,13 @@ class PlacesTable:
     )
     damped: tuple[int, ...] = key(
         "with axes: flexible modes, from 1, each an axis of its own", (), check=numbers_of_modes
+    )
+    reference: tuple[tuple[float, ...], ...] = key(
+        "3 or, with twist, 4 points in a plane: inputs are loads there, which the least forces at "
+        "the actuators make, outputs the displacements there, which the sensors tell",
+        (),
+        check=rows(2),
+        unit="m",
     )
 
 

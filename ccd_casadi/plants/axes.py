@@ -4,6 +4,12 @@
 
 All act by the columns of Q after the quiet ones. They have length 1 and are normal to each other
 and to what quiet modes show at the points.
+
+Or they act as loads at reference points would, and read what moves there:
+
+    f = (V_ref V⁺)ᵀ u,   y_ref = V_ref V⁺ y,   V = [1, x, y, x y] at the points
+
+f are the least forces that do the work of the loads u on every motion V.
 """
 
 from collections.abc import Sequence
@@ -27,6 +33,31 @@ def in_axes(
     A, dA = W.T @ motions, dW.transpose(0, 2, 1) @ motions + W.T @ dmotions
     Q, dQ = (part[..., quiet:] for part in _orthonormal(A, dA))
     return W @ Q, dW @ Q + W @ dQ
+
+
+def at_reference(
+    W: Array, dW: Array, points: Array, dpoints: Array, reference: Array
+) -> tuple[Array, Array]:
+    """Weights of nodes (N, m) combined to those of reference points (p, 2), and the slopes.
+
+    `points` (m, 2) and their slopes are those of the weights; V has p columns, three or four.
+    Raises PlantError where the points do not tell these motions apart.
+    """
+    still = np.zeros((len(dpoints), *reference.shape))
+    V, dV = (part[..., : len(reference)] for part in _motions(points, dpoints))
+    if np.linalg.cond(V / np.maximum(np.abs(V).max(axis=0), 1e-300)) > 1e6:
+        raise PlantError("places: forces or sensors are on one line; move one, or drop reference")
+    inverse, G = np.linalg.pinv(V), np.linalg.inv(V.T @ V)
+    slope = G @ dV.transpose(0, 2, 1) @ (np.eye(len(V)) - V @ inverse) - inverse @ dV @ inverse
+    there = _motions(reference, still)[0][:, : len(reference)]
+    N, dN = there @ inverse, there @ slope
+    return W @ N.T, dW @ N.T + W @ dN.transpose(0, 2, 1)
+
+
+def _motions(points: Array, dpoints: Array) -> tuple[Array, Array]:
+    """1, x, y and x y at points, as columns, and their slopes."""
+    (x, y), (dx, dy) = points.T, dpoints.transpose(2, 0, 1)
+    return np.stack([1.0 + 0.0 * x, x, y, x * y], 1), np.stack([0.0 * dx, dx, dy, dx * y + x * dy], 2)
 
 
 def followed_modes(

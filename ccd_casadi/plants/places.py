@@ -18,7 +18,7 @@ from scipy.spatial import Delaunay
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
-from ccd_casadi.plants.axes import followed_modes, in_axes
+from ccd_casadi.plants.axes import at_reference, followed_modes, in_axes
 from ccd_casadi.plants.fixed import reparametrised
 from ccd_casadi.plants.modal import RIGID_RATIO
 from ccd_casadi.plants.nodes import NodeInterpolation, Position, Positions, names_in
@@ -38,7 +38,8 @@ class Places:
     With `axes` all forces act, and all sensors read, together along the motions of a rigid body
     normal to the nodes, 1, x, y, in directions of length 1: as many inputs and outputs, however
     many actuators. `quiet` flexible modes, from 1 by frequency, are neither driven nor read by
-    them; each `damped` one is an axis of its own.
+    them; each `damped` one is an axis of its own. With `reference` points inputs are loads and
+    outputs displacements there, whatever the number of forces and sensors (`axes.at_reference`).
     """
 
     nodes: tuple[tuple[float, ...], ...]
@@ -50,6 +51,12 @@ class Places:
     axes: bool = False
     quiet: tuple[int, ...] = ()
     damped: tuple[int, ...] = ()
+    reference: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """Its values, the reference only where there is one: earlier stores do not know it."""
+        return {key: value for key, value in vars(self).items() if value or key != "reference"}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,6 +82,10 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     if axes and least < axes + len(places.quiet):
         words = f"need {axes + len(places.quiet)} actuators and sensors or more"
         raise PlantError(f"places.axes, quiet and damped {words}; add some, or drop a mode")
+    reference = len(places.reference)
+    if reference and (nodes.shape[1] != 2 or reference not in (3, 4) or least < reference):
+        words = "needs nodes in a plane, 3 or 4 points, and no fewer actuators and sensors"
+        raise PlantError(f"places.reference {words}")
     between, own = NodeInterpolation(nodes), [list(names).index(name) for name in plant.names]
     points = Positions(places.actuators, names), Positions(places.sensors, names)
     for group in points if places.sensors else points[:1]:
@@ -110,8 +121,8 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         constraint_names=(*plant.constraint_names, *rules),
         evaluate=whole,
         hardware=ca.Function("hardware", [x], [f, ca.vertcat(lam, *rules.values())]),
-        outputs=axes or len(places.sensors) or plant.outputs,
-        inputs=axes or len(places.actuators),
+        outputs=axes or reference or len(places.sensors) or plant.outputs,
+        inputs=axes or reference or len(places.actuators),
         notes=notes,
         domain=_domain(plant, whole, len(names)),
         shapes=whole.shapes if nodes.shape[1] == 2 else None,
@@ -162,10 +173,19 @@ class PlacedMechanics:
             dmotions = np.insert(moved, [quiet] * rigid.shape[1], 0.0, axis=2)
             W, dW = in_axes(W, dW, motions, dmotions, quiet)
             R, dR = in_axes(R, dR, motions, dmotions, quiet)
+        if places.reference:
+            W, dW = self._at_reference(self.actuators, W, dW, values)
+            R, dR = self._at_reference(self.sensors, R, dR, values)
         C = below.C
         if places.sensors:
             C, dC = (B0 @ R).T, (dB0 @ R + B0 @ dR).transpose(0, 2, 1)
         return replace(below, M=M, B=B0 @ W, C=C, derivatives=(dM, dD, dK, dB0 @ W + B0 @ dW, dC))
+
+    def _at_reference(
+        self, points: Positions, W: Array, dW: Array, theta: Array
+    ) -> tuple[Array, Array]:
+        moved = points.slope.transpose(2, 0, 1)[: len(dW)]
+        return at_reference(W, dW, points.at(theta), moved, np.array(self.places.reference))
 
     def shapes(self, theta: Sequence[float], count: int) -> ModeShapes:
         """The lowest flexible modes at the nodes, with all masses where they are."""

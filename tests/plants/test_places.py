@@ -120,6 +120,35 @@ def test_axes_leave_quiet_modes_alone_and_have_slopes(at: tuple[float, float], s
         compare_slopes(plant, theta)
 
 
+CORNERS = ((0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2), (0.3, -0.2))
+
+
+@few(20)
+@given(inside, st.integers(0, 99), st.sampled_from([3, 4]))
+def test_loads_at_reference_points_move_the_body_as_there_and_have_slopes(
+    at: tuple[float, float], seed: int, count: int
+) -> None:
+    """By the least forces that do it; of three points without twist."""
+    corners = CORNERS[:count]
+    places = Places(GRID, SIX, SIX[1:], 0.4, 0.1, reference=corners)
+    free = placed(beam_of_nodes(seed), replace(places, reference=()), ("x", "k", "y"))
+    plant = placed(beam_of_nodes(seed), places, ("x", "k", "y"))
+    theta = np.array([at[0], 1.3, at[1]])
+    system, apart = mechanics(plant, theta), mechanics(free, theta)
+    assert (plant.inputs, plant.outputs, system.B.shape) == (count, count, (7, count))
+    there = np.array([[1.0, *p] for p in corners]).T
+    assert system.B[:3] == pytest.approx(there, abs=1e-9)
+    assert system.C[:, :3] == pytest.approx(there.T, abs=1e-9)
+    forces = np.linalg.lstsq(apart.B, system.B, rcond=None)[0]
+    motions = apart.B[:3].T
+    if count == 4:
+        motions = np.column_stack([motions, motions[:, 1] * motions[:, 2]])
+        corner = np.prod(there[1:], axis=0)
+        assert motions[:, 3] @ forces == pytest.approx(corner, abs=1e-9)
+    assert motions @ np.linalg.lstsq(motions, forces, rcond=None)[0] == pytest.approx(forces)
+    compare_slopes(plant, theta)
+
+
 @few(20)
 @given(inside, st.floats(0.0, 2.0))
 def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
@@ -147,6 +176,8 @@ def test_what_does_not_match_is_one_sentence() -> None:
         (Places(GRID, (("x",),)), "has 1 coordinates, a node 2"),
         (Places(GRID, (("x", 0.21),)), "beyond the nodes"),
         (Places(line, POINTS), "on one line"),
+        (Places(GRID, POINTS, POINTS, reference=CORNERS), "no fewer actuators and sensors"),
+        (Places(GRID, POINTS, POINTS, reference=CORNERS[:2]), "3 or 4 points"),
     ):
         with pytest.raises(PlantError, match=words):
             placed(plant, places, ("k", "x", "y"))
