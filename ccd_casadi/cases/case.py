@@ -164,7 +164,8 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         plant_table(dict(data["plant"]) | options_in(place, fail), path, fail)
     tables["robust"] = replace(tables["robust"], plants=absolute)
     places, size = tables["places"], tables["motor"].size
-    of_case = (*names_in((*places.actuators, *places.sensors)), *filter(None, [size]))
+    named = names_in((*places.actuators, *places.sensors, places.present))
+    of_case = (*named, *filter(None, [size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":

@@ -19,6 +19,7 @@ from ccd_casadi.cases.checks import (
     files,
     interval,
     key,
+    names,
     number,
     numbers_of_modes,
     places,
@@ -271,6 +272,12 @@ class PlacesTable:
         check=rows(2),
         unit="m",
     )
+    present: tuple[str, ...] = key(
+        "with axes or a reference: a [theta] for each actuator, 1 where it is there, else 0",
+        (),
+        check=names,
+    )
+    choose: int = key("with present: how many of them are there at most", 0)
 
 
 @dataclass(frozen=True)

@@ -35,29 +35,22 @@ def in_axes(
     return W @ Q, dW @ Q + W @ dQ
 
 
-def at_reference(
-    W: Array, dW: Array, points: Array, dpoints: Array, reference: Array
-) -> tuple[Array, Array]:
-    """Weights of nodes (N, m) combined to those of reference points (p, 2), and the slopes.
+def at_reference(W: Array, dW: Array, nodes: Array, reference: Array) -> tuple[Array, Array]:
+    """Weights of nodes (N, m) combined to those of three or four points (p, 2), and the slopes.
 
-    `points` (m, 2) and their slopes are those of the weights; V has p columns, three or four.
-    Raises PlantError where the points do not tell these motions apart.
+    V has as many columns as there are points. Raises PlantError where W does not tell them apart.
     """
-    still = np.zeros((len(dpoints), *reference.shape))
-    V, dV = (part[..., : len(reference)] for part in _motions(points, dpoints))
-    if np.linalg.cond(V / np.maximum(np.abs(V).max(axis=0), 1e-300)) > 1e6:
+    here, there = (
+        np.column_stack([np.ones(len(points)), points, points.prod(axis=1)])[:, : len(reference)]
+        for points in (nodes, reference)
+    )
+    V, dV = W.T @ here, dW.transpose(0, 2, 1) @ here
+    if np.linalg.cond(V / np.abs(here).max(axis=0)) > 1e6:
         raise PlantError("places: forces or sensors are on one line; move one, or drop reference")
-    inverse, G = np.linalg.pinv(V), np.linalg.inv(V.T @ V)
-    slope = G @ dV.transpose(0, 2, 1) @ (np.eye(len(V)) - V @ inverse) - inverse @ dV @ inverse
-    there = _motions(reference, still)[0][:, : len(reference)]
+    inverse, beyond = np.linalg.pinv(V), np.linalg.inv(V.T @ V) @ dV.transpose(0, 2, 1)
+    slope = beyond - beyond @ V @ inverse - inverse @ dV @ inverse
     N, dN = there @ inverse, there @ slope
     return W @ N.T, dW @ N.T + W @ dN.transpose(0, 2, 1)
-
-
-def _motions(points: Array, dpoints: Array) -> tuple[Array, Array]:
-    """1, x, y and x y at points, as columns, and their slopes."""
-    (x, y), (dx, dy) = points.T, dpoints.transpose(2, 0, 1)
-    return np.stack([1.0 + 0.0 * x, x, y, x * y], 1), np.stack([0.0 * dx, dx, dy, dx * y + x * dy], 2)
 
 
 def followed_modes(

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -150,6 +151,29 @@ def test_loads_at_reference_points_move_the_body_as_there_and_have_slopes(
 
 
 @few(20)
+@given(inside, st.integers(0, 99), st.sampled_from([{"axes": True}, {"reference": CORNERS}]))
+def test_an_actuator_that_is_not_there_is_as_if_never_given(
+    at: tuple[float, float], seed: int, how: dict[str, Any]
+) -> None:
+    """Its mass too; in part it has slopes; more than are to be chosen break a rule."""
+    flags = tuple(f"p{i}" for i in range(6))
+    whole = Places(GRID, SIX, SIX, 0.4, 0.1, present=flags, choose=4, **how)
+    some = replace(whole, actuators=tuple(SIX[i] for i in (0, 2, 3, 5)), present=(), choose=0)
+    plant = placed(beam_of_nodes(seed), whole, ("x", "k", "y", *flags))
+    four = placed(beam_of_nodes(seed), some, ("x", "k", "y"))
+    theta = np.array([at[0], 1.3, at[1]])
+    chosen = mechanics(plant, np.append(theta, [1, 0, 1, 1, 0, 1]))
+    expected = mechanics(four, theta)
+    for part in "MKBC":
+        there = getattr(expected, part)
+        assert getattr(chosen, part) == pytest.approx(there, abs=1e-7 * np.abs(there).max()), part
+    parts = np.append(theta, [0.7, 0.4, 0.9, 0.5, 0.6, 0.8])
+    compare_slopes(plant, parts)
+    assert plant.constraint_names[-1] == "actuators chosen"
+    assert constraint_values(plant, parts)[-1] == pytest.approx(3.9 / 4.0 - 1.0)
+
+
+@few(20)
 @given(inside, st.floats(0.0, 2.0))
 def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
     at: tuple[float, float], kg: float
@@ -178,6 +202,7 @@ def test_what_does_not_match_is_one_sentence() -> None:
         (Places(line, POINTS), "on one line"),
         (Places(GRID, POINTS, POINTS, reference=CORNERS), "no fewer actuators and sensors"),
         (Places(GRID, POINTS, POINTS, reference=CORNERS[:2]), "3 or 4 points"),
+        (Places(GRID, POINTS, POINTS, axes=True, present=("k",), choose=3), "for each actuator"),
     ):
         with pytest.raises(PlantError, match=words):
             placed(plant, places, ("k", "x", "y"))
