@@ -19,7 +19,7 @@ from ccd_casadi.cases.checks import (
     files,
     interval,
     key,
-    names,
+    names_of_theta,
     number,
     numbers_of_modes,
     places,
@@ -266,18 +266,17 @@ class PlacesTable:
         "with axes: flexible modes, from 1, each an axis of its own", (), check=numbers_of_modes
     )
     reference: tuple[tuple[float, ...], ...] = key(
-        "3 or, with twist, 4 points in a plane: inputs are loads there, which the least forces at "
-        "the actuators make, outputs the displacements there, which the sensors tell",
+        "3 or (with twist) 4 points of a plane: inputs are loads, outputs displacements there",
         (),
         check=rows(2),
         unit="m",
     )
     present: tuple[str, ...] = key(
-        "with axes or a reference: a [theta] for each actuator, 1 where it is there, else 0",
+        "with either: a [theta] for each actuator, 1 where it is there, else 0",
         (),
-        check=names,
+        check=names_of_theta,
     )
-    choose: int = key("with present: how many of them are there at most", 0)
+    choose: int = key("how many of these are there at most", 0)
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class Page:
         self.pins = Pins(parameters, self.figures, kept, dark, session.case.objective.cost_unit)
         self.map = MapFigure(parameters, self.draw_map, dark)
         run, problem = session.run, session.problems.at(session.start)
-        self.places = [PlacesFigure(problem, self._theta, self._placed)] if moves(problem) else []
+        self.places = [PlacesFigure(problem, self._placed)] if moves(problem) else []
         self._surrogate = None if run is None else run_surrogate(run.folder)
         self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
         self._of_search = False
@@ -121,9 +121,6 @@ class Page:
         self.document.js_on_event(DocumentReady, label)
 
     # drags
-
-    def _theta(self) -> tuple[float, ...]:
-        return self.controls.knobs().theta
 
     def _placed(self, theta: Array) -> None:
         """A place was dragged: the sliders move to its θ, within the box."""

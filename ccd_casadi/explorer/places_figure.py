@@ -14,6 +14,7 @@ from ccd_casadi.plants.nodes import Positions, names_in
 from ccd_casadi.support.arrays import Array
 
 MM = 1e3  # a metre
+SAME = 1e-9  # m
 
 
 def moves(problem: CoDesignProblem) -> bool:
@@ -25,17 +26,14 @@ def moves(problem: CoDesignProblem) -> bool:
 
 
 class PlacesFigure:
-    """`moved` is called with the new θ when a place was dragged; `theta` tells the present one."""
+    """`moved` is called with the new θ when a place was dragged."""
 
     name = "places"
 
-    def __init__(
-        self, problem: CoDesignProblem, theta: Callable[[], Sequence[float]],
-        moved: Callable[[Array], None],
-    ) -> None:  # fmt: skip
+    def __init__(self, problem: CoDesignProblem, moved: Callable[[Array], None]) -> None:
         places, held = problem.source.places, problem.source.held
         assert places is not None
-        self._theta, self._moved, self._held = theta, moved, np.array([*held.values()])
+        self._moved, self._held = moved, np.array([*held.values()])
         self._free, known = len(problem.names), (*problem.names, *held)
         nodes = np.array(places.nodes)
         made: Any = figure(
@@ -47,6 +45,8 @@ class PlacesFigure:
         self._groups, drawn = [], []
         looks = ((places.sensors, GREEN, "circle", 15), (places.actuators, ORANGE, "x", 11))
         for points, colour, marker, size in looks:
+            if not points:
+                continue
             group, source = Positions(points, known), ColumnDataSource(_columns(nodes[:0]))
             drawn.append(made.scatter("x", "y", source=source, size=size, marker=marker,
                                       line_color=colour, line_width=3, fill_alpha=0.1))  # fmt: skip
@@ -59,22 +59,25 @@ class PlacesFigure:
 
     def marks(self, theta: Sequence[float]) -> list[Change]:
         """What shows them at θ."""
-        whole = np.append(theta, self._held)
-        return [(source, {"data": _columns(group.at(whole))}) for group, source in self._groups
-                if len(group.constant)]  # fmt: skip
+        self._shown = np.append(theta, self._held)
+        groups = self._groups
+        return [(source, {"data": _columns(group.at(self._shown))}) for group, source in groups]
 
     def _heard(self, group: Positions) -> Callable[[str, Any, Any], None]:
         def changed(attr: str, old: Any, new: Any) -> None:
-            theta, after = np.array(self._theta()), np.transpose([new["x"], new["y"]])
-            before = group.at(np.append(theta, self._held))
+            before, after = group.at(self._shown), np.transpose([new["x"], new["y"]]) / MM
+            theta = self._shown[: self._free]
             if after.shape == before.shape:  # none was deleted
-                off = after / MM - before
+                off = after - before
                 i = int(np.abs(off).sum(axis=1).argmax())
+                if np.abs(off[i]).max() < SAME:  # all are told of when one was dragged
+                    return
                 theta = theta + np.linalg.pinv(group.slope[i][:, : self._free]) @ off[i]
             self._moved(theta)
 
         return changed
 
 
-def _columns(points: Array) -> dict[str, Array]:
-    return {"x": MM * points[:, 0], "y": MM * points[:, 1]}
+def _columns(points: Array) -> dict[str, list[float]]:
+    """As lists: of an array that is a part of another the browser would send all of that back."""
+    return {"x": (MM * points[:, 0]).tolist(), "y": (MM * points[:, 1]).tolist()}

@@ -27,7 +27,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
 
-ABSENT = 1e-10  # presence of an actuator that is not there: a root has a slope
+ABSENT = 1e-12  # presence of an actuator that is not there: a root has a slope
 
 
 @dataclass(frozen=True)

@@ -300,9 +300,9 @@ def test_a_place_that_is_dragged_moves_what_it_names():
     source = replace(problem.source, places=places, fixed=(("b", 0.06, "m"),))
     problem = replace(problem, source=source, names=("t", "a", "r"))
     assert moves(problem)
-    made = PlacesFigure(problem, lambda: theta, found.append)
+    made = PlacesFigure(problem, found.append)
     ((source, shown),) = made.marks(theta)  # there is no sensor
-    x, y = shown["data"]["x"], shown["data"]["y"]
+    x, y = np.array(shown["data"]["x"]), np.array(shown["data"]["y"])
     assert np.allclose([x, y], [[-40.0, 30.0, 0.0], [60.0, 30.0, 50.0]])
     moves = (
         (0, (-5.0, 3.0), (0.0, 5e-3, 0.0)),
