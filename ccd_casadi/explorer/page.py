@@ -203,7 +203,7 @@ class Page:
         frame = look.how is not How.PRESENT and curves is not None
         changes = [change for made in self.figures for change in
                    made.changes(now.panels.get(made.name, EMPTY), colour, dash, frame)]  # fmt: skip
-        changes += [change for made in self.places for change in made.marks(look.theta)]
+        changes += [made.marks(look.theta) for made in self.places]
         changes += [self.map.mark(look.theta), (self.answer, {"data": answer})]
         self._message.send(words, changes)
         self._seen.append(look)

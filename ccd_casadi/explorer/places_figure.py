@@ -14,7 +14,6 @@ from ccd_casadi.plants.nodes import Positions, names_in
 from ccd_casadi.support.arrays import Array
 
 MM = 1e3  # a metre
-SAME = 1e-9  # m
 
 
 def moves(problem: CoDesignProblem) -> bool:
@@ -42,40 +41,33 @@ class PlacesFigure:
         )  # fmt: skip
         made.toolbar.logo = None
         made.scatter(**_columns(nodes), size=4, color="#808080")
-        self._groups, drawn = [], []
-        looks = ((places.sensors, GREEN, "circle", 15), (places.actuators, ORANGE, "x", 11))
-        for points, colour, marker, size in looks:
-            if not points:
-                continue
-            group, source = Positions(points, known), ColumnDataSource(_columns(nodes[:0]))
-            drawn.append(made.scatter("x", "y", source=source, size=size, marker=marker,
-                                      line_color=colour, line_width=3, fill_alpha=0.1))  # fmt: skip
-            source.on_change("data", self._heard(group))
-            self._groups.append((group, source))
-        tool = PointDrawTool(renderers=drawn, add=False)
+        # One source: of several the browser would tell one by one, as before the others' answer.
+        self._points = Positions((*places.sensors, *places.actuators), known)
+        a, b = len(places.sensors), len(places.actuators)
+        self._looks = {"colour": [GREEN] * a + [ORANGE] * b, "marker": ["circle"] * a + ["x"] * b,
+                       "size": [15] * a + [11] * b}  # fmt: skip
+        self._source = ColumnDataSource({name: [] for name in ("x", "y", *self._looks)})
+        self._source.on_change("data", self._heard)
+        drawn = made.scatter("x", "y", source=self._source, size="size", marker="marker",
+                             line_color="colour", line_width=3, fill_alpha=0.1)  # fmt: skip
+        tool = PointDrawTool(renderers=[drawn], add=False)
         made.add_tools(tool)
         made.toolbar.active_tap = tool
         self.figure = made
 
-    def marks(self, theta: Sequence[float]) -> list[Change]:
+    def marks(self, theta: Sequence[float]) -> Change:
         """What shows them at θ."""
         self._shown = np.append(theta, self._held)
-        groups = self._groups
-        return [(source, {"data": _columns(group.at(self._shown))}) for group, source in groups]
+        return self._source, {"data": _columns(self._points.at(self._shown)) | self._looks}
 
-    def _heard(self, group: Positions) -> Callable[[str, Any, Any], None]:
-        def changed(attr: str, old: Any, new: Any) -> None:
-            before, after = group.at(self._shown), np.transpose([new["x"], new["y"]]) / MM
-            theta = self._shown[: self._free]
-            if after.shape == before.shape:  # none was deleted
-                off = after - before
-                i = int(np.abs(off).sum(axis=1).argmax())
-                if np.abs(off[i]).max() < SAME:  # all are told of when one was dragged
-                    return
-                theta = theta + np.linalg.pinv(group.slope[i][:, : self._free]) @ off[i]
-            self._moved(theta)
-
-        return changed
+    def _heard(self, attr: str, old: Any, new: Any) -> None:
+        before, after = self._points.at(self._shown), np.transpose([new["x"], new["y"]]) / MM
+        theta = self._shown[: self._free]
+        if after.shape == before.shape:  # none was deleted
+            off = after - before
+            i = int(np.abs(off).sum(axis=1).argmax())
+            theta = theta + np.linalg.pinv(self._points.slope[i][:, : self._free]) @ off[i]
+        self._moved(theta)
 
 
 def _columns(points: Array) -> dict[str, list[float]]:

@@ -301,7 +301,7 @@ def test_a_place_that_is_dragged_moves_what_it_names():
     problem = replace(problem, source=source, names=("t", "a", "r"))
     assert moves(problem)
     made = PlacesFigure(problem, found.append)
-    ((source, shown),) = made.marks(theta)  # there is no sensor
+    source, shown = made.marks(theta)
     x, y = np.array(shown["data"]["x"]), np.array(shown["data"]["y"])
     assert np.allclose([x, y], [[-40.0, 30.0, 0.0], [60.0, 30.0, 50.0]])
     moves = (
@@ -310,9 +310,9 @@ def test_a_place_that_is_dragged_moves_what_it_names():
         (2, (9.0, 0.0), (0.0,) * 3),
     )
     for i, (dx, dy), expected in moves:
-        source.data = {"x": x + dx * np.eye(3)[i], "y": y + dy * np.eye(3)[i]}
+        source.data = shown["data"] | {"x": x + dx * np.eye(3)[i], "y": y + dy * np.eye(3)[i]}
         assert found[-1] - theta == pytest.approx(expected, abs=1e-12)
-    source.data = {"x": x[1:], "y": y[1:]}  # deleted: drawn again where it is
+    source.data = {name: column[1:] for name, column in shown["data"].items()}
     assert found[-1] == pytest.approx(theta)
 
 
