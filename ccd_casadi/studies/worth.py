@@ -50,7 +50,6 @@ ROUNDS = 12  # of surrogate, IPOPT and truth, at most
 SETTLED, SETTLED_SLOW = 1e-4, 1.5e-3  # of the bandwidth: δ below which no round is needed
 APART = 1e-3  # of the box: designs closer than this are one
 CLOUD, REACHES = 256, (1.0, 0.3, 0.1, 0.03)  # points in boxes of these sizes around the best θ
-TOLD = 1e-6  # relative: two controllers are one below it
 LITTLE = 1.0  # % of the bandwidth: a gain below it is hardly worth a co-design
 
 
@@ -99,8 +98,11 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         settled = ahead.left <= (SETTLED_SLOW if slow else SETTLED) * ahead.best.bandwidth
         if settled or not rounds_left:
             ends = {end.theta: end for end in (known[0], ahead.best) if end.kappa}
-            better = [_searched(sampler, end) for end in ends.values() if end.theta not in searched]
-            if not (rounds_left and any(better)):
+            found = {at: multistart_at(sampler, ends[at]) for at in ends if at not in searched}
+            better = [at for at in found if found[at].feasible and found[at].value > ends[at].value]
+            for at in better:
+                sampler.value_from(at, found[at].design.kappa.tolist())
+            if not (better and rounds_left):
                 break
             missed, searched = 0.0, searched | ends.keys()
             continue
@@ -135,14 +137,6 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         "syntheses": sampler.syntheses,
         "seconds": perf_counter() - began,
     }
-
-
-def _searched(sampler: Sampler, end: InnerSample) -> bool:
-    """Whether a multi-start search at the θ of a sample finds a better structured controller."""
-    found = multistart_at(sampler, end)
-    if not found.feasible or found.value <= (1.0 + TOLD) * end.value:
-        return False
-    return sampler.value_from(end.theta, found.design.kappa.tolist()).value > end.value
 
 
 def outlook(
