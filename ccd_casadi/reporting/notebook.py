@@ -12,7 +12,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
 from ccd_casadi.drawing.page import CSS
-from ccd_casadi.drawing.paint import block_html, head_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -41,10 +41,7 @@ def html_of(item: object) -> str:
 
 
 def _cell(*parts: Head | Block) -> str:
-    body = "\n".join(
-        head_html(part) if isinstance(part, Head) else block_html(part, f"nb{next(_figures)}")
-        for part in parts
-    )
+    body = "\n".join(block_html(part, f"nb{next(_figures)}") for part in parts)
     # the page's own rules, nested: `h1` is `.ccd h1` in here
     return f'<div class="ccd"><style>.ccd {{{_OWN}{CSS}{_SMALL}}}</style>\n{body}\n</div>'
 

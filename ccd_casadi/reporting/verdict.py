@@ -7,7 +7,7 @@ from typing import Any
 
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import Head, VerdictLine
-from ccd_casadi.drawing.paint import head_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.support.terminal import columns, wrapped
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
@@ -88,7 +88,7 @@ def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Hea
 def with_verdict_of(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
     """A page with the decision and the verdict as they are now; of the run's own (`whole`) the
     badge too."""
-    source = head_html(run_head("", result, "", ""))
+    source = block_html(run_head("", result, "", ""))
     for place in (DECISION, TABLE, *([BADGE] if whole else [])):
         old, new = place.search(text), place.search(source)
         if old is not None and new is not None:
