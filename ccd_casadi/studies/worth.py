@@ -91,7 +91,7 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     first = [hardware.theta] if slow and apart < BESIDE else [hardware.theta, problem.start]
     known = sampler.values(np.array(first), "first designs")
     known += sampler.values(looks[: LOOKS_SLOW * len(lower)] if slow else looks, "global check")
-    missed, searched = 0.0, set()
+    missed, searched = 0.0, set[tuple[float, ...]]()
     for rounds_left in reversed(range(ROUNDS + 1)):
         known = sampler.latest(known)
         ahead = outlook(problem, known, missed, seed)
