@@ -23,7 +23,6 @@ from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.run import OUTERS, solve
 from ccd_casadi.codesign.verdict import State, VerdictLine, search_evidence
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.fixed_structure import Bounds
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem
 from ccd_casadi.inner_problem.kinds import KINDS, InnerKind
 from ccd_casadi.inner_problem.objective import violated
@@ -87,19 +86,6 @@ class ByRule(InnerKind):
 
     def require_function(self) -> None:
         """It is one function of θ."""
-
-    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
-        return [scaled_plant(self.problem, theta)]
-
-    def bounds(self) -> Bounds:
-        inner = self.problem.inner
-        return Bounds(inner.S_max, inner.S_low, inner.omega_low)
-
-    def common_shifts(self) -> tuple[float, float]:
-        return 0.0, 0.0
-
-    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
-        return (1.0,), (1.0,)
 
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         raise AssertionError("no page is drawn here")
