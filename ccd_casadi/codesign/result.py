@@ -16,16 +16,7 @@ from ccd_casadi.codesign.design_entries import budget_entry, move_entry
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.codesign.verdict import (
-    State,
-    Verdict,
-    VerdictLine,
-    deployable,
-    optimal,
-    predicted,
-    reason,
-    verdict_dict,
-)
+from ccd_casadi.codesign.verdict import State, VerdictLine, deployable, optimal, predicted
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.optim.kkt import KktCertificate
@@ -64,13 +55,14 @@ def result_dict(
         **verified.checks(),
     }
     failed = [name for name, passed in checks.items() if not passed]
-    why = f"failed: {', '.join(failed)} ({reason(verdict)})"
+    lost = [f"{name}: {line.words}" for name, line in verdict.items() if line.state is State.FAILED]
+    why = f"failed: {', '.join(failed)} ({'; '.join(lost)})"
     words = "; ".join(part for part in (why, outcome.message) if part) if failed else ""
     result = {
         **verified.figures(),
         "status": "not_verified" if failed else "verified",
         "reason": words,
-        "verdict": verdict_dict(verdict),
+        "verdict": {name: line.entry for name, line in verdict.items()},
         "formulation": terms.formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": problem.parameter_units,
@@ -104,14 +96,15 @@ def verdict_of(
     error: float,
     quality: tuple[Quality, ...] = (),
     look: GlobalCheck | None = None,
-) -> Verdict:
-    """The five lines on a verified design; `error` is that of its predicted value."""
+) -> dict[str, VerdictLine]:
+    """The five lines on a verified design, in the order in which they matter; `error` is that of
+    its predicted value."""
     problem = verified.problem
     figure, at = problem.figure, quality[0].at_point if quality else None
-    return Verdict(
-        certified=verified.certified_line(),
-        optimal=optimal_line(outcome, verified, tolerance, look, gap=verified.inner_gap),
-        predicted=predicted(
+    return {
+        "certified": verified.certified_line(),
+        "optimal": optimal_line(outcome, verified, tolerance, look, gap=verified.inner_gap),
+        "predicted": predicted(
             error=error,
             tolerance=tolerance,
             left_out=None if at is None else abs(at[0]) / (figure.factor * verified.value),
@@ -121,9 +114,9 @@ def verdict_of(
             surrogate=bool(outcome.surrogates),
             of=figure,
         ),
-        survives=verified.survives_line(),
-        deployable=deployable(verified.survival, problem.sampling),
-    )
+        "survives": verified.survives_line(),
+        "deployable": deployable(verified.survival, problem.sampling),
+    }
 
 
 def optimal_line(
@@ -219,7 +212,6 @@ def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine)
     if not before or not out.resolve().is_relative_to(folder):
         return run
     result = dict(read_json(folder / "result.json"))
-    found = {"state": line.state.value, "words": line.words, **line.figures, "at_solve": before}
-    result["verdict"] = {**result["verdict"], name: found}
+    result["verdict"] = {**result["verdict"], name: line.entry | {"at_solve": before}}
     write_json(folder / "result.json", result)
     return replace(run, result=result)

@@ -15,7 +15,7 @@ from scipy import signal
 
 from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.codesign import outer as outer_room
-from ccd_casadi.codesign.design_entries import controller_dict, figures_dict
+from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.nested import Nested
@@ -132,12 +132,6 @@ class VerifiedRule(Verified):
 
     def evidence(self, predicted: float) -> dict[str, Any]:
         return {"surrogate_bandwidth_hz": predicted / HZ}
-
-    def checks(self) -> dict[str, bool]:
-        return {}
-
-    def controller_entry(self) -> dict[str, Any]:
-        return controller_dict(self.made)
 
     def certified_line(self) -> VerdictLine:
         state = State.PASSED if self.feasible else State.FAILED
