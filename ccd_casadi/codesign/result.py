@@ -6,7 +6,7 @@ itself said of it (`at_solve`), so that a command may be given again.
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -19,7 +19,6 @@ from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.verdict import State, VerdictLine, deployable, optimal, predicted
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values, write_json
@@ -75,11 +74,12 @@ def result_dict(
         "checks": checks,
         "active": list(verified.active),
         "inner_gap": verified.inner_gap,
-        "kkt": kkt_dict(verified.kkt),
-        "globality": globality_dict(outcome.outer),
+        # a vertex has no second-order figure, and says so
+        "kkt": {**vars(verified.kkt), "vertex": verified.kkt.second_order == math.inf},
+        "globality": outcome.outer or OuterSolution((), 0),
         "box_look": {} if look is None else look.entry,
         "notes": list(plant.notes(verified.theta)),
-        "iterates": [asdict(iterate) for iterate in outcome.iterates],
+        "iterates": outcome.iterates,
         **run_entry(terms, spent, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
         **evidence,
@@ -167,28 +167,6 @@ def run_entry(terms: Terms, spent: Mapping[str, int], moved: bool = False) -> di
         "seconds": perf_counter() - terms.began,
         "seed": terms.seed,
         "versions": versions(),
-    }
-
-
-def kkt_dict(certificate: KktCertificate) -> dict[str, Any]:
-    """The optimality certificate; a vertex has no second-order figure, and says so."""
-    second = certificate.second_order
-    return asdict(certificate) | {
-        "second_order": None if second is None or math.isinf(second) else second,
-        "vertex": second is not None and math.isinf(second),
-    }
-
-
-def globality_dict(solution: OuterSolution | None) -> dict[str, Any]:
-    """Starts tried, distinct local optima of the last problem solved, the best J of each."""
-    if solution is None:
-        return {"starts": 0, "optima": []}
-    return {
-        "starts": solution.starts,
-        "optima": [
-            {"objective": item.objective, "starts": item.starts, "x": item.x.tolist()}
-            for item in solution.optima
-        ],
     }
 
 
