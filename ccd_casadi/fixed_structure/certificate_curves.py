@@ -111,7 +111,7 @@ def _maxima(grid: Array, value: Array, least: Array) -> tuple[np.ndarray, np.nda
 
 
 def crossing_and_bandwidth(
-    table: LoopTable, grid: Array, S: Array, integrator: bool, row: Sequence[float] | None = None
+    table: LoopTable, grid: Array, S: Array, row: Sequence[float] | None = None
 ) -> tuple[Array, Array]:
     """The first ω with |S| = 1/√2 of every plant (NaN where there is none), and the largest ω_b
     that keeps the shape below it (0 there).
@@ -141,7 +141,7 @@ def crossing_and_bandwidth(
         low, high = points[each, past], points[each, past + 1]
     crossing[good], bandwidth[good] = low, low
     if table.bounds.shape is not None:
-        bandwidth[good] = _within_shape(table, grid[good], S[good], good, low, integrator, row)
+        bandwidth[good] = _within_shape(table, grid[good], S[good], good, low, row)
     return crossing, bandwidth
 
 
@@ -151,7 +151,6 @@ def _within_shape(
     S: Array,
     which: np.ndarray,
     crossing: Array,
-    integrator: bool,
     row: Sequence[float] | None,
 ) -> Array:
     """The largest ω_b of plants `which` (P,) that keeps the shape below |S|.
@@ -164,7 +163,8 @@ def _within_shape(
     scale = bounds.shape * HALF_POWER
 
     def room(x: Array, S: Array) -> Array:
-        return np.asarray(scale * (x if integrator else np.maximum(x, bounds.omega_low)) / S)
+        counted = x if table.integrator else np.maximum(x, bounds.omega_low)
+        return np.asarray(scale * counted / S)
 
     short = bounds.shape_ends is ShapeEnd.CROSSING
     ends = crossing if short else grid[:, -1]

@@ -136,9 +136,12 @@ def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> I
 
 
 def refine(
-    at: At, problem: InnerBounds, rows: Sequence[DesignFigures], starts: Iterable[Point],
+    at: At,
+    problem: InnerBounds,
+    rows: Sequence[DesignFigures],
+    starts: Iterable[Point],
     limit: int = 40,
-) -> InnerResult:  # fmt: skip
+) -> InnerResult:
     """Local constrained solves from `starts` (rad/s); the best feasible design of all wins.
 
     `limit` bounds the syntheses of each local solve.
