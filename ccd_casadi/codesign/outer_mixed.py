@@ -13,10 +13,9 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.direct import polish
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
+from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import SETTLED, descend
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
-from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
@@ -50,11 +49,6 @@ class MixedOuter(Outer):
     @property
     def bounds(self) -> tuple[Array, Array]:
         return lifted_bounds(self.problem)
-
-    def solve_lifted(
-        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
-    ) -> FormulationResult:
-        return solve_lifted(self.sampler, formulation, seed=seed, given=given)
 
     def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """The true inner problem at a few θ tells an infeasible case from a formulation that
