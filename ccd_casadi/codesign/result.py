@@ -38,13 +38,19 @@ def result_dict(
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     problem, tolerance = verified.problem, terms.tolerance
-    plant = plant_of(problem)
     promised = predicted_value(outcome, verified.point, verified.value)
     error = abs(promised / verified.value - 1.0)
-    verdict = verdict_of(outcome, verified, tolerance, error, quality, look)
+    known = verified.searched(outcome, look)
+    verdict = {  # in the order in which they matter
+        "certified": verified.certified_line(),
+        "optimal": optimal_line(verified, tolerance, verified.inner_gap, known),
+        "predicted": predicted_line(verified, tolerance, error, outcome, quality),
+        "survives": verified.survives_line(),
+        "deployable": deployable(verified.survival, problem.sampling),
+    }
     evidence = verified.evidence(promised)
     held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}
-    stationary = optimal_line(outcome, verified, tolerance, look, gap=0.0)
+    stationary = optimal_line(verified, tolerance, 0.0, known)
     checks = {
         "certificate": verified.certified,
         "constraints": verified.feasible,
@@ -78,7 +84,7 @@ def result_dict(
         "kkt": {**vars(verified.kkt), "vertex": verified.kkt.second_order == math.inf},
         "globality": outcome.outer or OuterSolution((), 0),
         "box_look": {} if look is None else look.entry,
-        "notes": list(plant.notes(verified.theta)),
+        "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": outcome.iterates,
         **run_entry(terms, spent, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
@@ -89,46 +95,29 @@ def result_dict(
     return json_values(result)
 
 
-def verdict_of(
-    outcome: FormulationResult,
-    verified: Verified,
-    tolerance: float,
-    error: float,
-    quality: tuple[Quality, ...] = (),
-    look: GlobalCheck | None = None,
-) -> dict[str, VerdictLine]:
-    """The five lines on a verified design, in the order in which they matter; `error` is that of
-    its predicted value."""
-    problem = verified.problem
-    figure, at = problem.figure, quality[0].at_point if quality else None
-    return {
-        "certified": verified.certified_line(),
-        "optimal": optimal_line(outcome, verified, tolerance, look, gap=verified.inner_gap),
-        "predicted": predicted(
-            error=error,
-            tolerance=tolerance,
-            left_out=None if at is None else abs(at[0]) / (figure.factor * verified.value),
-            left_out_size=None if at is None else abs(at[0]),
-            sigmas=None if at is None else at[1],
-            extrapolates=quality[0].extrapolates if quality else (),
-            surrogate=bool(outcome.surrogates),
-            of=figure,
-        ),
-        "survives": verified.survives_line(),
-        "deployable": deployable(verified.survival, problem.sampling),
-    }
+def predicted_line(
+    verified: Verified, tolerance: float, error: float, outcome: FormulationResult,
+    quality: tuple[Quality, ...],
+) -> VerdictLine:  # fmt: skip
+    """Surrogate against truth, `error` relative, and the surrogate without the design."""
+    figure, at = verified.problem.figure, quality[0].at_point if quality else None
+    return predicted(
+        error=error,
+        tolerance=tolerance,
+        left_out=None if at is None else abs(at[0]) / (figure.factor * verified.value),
+        left_out_size=None if at is None else abs(at[0]),
+        sigmas=None if at is None else at[1],
+        extrapolates=quality[0].extrapolates if quality else (),
+        surrogate=bool(outcome.surrogates),
+        of=figure,
+    )
 
 
 def optimal_line(
-    outcome: FormulationResult,
-    verified: Verified,
-    tolerance: float,
-    look: GlobalCheck | None,
-    *,
-    gap: float,
+    verified: Verified, tolerance: float, gap: float, searched: tuple[str, Mapping[str, Any]]
 ) -> VerdictLine:
-    """Whether θ is stationary, and whether anything better is known."""
-    known, figures = verified.searched(outcome, look)
+    """Whether θ is stationary, and whether anything better is known, where it was `searched`."""
+    known, figures = searched
     line = optimal(
         verified.kkt,
         level=verified.kkt_level,
