@@ -110,7 +110,8 @@ class Page:
             "buttons_place": [wrapped],
             "pins_place": [self.pins.table],
             "map_place": [self.map.root()],
-        } | {f"{made.name}_place": [made.figure] for made in (*self.figures, *self.places)}
+        } | {f"{made.name}_place": [made.figure] for made in self.figures}
+        roots |= {f"{places.name}_place": [places.figure] for places in self.places}
         for name, parts in roots.items():
             for part in parts:
                 if part.sizing_mode is None:

@@ -255,9 +255,10 @@ def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
                 away = ca.DM(group.constant[i] - group.constant[j]) + ca.DM(slope) @ theta
                 lam = 1.0 - ca.sumsqr(away) / of.places.apart**2
                 found.setdefault(frozenset((points[i], points[j])), (name, lam))
-    there = [theta[k] for k in of.there]
-    some = {"actuators chosen": sum(there) / of.places.choose - 1.0} if there else {}
-    return dict(found.values()) | some
+    rules = dict(found.values())
+    if of.there:
+        rules["actuators chosen"] = ca.sum1(theta[of.there]) / of.places.choose - 1.0
+    return rules
 
 
 def _domain(plant: Plant, of: PlacedMechanics, count: int) -> tuple[Array, Array]:
