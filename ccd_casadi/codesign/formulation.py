@@ -1,11 +1,12 @@
 """What a formulation leaves behind: its iterates, its surrogate, and the design it ends with."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.sampling.samples import QuantitySample
+from ccd_casadi.sampling.samples import InnerSample, QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
 
@@ -44,12 +45,8 @@ class FormulationResult:
     message: str = ""
 
 
-@dataclass(frozen=True)
-class KnownSamples:
-    """What a formulation may begin with in place of its own plan: θ (n, n_θ), designs there."""
-
-    thetas: Array
-    samples: tuple[QuantitySample, ...]
+# What a formulation may begin with in place of its own plan: samples at θ, or at (θ, ω_S, ω_T).
+KnownSamples = Sequence[InnerSample | QuantitySample]
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def solve_lifted(
         X = design("sobol", lower, upper, points, seed)
         samples = [s for s in sampler.quantities(X) if s.certified]
     else:
-        samples = list(given.samples)
+        samples = [sample for sample in given if isinstance(sample, QuantitySample)]
     if len(samples) < len(lower) + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)

@@ -75,7 +75,7 @@ def solve_nested(
         plan = design(options.plan, lower, upper, options.points, seed)
         thetas = _allowed(problem, np.unique(np.vstack([plan, problem.start]), axis=0))
     else:
-        thetas = given.thetas
+        thetas = np.array([sample.x[: len(lower)] for sample in given])
     samples = sampler.values(thetas)
     if not any(sample.feasible for sample in samples):
         return FormulationResult(message="no sampled theta is feasible")
