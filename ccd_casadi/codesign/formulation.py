@@ -5,7 +5,11 @@ from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.samples import InnerSample, QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
@@ -27,6 +31,16 @@ class Iterate:
     error: float
     step: float
     radius: float
+
+
+def iterate_of(
+    problem: CoDesignProblem, theta: tuple[float, ...], predicted: float, truth: float,
+    *, error: float, step: float, radius: float = 1.0,
+) -> Iterate:  # fmt: skip
+    """A round with J as it was promised and as it is, infinite where there is no true value."""
+    promised, J = (objective(problem, theta, value) for value in (predicted, truth))
+    J = J if np.isfinite(truth) else np.inf
+    return Iterate(theta, predicted, truth, promised, J, error, step, radius)
 
 
 @dataclass(frozen=True)
