@@ -7,7 +7,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-PLAIN = (".c", ".h", ".st")  # what no mark-up is in
+PLAIN = (".c", ".h", ".md", ".st", ".txt")  # what no mark-up is in
 
 
 def package_path(name: str) -> Path:
