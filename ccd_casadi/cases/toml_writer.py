@@ -11,7 +11,7 @@ from typing import Any
 from ccd_casadi.cases.tables import TABLES, Case
 
 
-def case_totoml(case: Case) -> str:
+def case_to_toml(case: Case) -> str:
     """The resolved case, defaults included, as TOML."""
     plant = {"model": case.plant.model} if case.plant.model else {"function": case.plant.function}
     lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
