@@ -2,14 +2,18 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 
-from ccd_casadi.support.command_line import ExitCode, parser, program, run, run_folder
+from ccd_casadi.support.command_line import ExitCode, command, option, program, run_folder
 from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.units import counted
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.check", "Look at a case's plant before designing anything.",
+    option("--json", action="store_true", help="the diagnosis as JSON"),
+    needs=["ccd_casadi.codesign.result"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
@@ -38,13 +42,6 @@ def command(options: argparse.Namespace) -> ExitCode:
         say(words.render(found, start=theta_words(found), shares=SHARES).rstrip())
         inform(f"next          {program('ccd_casadi.solve')} {options.case}")
     return ExitCode.DONE
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser("ccd_casadi.check", "Look at a case's plant before designing anything.")
-    arguments.add_argument("--json", action="store_true", help="the diagnosis as JSON")
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":

@@ -2,12 +2,11 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
-from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import one_line, positive, real
 from ccd_casadi.support.progress import Progress
@@ -18,7 +17,40 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     from ccd_casadi.deployment.outcome import Deployment
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+def _delay(arguments: argparse.ArgumentParser) -> None:
+    """--delay or --delay-samples."""
+    either = arguments.add_mutually_exclusive_group()
+    words = "time from reading y to the new u, in s"
+    either.add_argument("--delay", metavar="SECONDS", type=real(), help=words)
+    words = "the same time in sampling periods (default: 1)"
+    either.add_argument(
+        "--delay-samples", metavar="X", type=real(), default=Timing.delay_samples, help=words
+    )
+
+
+@command(
+    "ccd_casadi.deploy",
+    "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
+    option("--rate-hz", metavar="X", type=positive,
+           help="sampling rate (default: the next round rate above what is needed)"),
+    _delay,
+    option("--lead", choices=["on", "off"], default="on",
+           help="a lead that compensates hold and delay (default: on, which lowers the rate)"),
+    option("--unverified", action="store_true",
+           help="deploy a run that is not verified; the result is not verified either"),
+    option("--saturation", metavar="NEWTON", type=positive,
+           help="limit every u to plus or minus this, with anti-windup (default: off)"),
+    option("--fmu", action="store_true",
+           help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC "
+           "names"),
+    *(option(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
+      for name, metavar, words in (
+          ("--sensor-step", "METRE", "of the simulated sensor"),
+          ("--force-step", "NEWTON", "of the simulated actuator"),
+          ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"))),
+    add_move_options, needs=["ccd_casadi.deployment.pipeline"], make=run_parser,
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
@@ -131,38 +163,6 @@ def _shortfall(found: "Deployment") -> str:
     if found.needed_hz is None:
         return f"{words}; with this delay no rate is; shorten the delay"
     return f"{words}; {found.needed_hz:.6g} Hz is needed"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.deploy",
-        "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
-    )
-    add = arguments.add_argument
-    words = "sampling rate (default: the next round rate above what is needed)"
-    add("--rate-hz", metavar="X", type=positive, help=words)
-    delay = arguments.add_mutually_exclusive_group()
-    words = "time from reading y to the new u, in s"
-    delay.add_argument("--delay", metavar="SECONDS", type=real(), help=words)
-    delay.add_argument("--delay-samples", metavar="X", type=real(), default=Timing.delay_samples,
-                       help="the same time in sampling periods (default: 1)")  # fmt: skip
-    words = "a lead that compensates hold and delay (default: on, which lowers the rate)"
-    add("--lead", choices=["on", "off"], default="on", help=words)
-    words = "deploy a run that is not verified; the result is not verified either"
-    add("--unverified", action="store_true", help=words)
-    words = "limit every u to plus or minus this, with anti-windup (default: off)"
-    add("--saturation", metavar="NEWTON", type=positive, help=words)
-    words = "also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC names"
-    add("--fmu", action="store_true", help=words)
-    for name, metavar, words in (
-        ("--sensor-step", "METRE", "of the simulated sensor"),
-        ("--force-step", "NEWTON", "of the simulated actuator"),
-        ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
-    ):
-        add(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
-    add_move_options(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign import FORMULATIONS
-from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
+from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.units import counted
@@ -114,7 +114,17 @@ def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
     return replace(solution, result=solution.result | {"reason": "; ".join(filter(None, words))})
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.solve", "Design a stage and its controller together.",
+    option("--formulation", choices=FORMULATIONS,
+           help="default: nested, or direct with many parameters or lists"),
+    option("--resume", action="store_true",
+           help="print what the run folder holds; every run continues from it"),
+    option("--no-report", action="store_true",
+           help="write no pages, for jobs that only need result.json"),
+    SCHEDULER, needs=["ccd_casadi.codesign.run"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
@@ -160,20 +170,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     if options.quiet and code is not ExitCode.DONE:
         say(f"{options.case}: {solution.result['reason']}", sys.stderr)
     return code
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser("ccd_casadi.solve", "Design a stage and its controller together.")
-    add = arguments.add_argument
-    words = "default: nested, or direct with many parameters or lists"
-    add("--formulation", choices=FORMULATIONS, help=words)
-    words = "print what the run folder holds; every run continues from it"
-    add("--resume", action="store_true", help=words)
-    words = "write no pages, for jobs that only need result.json"
-    add("--no-report", action="store_true", help=words)
-    add_scheduler(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
 
 if __name__ == "__main__":
