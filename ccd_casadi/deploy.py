@@ -132,26 +132,12 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.deployment.words import figure_rows, order_words, status_words
     from ccd_casadi.reporting.verdict import advice
+    from ccd_casadi.support.package_text import template
 
-    needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
-    lines = [
-        ("status", status_words(run, found)),
-        *([("decision", advice(run.result))] if advice(run.result) else []),
-        ("order", order_words(run, found)),
-        ("rate", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
-                 f"{found.conversion.value}; needed {needed}"),
-        *((name.lower(), f"{value}, {words}") for name, value, words in figure_rows(run, found)),
-    ]  # fmt: skip
-    if not found.stable:
-        lines.append(("", found.shortfalls[0]))
-    if found.members:
-        worst = found.worst
-        peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"
-        words = f"{1 + len(found.members)} plants: {peak}"
-        lines.append(("robust set", f"{words} ({place_words(worst.at)})"))
-    if found.statics is not None:
-        lines.append(("at rest", found.statics.words))
-    return "\n".join(f"{name:13s} {words}" for name, words in lines)
+    return template("templates/deploy.txt", place_words=place_words).render(
+        d=found, status=status_words(run, found), decision=advice(run.result),
+        order=order_words(run, found), figures=figure_rows(run, found),
+    ).rstrip()  # fmt: skip
 
 
 def _shortfall(found: "Deployment") -> str:
