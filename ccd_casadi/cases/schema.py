@@ -4,6 +4,7 @@ Both are made of the definitions that check a case (`tables`), so that they cann
 The schema lets more pass than the checks do: what hangs on several keys is left to them.
 """
 
+import json
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
@@ -15,72 +16,32 @@ from ccd_casadi.cases.parameters import KEYS as THETA
 from ccd_casadi.cases.tables import REQUIRED, TABLES
 from ccd_casadi.cases.toml_writer import toml
 from ccd_casadi.plants.registry import model_names
-from ccd_casadi.support.package_text import template
-
-DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_PLANT = {
-    "model": 'a model of the package, or "measured": a frequency response; or give function',
-    "function": '"my_plant.py:model", relative to the case file: a Python function of θ',
-}
+from ccd_casadi.support.package_text import package_text, template
 
 
 def case_schema() -> dict[str, Any]:
     """The JSON Schema of a case file."""
-    tables: dict[str, Any] = {
-        "plant": {
-            "type": "object",
-            "description": "The plant; every other key goes to the model or function.",
-            "properties": {
-                "model": {
-                    "enum": sorted({*model_names(), MEASURED}), "description": _PLANT["model"],
-                },
-                "function": {
-                    "type": "string", "pattern": r".+\.py:\w+$", "description": _PLANT["function"],
-                },
-            },
-            "oneOf": [{"required": ["model"]}, {"required": ["function"]}],
-        },
-        "theta": {
-            "type": "object",
-            "description": "A table [theta.NAME] for each hardware parameter.",
-            "minProperties": 1,
-            "additionalProperties": {
-                "type": "object",
-                "properties": {
-                    key: {**check.schema, "description": says}
-                    for key, (check, says) in THETA.items()
-                },
-                "anyOf": [
-                    {"required": keys} for keys in (["lower", "upper"], ["values"], ["fixed"])
-                ],
-                "additionalProperties": False,
-            },
-        },
-    }  # fmt: skip
+    found: dict[str, Any] = json.loads(package_text("templates/case.schema.json"))
+    tables = found["properties"]
+    tables["plant"]["properties"]["model"]["enum"] = sorted({*model_names(), MEASURED})
+    tables["theta"]["additionalProperties"]["properties"] = {
+        key: {**check.schema, "description": says} for key, (check, says) in THETA.items()
+    }
     tables |= {name: _table(kind) for name, kind in TABLES.items()}
     channels = tables["controller"]["properties"]["channel"]
     channels["additionalProperties"] = _table(ChannelTable)
+    checks = {key: dict(check.schema) for key, check in TABLE_CHECKS.items()}
     for kind, units in UNITS.items():
         spectrum = {
             "type": "object",
-            "properties": {key: dict(check.schema) for key, check in TABLE_CHECKS.items()},
+            "properties": checks | {"unit": {"enum": list(units)}},
             "required": ["unit"],
             "additionalProperties": False,
         }
-        spectrum["properties"]["unit"] = {"enum": list(units)}  # type: ignore[index]
         entry = tables["budget"]["properties"][kind.value]
         entry["anyOf"] = [spectrum, {"type": "array", "items": spectrum}]
-    of_data = {"plant": {"properties": {"model": {"const": MEASURED}}, "required": ["model"]}}
-    return {
-        "$schema": DRAFT,
-        "title": "A case of ccd-casadi",
-        "type": "object",
-        "properties": tables,
-        "required": ["plant", "inner"],
-        "if": {"properties": of_data},
-        "else": {"required": ["theta", *REQUIRED]},  # what was measured has no θ to choose
-        "additionalProperties": False,
-    }
+    found["else"]["required"] += REQUIRED  # what was measured has no θ to choose
+    return found
 
 
 def keys_page() -> str:
@@ -88,8 +49,9 @@ def keys_page() -> str:
     required = ("lower", "upper")
     theta = ((key, "required" * (key in required), "", says) for key, (_, says) in THETA.items())
     kinds = {**TABLES, "controller.channel.NAME": ChannelTable}
+    plant = case_schema()["properties"]["plant"]["properties"]
     return template("templates/keys.md").render(
-        plant=((key, "", "", says) for key, says in _PLANT.items()), theta=theta,
+        plant=((key, "", "", own["description"]) for key, own in plant.items()), theta=theta,
         tables={name: [_row(item) for item in fields(kind)] for name, kind in kinds.items()},
         spectrum=TABLE_CHECKS,
     )  # fmt: skip
