@@ -22,7 +22,7 @@ from ccd_casadi.reporting.facts import conclusion, theta_axes, theta_table
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ, number, with_unit
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
@@ -78,7 +78,7 @@ def _(item: CoDesignProblem) -> str:
         (f"|S| at {number(inner.omega_low / HZ)} Hz", f"≤ {inner.S_low:g}", ""),
     ]
     if inner.compliance_max is not None:
-        facts.append(("Compliance |GS|", f"≤ {1e6 * inner.compliance_max:g} µm/N", ""))
+        facts.append(("Compliance |GS|", f"≤ {with_unit(inner.compliance_max, 'm')}/N", ""))
     facts.append(("Controller", *kind_of(item).described()))
     if item.robust is not None:
         shifts = f"resonances ±{100.0 * item.robust.shift:g} %"

@@ -76,7 +76,10 @@ def head_of(
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
     """The head of a page that is about the run itself: badge and verdict are the run's."""
     good = result["status"] == "verified"
-    reason = head_words(result) if good else str(result.get("reason") or "")
+    failed = [line for line in lines_of(result) if line.state == State.FAILED]
+    below = "; ".join(f"{line.name}: {line.words}" for line in failed)
+    why = str(result.get("reason") or "").replace(f" ({below})", "")
+    reason = head_words(result) if good else why
     reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
     status = STATUS.get(result["status"], "not verified")
     return head_of(title, good, status, reason, meta, lead, result)
