@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.fixed_structure.composite import on_plants
 from ccd_casadi.fixed_structure.decoupling import in_units_of
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
@@ -40,7 +41,8 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
-from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
+from ccd_casadi.plants.plant import Evaluate, first_order, hardware_cost
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
@@ -120,7 +122,10 @@ def joint_search(
             final = APART + (LOOKS + 1) * turn + LOOKS
             looks = range(final - LOOKS, final)
             asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
-            best, near, problem = *finished(asked, models, best), asked.problem
+            best, problem = nearly_finished(asked, models, best), asked.problem
+            del make, models  # with which the bases go
+            gc.collect()
+            best, near = finished(asked, best, partial(nearby, problem, ()))
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
             scenarios = violations(problem, own, kappa, omega_b, final, tell)[1]
@@ -142,7 +147,8 @@ def joint_search(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = best if settled or ends is not None else finished(asked, models, best)[0]
+    if not (settled or ends is not None):
+        best = finished(asked, best, partial(nearby, problem, ()))[0]
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
@@ -187,26 +193,34 @@ def on_worse_plants(
     return sampler, best, J
 
 
+def nearly_finished(sampler: Sampler, models: Sequence[Evaluate], start: JointPoint) -> JointPoint:
+    """The joint optimum near by on what these models know of it, where the plants cost more."""
+    if plant_of(sampler.problem).nearby is None:
+        return start
+
+    def around(theta: tuple[float, ...]) -> list[Evaluate]:
+        return [first_order(model(theta), theta) for model in models]
+
+    return finished(sampler, start, around, "nearly finished")[0]
+
+
 def finished(
-    sampler: Sampler, models: Sequence[Evaluate], start: JointPoint
+    sampler: Sampler,
+    start: JointPoint,
+    around: Callable[[tuple[float, ...]], Sequence[Evaluate]],
+    name: str = "finished",
 ) -> tuple[JointPoint, bool]:
-    """The joint optimum near by, on plants known near it and then on the plants themselves to first
-    order: so near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it;
-    and whether it is that near, or was."""
-
-    def ended(models: Sequence[Evaluate], at: JointPoint, reach: float) -> Proposal:
-        make = partial(proposed, problem, models, at, reach, LAST_GAIN)
-        return sampler.cached("finished", (*at.theta, at.bandwidth, reach), Proposal, make)
-
-    problem, reach = sampler.problem, CLOSE
-    best = ended(models, start, CLOSE).end
-    models = nearby(problem, (), best.theta)
-    best, J = first = JointModel(problem, models, best, reach).adapted()
+    """The joint optimum near by, on plants to first order around one place after the other: so near
+    that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether it is
+    that near, or was."""
+    problem, models, reach = sampler.problem, around(start.theta), CLOSE
+    best, J = first = JointModel(problem, models, start, reach).adapted()
     for _ in range(ENDINGS):
-        found = ended(models, best, reach)
+        make = partial(proposed, problem, models, best, reach, LAST_GAIN)
+        found = sampler.cached(name, (*best.theta, best.bandwidth, reach), Proposal, make)
         if found.gain <= KEPT * abs(J):
             return best, True
-        others = nearby(problem, (), found.end.theta)
+        others = around(found.end.theta)
         end, there = JointModel(problem, others, found.end, reach).adapted()
         reach *= 2.0 if J - there > GOOD * found.gain else 0.3
         if there < J:
@@ -324,30 +338,32 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         count = len(self.middle)
         return x[:count], x[count:-1], float(x[-1])
 
-    def uncertain(self, z: Array, beside: Array | None = None) -> UncertainPlant:
-        """The plant at z, or beside z to first order."""
+    def uncertain(self, z: Array) -> UncertainPlant:
+        """The plant at z."""
         theta = tuple(self.theta(z).tolist())
-        known = [model(theta) for model in self.models]
-        if beside is not None:
-            known = [to_first_order(one, self.width * beside) for one in known]
-            theta = tuple(self.theta(z + beside).tolist())
-        return uncertain_plant(self.problem, theta, known)
+        return uncertain_plant(self.problem, theta, [model(theta) for model in self.models])
 
-    def loops(self, z: Array, beside: Array | None = None) -> LoopProblem:
-        """Those of the set there, in the units of its first plant in the middle."""
+    def plants(self, z: Array) -> list[ScaledPlant]:
+        """Those of the set there, in the units of its first one in the middle."""
         share = self.width[:, None, None]
-        plants = [
-            replace(plant, dA=share * plant.dA, dB=share * plant.dB, dC=share * plant.dC)
-            for plant in self.uncertain(z, beside).plants(self.scenarios)
-        ]
+        return [
+            in_units_of(replace(one, dA=share * one.dA, dB=share * one.dB, dC=share * one.dC),
+                        self.first)
+            for one in self.uncertain(z).plants(self.scenarios)
+        ]  # fmt: skip
+
+    def loops(self, z: Array) -> LoopProblem:
+        """Those with these plants."""
         structured = structured_of(self.problem)
         return problem_for(
-            [in_units_of(plant, self.first) for plant in plants], structure_of(self.problem),
-            bounds_of(self.problem), structured.sampling, structured.frequencies,
+            self.plants(z), structure_of(self.problem), bounds_of(self.problem),
+            structured.sampling, structured.frequencies,
         )  # fmt: skip
 
-    def _loops_beside(self, z: tuple[float, ...]) -> list[LoopProblem]:
-        return [self.loops(np.array(z), BESIDE * unit) for unit in np.eye(len(z))]
+    def _loops_beside(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> list[LoopProblem]:
+        z, sampling = self.parts(here.x)[0], structured_of(self.problem).sampling
+        moved = (z + BESIDE * unit for unit in np.eye(len(z)))
+        return [on_plants(here.data[0], self.plants(place), sampling) for place in moved]
 
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
         """With every loop stable, and masses that are positive to first order."""
@@ -389,7 +405,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         def second(index: np.ndarray) -> Array:
             chosen = found.only(index)
             try:
-                beside = self.loops_beside(tuple(z.tolist()))
+                beside = self.loops_beside(here)
             except np.linalg.LinAlgError:  # as in `at`: no curvature is known at the edge
                 return np.zeros((len(chosen.value), len(here.x), len(here.x)))
             return hessians(problem, kappa, tau, chosen, beside)

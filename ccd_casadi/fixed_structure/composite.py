@@ -7,7 +7,7 @@ are the channels' moduli. Plants whose channels are coupled are bounded as a who
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -149,6 +149,26 @@ def composite_problem(
         parts.append(Part(whole, place, together))
     plant_units = parts[0].problem.plants
     return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
+
+
+def on_plants(
+    problem: LoopProblem, plants: Sequence[ScaledPlant], sampling: Sampling | None
+) -> LoopProblem:
+    """The same problem on plants that are moved a little: as many, in its units, that fall apart
+    and are alike where its own are. None of this is checked."""
+    if not isinstance(problem, CompositeProblem):
+        return replace(problem, plants=plant_set(plants, sampling))
+    decoupling, parts = problem.structure.decoupling, []
+    for part in problem.parts:
+        members, channel = [plants[i] for i in part.members], part.channel
+        if channel is None:
+            moved = plant_set(members, sampling, decoupling)
+        else:
+            moved = plant_set(
+                [channel_plant(one, decoupling, channel) for one in members], sampling
+            )
+        parts.append(replace(part, problem=replace(part.problem, plants=moved)))
+    return replace(problem, plants=parts[0].problem.plants, parts=tuple(parts))
 
 
 def box_of(

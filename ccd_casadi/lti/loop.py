@@ -41,7 +41,7 @@ class Loop:
         if self.plant.modes is None:
             return self.as_run[0].response(omega)
         poles, drive, reading = self.plant.modes
-        f, _ = transfer(poles, omega, self.sampling.period, self.sampling.delay)
+        f = transfer(poles, omega, self.sampling.period, self.sampling.delay)
         return np.asarray((reading * f[:, None, :]) @ drive)
 
     def controller_response(self, omega: Array) -> np.ndarray:

@@ -252,7 +252,11 @@ def nearby_model(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[
     """θ -> Mechanics from what is known: the plant's own way, or to first order around `here`."""
     if plant.nearby is not None and known:
         return plant.nearby(known)
-    system = mechanics(plant, here)
+    return first_order(mechanics(plant, here), here)
+
+
+def first_order(system: Mechanics, here: Sequence[float]) -> Evaluate:
+    """θ -> Mechanics around `here`."""
     return lambda theta: to_first_order(system, np.array(theta) - np.array(here))
 
 
