@@ -93,8 +93,8 @@ def _compile_rows(curvature: bool) -> None:
         modes.responses(plants, first, one)
         loop_curvature.second(first, first, first, one, loop)
         side, four = np.ones((1, 1, 1), complex), np.ones((1, 1, 1, 1), complex)
-        slopes = (plants.terms[..., [0] * 6], side, side, side, four.real[..., None], four, four)
-        slopes = plant_slopes.PlantSlopes(*slopes, 0.0, 0.0)
+        terms, apart = plants.terms[..., [0] * 6], four.real[..., None]
+        slopes = plant_slopes.PlantSlopes(terms, side, side, side, apart, four, four, 0.0, 0.0)
         plant_slopes.form_slopes(slopes, first, one, side[0], side[0], False)
     else:
         loop_rows.levels(first[None], first, square, loop, 0.0)
@@ -160,13 +160,8 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    for name in (
-        "design",
-        "gradients",
-        "loop_curvature",
-        "loop_rows",
-        "plant_slopes",
-    ):  # with them all the others
+    names = ("design", "gradients", "loop_curvature", "loop_rows", "plant_slopes")
+    for name in names:  # with them all the others
         import_module(f"{PACKAGE}.{name}")
     found = {}
     for name, module in list(sys.modules.items()):

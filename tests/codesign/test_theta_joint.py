@@ -10,15 +10,10 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
+from ccd_casadi.codesign.joint_model import JointModel, JointPoint, proposed
 from ccd_casadi.codesign.outer import Place
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.theta_joint import (
-    JointModel,
-    JointPoint,
-    joint_search,
-    objectives_beside,
-    proposed,
-)
+from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import objective_of
