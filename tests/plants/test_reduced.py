@@ -11,6 +11,7 @@ from ccd_casadi.case_studies.rib_stage.geometry import Geometry, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE
 from ccd_casadi.case_studies.rib_stage.model import RibStage
 from ccd_casadi.case_studies.rib_stage.plant import plant_of_stage
+from ccd_casadi.case_studies.rib_stage.truncation import kept_first
 from ccd_casadi.plants.plant import Mechanics, nearby_model
 from ccd_casadi.support.arrays import Array
 
@@ -87,6 +88,14 @@ def test_a_plant_evaluates_it_in_its_own_order_of_parameters() -> None:
     np.testing.assert_allclose(
         told.derivatives[2], true.derivatives[2], atol=0.1 * np.abs(true.derivatives[2]).max()
     )
+
+
+def test_of_two_modes_that_cross_the_same_symmetry_stays() -> None:
+    before = np.array([[0.9, 0.1, 0.8, 0.3], [0.1, 0.9, 0.2, 0.7]])  # shares of two symmetries
+    after = before[:, [0, 1, 3, 2]]
+    for shares, order in ((before, [0, 2, 1, 3]), (after, [0, 3, 1, 2])):
+        np.testing.assert_array_equal(kept_first(shares, (2, 1)), order)
+    np.testing.assert_array_equal(kept_first(before, (3, 1))[:4], [0, 2, 1, 3])  # no third one
 
 
 def test_modes_that_may_cross_have_places_of_their_own() -> None:
