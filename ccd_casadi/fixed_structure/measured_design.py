@@ -103,7 +103,7 @@ def design_on_data(
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent)
     best: MeasuredDesign | None = None
     for runner in finished(run_race(problem, np.array(pool), tell, workers)):
-        end = ascend(problem, runner.point, iterations=60, radius=1e-2, penalty=400.0)
+        end = ascend(problem, runner.point, iterations=60, radius=1e-2, restoring=True)
         spent += runner.evaluations + end.evaluations
         kappa = _more_integral(problem, end.point, given_up) if given_up else end.point.kappa
         design = _judged(problem, kappa, period, spent)

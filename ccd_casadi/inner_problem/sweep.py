@@ -13,8 +13,8 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.optimize import minimize
 
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -227,7 +227,7 @@ def local_solve(
     def climbed(x: Array, low: Array, high: Array) -> bool:
         """Whether SLSQP ended without an uncertified design on the way."""
         try:
-            minimize(
+            scipy.optimize.minimize(
                 lambda x: -np.log(at(x).values[0]),
                 x,
                 jac=lambda x: -at(x).to_break_frequencies[0] / at(x).values[0],

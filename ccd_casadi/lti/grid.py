@@ -5,7 +5,7 @@ the local maxima of a gain over them.
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 
 from ccd_casadi.support.arrays import Array
 
@@ -50,7 +50,7 @@ def refine_peak(
 
     `xatol`: in ln ω.
     """
-    top = minimize_scalar(
+    top = scipy.optimize.minimize_scalar(
         lambda x: -gain(float(np.exp(x))), bounds=(np.log(low), np.log(high)),
         method="bounded", options={"xatol": xatol},
     )  # fmt: skip

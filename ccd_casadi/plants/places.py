@@ -12,8 +12,8 @@ from itertools import combinations
 
 import casadi as ca
 import numpy as np
+import scipy
 from scipy.linalg import eigh
-from scipy.spatial import Delaunay
 
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
@@ -172,7 +172,7 @@ class PlacedMechanics:
         omega, modes = _flexible(self(theta))
         nodes = self.between.nodes
         moved = modes.T @ self.evaluate(tuple(float(theta[i]) for i in self.own)).B
-        corners = Delaunay(nodes).simplices[:, [0, 1, 2, 2]]
+        corners = scipy.spatial.Delaunay(nodes).simplices[:, [0, 1, 2, 2]]
         flat = np.zeros((len(nodes), 3))
         found = [
             ModeShape(flat + row[:, None] * [0.0, 0.0, 1.0], float(w) / HZ, (i + 1,))

@@ -26,7 +26,8 @@ from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import REACH, Survival, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.drawing.paint import verdict_html
+from ccd_casadi.drawing.content import Verdict
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -305,7 +306,7 @@ def result_of(**states: str) -> dict:
 def test_every_place_shows_the_same_lines() -> None:
     result = result_of(survives="warned", deployable="unknown")
     terminal = "\n".join(shown.terminal_lines(result))
-    page = verdict_html(shown.lines_of(result))
+    page = block_html(Verdict(shown.lines_of(result)))
     for name in shown.LINES:
         assert f"{name} words" in terminal
         assert f"{name} words" in page
@@ -319,4 +320,4 @@ def test_every_place_shows_the_same_lines() -> None:
 @pytest.mark.parametrize("damage", [{}, {"verdict": 3}, {"verdict": {"optimal": {"state": "?"}}}])
 def test_a_run_without_a_verdict_shows_none(damage: dict) -> None:
     assert shown.lines_of(damage) == ()
-    assert verdict_html(shown.lines_of(damage)) == ""
+    assert block_html(Verdict(shown.lines_of(damage))) == ""
