@@ -80,8 +80,8 @@ class Bases:
 
 @dataclass(frozen=True)
 class Small:
-    """Modes of a small problem, those that are kept first: λ (m,), ∂K and ∂M between them (θ, m, k),
-    k <= m; u at points (m, 3, p) with its slopes (θ, m, 3, p)."""
+    """Modes of a small problem, those kept first: λ (m,), ∂K and ∂M between them (θ, m, k), k <= m;
+    u at points (m, 3, p) with its slopes (θ, m, 3, p)."""
 
     values: Array
     dK: Array
