@@ -30,7 +30,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
-from ccd_casadi.plants.plant import Evaluate, hardware_cost
+from ccd_casadi.plants.plant import Evaluate, Mechanics, hardware_cost, to_first_order
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -99,11 +99,11 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         known = [(option, np.array(point)) for option, point in structured.scenarios]
         lower, upper = box(problem)
         self.lower, self.width = lower, upper - lower
-        uncertain = self.uncertain((self.middle - lower) / self.width)
+        middle = (self.middle - lower) / self.width
+        uncertain = self.uncertain(middle, self.known(middle))
         self.scenarios = known or uncertain.corners()
         self.first = uncertain.plants(self.scenarios[:1])[0]
         self.unit = -problem.w2 * place.bandwidth
-        middle = (self.middle - lower) / self.width
         loops = self.first_loops = self.loops(middle)
         self.merits: list[float] = []  # before every trial
         # A step that fails is followed by one from the same place.
@@ -152,32 +152,39 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         count = len(self.middle)
         return x[:count], x[count:-1], float(x[-1])
 
-    def uncertain(self, z: Array) -> UncertainPlant:
-        """The plant at z."""
-        theta = tuple(self.theta(z).tolist())
-        return uncertain_plant(self.problem, theta, [model(theta) for model in self.models])
+    def known(self, z: Array) -> list[Mechanics]:
+        """The plant and its options at z, as the models know them."""
+        return [model(tuple(self.theta(z).tolist())) for model in self.models]
 
-    def plants(self, z: Array) -> list[ScaledPlant]:
+    def uncertain(self, z: Array, known: Sequence[Mechanics]) -> UncertainPlant:
+        """The plant at z."""
+        return uncertain_plant(self.problem, tuple(self.theta(z).tolist()), known)
+
+    def plants(self, z: Array, known: Sequence[Mechanics]) -> list[ScaledPlant]:
         """Those of the set there, in the units of its first one in the middle."""
         share = self.width[:, None, None]
         return [
             in_units_of(replace(one, dA=share * one.dA, dB=share * one.dB, dC=share * one.dC),
                         self.first)
-            for one in self.uncertain(z).plants(self.scenarios)
+            for one in self.uncertain(z, known).plants(self.scenarios)
         ]  # fmt: skip
 
     def loops(self, z: Array) -> LoopProblem:
         """Those with these plants."""
         structured = structured_of(self.problem)
         return problem_for(
-            self.plants(z), structure_of(self.problem), bounds_of(self.problem),
+            self.plants(z, self.known(z)), structure_of(self.problem), bounds_of(self.problem),
             structured.sampling, structured.frequencies,
         )  # fmt: skip
 
     def _loops_beside(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> list[LoopProblem]:
+        """To first order there, as a model may jump where a mode that it keeps meets another."""
         z, sampling = self.parts(here.x)[0], structured_of(self.problem).sampling
-        moved = (z + BESIDE * unit for unit in np.eye(len(z)))
-        return [on_plants(here.data[0], self.plants(place), sampling) for place in moved]
+        known, found = self.known(z), []
+        for step in BESIDE * np.eye(len(z)):
+            moved = [to_first_order(one, self.width * step) for one in known]
+            found.append(on_plants(here.data[0], self.plants(z + step, moved), sampling))
+        return found
 
     def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
         """With every loop stable, and masses that are positive to first order."""

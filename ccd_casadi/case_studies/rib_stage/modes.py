@@ -155,7 +155,7 @@ def spectrum(
 def slopes(
     disc: Discretisation, geometry: Geometry, found: Spectrum, keep: int, F: Array, dF: Array
 ) -> tuple[Array, Array]:
-    """∂K (θ, k, k) and ∂(Fᵀφ) (θ, r, k) of the first k = `keep` modes, F (n, r), dF (θ, n, r).
+    """∂K (θ, k, k) and ∂(Fᵀφ) (θ, r, k) of the k = `keep` lowest modes, F (n, r), dF (θ, n, r).
 
     φ' = -½ φ φᵀM'φ - (K - λM)⁺ (K' - λM') φ, taken from the side of F:
     Fᵀφ' = -½ (Fᵀφ) φᵀM'φ - Zᵀ(K' - λM')φ, Z = (K - λM)⁺F, so that the number of θ costs nothing.
@@ -164,7 +164,7 @@ def slopes(
     lam, V = found.values, found.vectors
     rigid, kept = found.rigid, V[:, :keep]
     Q, R = _compress(F)
-    resolvent = build_resolvent(found.pencil, np.hstack([rigid, V]), Q, lam[:keep].max())
+    resolvent = build_resolvent(found.pencil, np.hstack([rigid, V]), Q, lam[keep - 1])
     close = np.abs(lam[:keep, None] - lam[None, :]) <= CLUSTER * lam[None, :]
     adjoint = []
     for i in range(keep):

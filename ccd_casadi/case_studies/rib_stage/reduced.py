@@ -45,7 +45,7 @@ from ccd_casadi.case_studies.rib_stage.modes import (
     spectrum,
 )
 from ccd_casadi.case_studies.rib_stage.symmetry import AS, mirror_signs, swap_displacements
-from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, kept_first
+from ccd_casadi.case_studies.rib_stage.truncation import TWENTY
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.threads import side_by_side
@@ -80,8 +80,8 @@ class Bases:
 
 @dataclass(frozen=True)
 class Small:
-    """Modes of a small problem, those kept first: λ (m,), ∂K and ∂M between them (θ, m, k), k <= m;
-    u at points (m, 3, p) with its slopes (θ, m, 3, p)."""
+    """Modes of a small problem, lowest first: λ (m,), ∂K and ∂M between them (θ, m, k), k <= m; u
+    at points (m, 3, p) with its slopes (θ, m, 3, p)."""
 
     values: Array
     dK: Array
@@ -116,7 +116,7 @@ def mechanics(stage: RibStage, known: Bases, theta: Sequence[float]) -> Mechanic
         images = (
             [of[s] for (s,) in group.images]
             if not masses
-            else [_coupled(stage, group, [of[s] for s in group.solved])]
+            else [_coupled([of[s] for s in group.solved], [mass.mass for mass in masses])]
         )
         for place, one in enumerate(images):
             # A pair of modes of one frequency stands in turns.
@@ -274,12 +274,11 @@ def _lowest(values: Array, G: Array) -> tuple[Array, Array]:
     return np.append(values[:few], own), block_diag(np.eye(few), Q @ turn)
 
 
-def _coupled(stage: RibStage, group: Group, parts: Sequence[Small]) -> Small:
+def _coupled(parts: Sequence[Small], masses: Sequence[float]) -> Small:
     """The direct sum of symmetries with point masses, which stand last among the points:
 
-    M = I + G m Gᵀ, G the displacements there. Rigid motions, modes that are kept, and the others.
+    M = I + G m Gᵀ, G the displacements there.
     """
-    masses = [mass.mass for mass in stage.geometry.point_masses]
     lam = np.concatenate([part.values for part in parts])
     n, count = len(lam), len(parts[0].dK)
     dK, dM, start = np.zeros((count, n, n)), np.zeros((count, n, n)), 0
@@ -291,12 +290,6 @@ def _coupled(stage: RibStage, group: Group, parts: Sequence[Small]) -> Small:
     mass = np.eye(n) + np.einsum("acp,bcp,p->ab", G, G, masses)
     moved = np.einsum("tacp,bcp,p->tab", dG, G, masses)
     values, Y = eigh(np.diag(lam), mass)
-    starts = np.cumsum([0, *(len(part.values) for part in parts[:-1])])
-    shares = np.add.reduceat(Y * (mass @ Y), starts)
-    rigid = sum(RIGID.get(s.name, 0) for s in group.solved)
-    kept = rigid + kept_first(shares[:, rigid:], stage.modes.each(group))
-    order = np.append(np.arange(rigid), kept)
-    values, Y = values[order], Y[:, order]
     dK, dM = (Y.T @ (part @ Y) for part in (dK, dM + moved + moved.transpose(0, 2, 1)))
     return Small(values, dK, dM, np.tensordot(Y.T, u, 1), np.einsum("ij,ticp->tjcp", Y, du))
 

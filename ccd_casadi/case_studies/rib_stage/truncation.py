@@ -1,7 +1,6 @@
 """Which flexible modes the plant keeps: a fixed number of each symmetry, or the lowest of all."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from ccd_casadi.case_studies.rib_stage.modes import (
     Group,
     Spectrum,
     groups_of,
-    sector_of,
     spectrum,
 )
 from ccd_casadi.case_studies.rib_stage.symmetry import AS, SA
@@ -42,13 +40,9 @@ class ModeCount:
         """Flexible modes in all."""
         return self.A1 + self.B1 + self.B2 + self.A2 + 2 * self.tilt
 
-    def each(self, group: Group) -> tuple[int, ...]:
-        """Modes of the symmetries of a group."""
-        return tuple(getattr(self, "tilt" if s in (SA, AS) else s.name) for s in group.solved)
-
     def of(self, group: Group) -> int:
         """Modes solved of a group of symmetries."""
-        return sum(self.each(group))
+        return sum(getattr(self, "tilt" if s in (SA, AS) else s.name) for s in group.solved)
 
 
 TWENTY = ModeCount(A1=4, B1=2, B2=4, A2=2, tilt=4)  # to see spill-over
@@ -78,27 +72,14 @@ class ModeSet:
         return 1 + max((m.place for m in self.flexible if m.group == group), default=-1)
 
 
-def kept_first(shares: Array, counts: Sequence[int]) -> np.ndarray:
-    """The order in which modes, lowest first, come that are kept, and then the others.
-
-    Point masses couple symmetries, most modes little: each is told by that which has the largest
-    of its `shares` (symmetries, modes), and so many of each are kept, one symmetry after the other.
-    So neither the model nor the number of a mode jumps where two of them cross.
-    """
-    owner = shares.argmax(axis=0)
-    chosen = [np.flatnonzero(owner == i)[:count] for i, count in enumerate(counts)]
-    first = np.concatenate(chosen)
-    return np.append(first, np.setdiff1d(np.arange(len(owner)), first))
-
-
 def solve_modes(
     disc: Discretisation, geometry: Geometry, theta: Array, count: ModeCount, by_frequency: bool
 ) -> ModeSet:
     """Solve every symmetry (or direct sums of them) at θ and choose the modes of the model.
 
     By symmetry the order is A1, B1, B2, A2, then SA and AS in turns, or the even and the odd ones
-    about an axis and of these one symmetry after the other, lowest first in each: it does not
-    change where frequencies of different symmetries cross.
+    about an axis, lowest first in each: it does not change where frequencies of different
+    symmetries cross.
     """
     square = has_square_symmetry(geometry)
     wanted = {}
@@ -111,15 +92,7 @@ def solve_modes(
     boxes = disc.assembler.box_matrices(theta, SHIFT)
 
     def solved(group: Group) -> Spectrum:
-        several = len(group.solved) > 1 and not by_frequency
-        number = wanted[group] + (1 + several) * EXTRA
-        item = spectrum(disc, geometry, theta, group, number, boxes)
-        if not several:
-            return item
-        cuts = np.cumsum([sector_of(disc, s).fold.size for s in group.solved])[:-1]
-        parts = np.split(item.vectors * item.pencil.mass(item.vectors), cuts)
-        order = kept_first(np.array([part.sum(axis=0) for part in parts]), count.each(group))
-        return replace(item, values=item.values[order], vectors=item.vectors[:, order])
+        return spectrum(disc, geometry, theta, group, wanted[group] + EXTRA, boxes)
 
     largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
     found = dict(zip(largest_first, side_by_side(solved, largest_first), strict=True))
