@@ -162,7 +162,8 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     plants = tuple(_options_of(one, own, path, fail) for one in tables["robust"].plants)
     tables["robust"] = replace(tables["robust"], plants=plants)
     places, size = tables["places"], tables["motor"].size
-    of_case = (*names_in((*places.actuators, *places.sensors)), *filter(None, [size]))
+    named = names_in((*places.actuators, *places.sensors, places.present))
+    of_case = (*named, *filter(None, [size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":

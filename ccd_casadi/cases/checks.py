@@ -181,6 +181,7 @@ coordinate = Check(
 places = every(
     every(coordinate, "", 1, 3), 'give rows of numbers and names of [theta], as [["x", 0.1]]'
 )
+names_of_theta = every(named, "give a list of names of [theta] in quotes")
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 

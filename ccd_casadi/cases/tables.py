@@ -18,11 +18,13 @@ from ccd_casadi.cases.checks import (
     factors,
     interval,
     key,
+    names_of_theta,
     number,
     numbers_of_modes,
     places,
     plant_options,
     points,
+    rows,
     signed,
     tables,
     text_or_rows,
@@ -263,6 +265,18 @@ class PlacesTable:
     damped: tuple[int, ...] = key(
         "with axes: flexible modes, from 1, each with its own axis", (), check=numbers_of_modes
     )
+    reference: tuple[tuple[float, ...], ...] = key(
+        "3 or (with twist) 4 points of a plane: inputs are loads, outputs displacements there",
+        (),
+        check=rows(2),
+        unit="m",
+    )
+    present: tuple[str, ...] = key(
+        "with either: a [theta] for each actuator, 1 where it is there, else 0",
+        (),
+        check=names_of_theta,
+    )
+    choose: int = key("how many of these are there at most", 0)
 
 
 @dataclass(frozen=True)

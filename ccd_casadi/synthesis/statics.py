@@ -37,11 +37,6 @@ class Statics:
     low_hz: float
 
     @property
-    def integrates(self) -> bool:
-        """Whether the controller has a pole at rest."""
-        return bool(np.isinf(self.stiffness))
-
-    @property
     def differentiates(self) -> bool:
         """Whether the controller is almost a differentiator."""
         return self.share < DIFFERENTIATOR
@@ -50,7 +45,7 @@ class Statics:
     def words(self) -> str:
         """One or two sentences."""
         low = f"1 N at {self.low_hz:.3g} Hz moves it {with_unit(self.low, 'm')}"
-        if self.integrates:
+        if np.isinf(self.stiffness):  # a pole at rest
             return f"The controller integrates: a constant force does not move the stage; {low}."
         found = (
             f"Static stiffness K(0) = {with_unit(self.stiffness, 'N/m')}: a constant force of 1 N "
