@@ -1,7 +1,6 @@
 """Slopes of plants behind hold and delay to their parameters, against differences."""
 
-from types import SimpleNamespace
-from typing import Any, cast
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,23 +10,27 @@ from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.kernels.plant_slopes import form_slopes
 from ccd_casadi.lti.hold import Sampling, sampled
 from ccd_casadi.lti.state_space import strictly_proper
+from ccd_casadi.plants.scaling import ScaledPlant
 
 P, M, PARAMETERS, STEP = 2, 3, 2, 1e-6
 ORDERS = (6, 4, 5)
 DIRECTIONS = Decoupling(("a", "b"), np.array([[1.0, 0.4], [0.2, 1.0]]), np.eye(M)[:, :P])
 
 
-def drawn(rng: np.random.Generator, order: int) -> Any:
+def drawn(rng: np.random.Generator, order: int) -> ScaledPlant:
     """A stable plant as `plant_set` takes it, with slopes to two parameters."""
     A = rng.standard_normal((order, order))
     A -= np.eye(order) * (np.linalg.eigvals(A).real.max() + 0.2)
     B, C = rng.standard_normal((order, M)), rng.standard_normal((P, order))
     slopes = {f"d{name}": rng.standard_normal((PARAMETERS, *matrix.shape))
               for name, matrix in (("A", A), ("B", B), ("C", C))}  # fmt: skip
-    return SimpleNamespace(A=A, B=B, C=C, omega_0=1.0, force=1.0, **slopes)
+    none = np.zeros(0)
+    return ScaledPlant(A, B, C, 1.0, 1.0, none, none, none, **slopes)
 
 
-def response(plant: Any, parameter: int, step: float, omega: float, sampling: Sampling | None):
+def response(
+    plant: ScaledPlant, parameter: int, step: float, omega: float, sampling: Sampling | None
+) -> np.ndarray:
     """G(jω) at a moved parameter."""
     A, B, C = (getattr(plant, name) + step * getattr(plant, f"d{name}")[parameter]
                for name in "ABC")  # fmt: skip
@@ -42,7 +45,7 @@ def response(plant: Any, parameter: int, step: float, omega: float, sampling: Sa
 def test_they_are_differences_of_the_response(sampling: Sampling | None, free: bool) -> None:
     rng = np.random.default_rng(1)
     plants = [drawn(rng, order) for order in ORDERS]
-    family = plant_set(cast(Any, plants), sampling, DIRECTIONS)
+    family = plant_set(plants, sampling, DIRECTIONS)
     which = rng.integers(0, len(plants), 12)
     omega = np.exp(rng.uniform(-1.0, 3.0, len(which)))
     x, y = (rng.standard_normal((len(which), k, 2)) @ np.array([1.0, 1j]) for k in (P, M))
@@ -58,9 +61,8 @@ def test_they_are_differences_of_the_response(sampling: Sampling | None, free: b
 def test_poles_that_are_one_have_the_derivative_between_them() -> None:
     """Of two equal lags and one beside them: f[p, p] = f'(p), met to the square of the gap."""
     rng, gap = np.random.default_rng(2), 1e-8
-    plant = drawn(rng, 4)
-    plant.A = np.diag([-1.0, -1.0 - gap, -1.0 - 2.0 * gap, -3.0])
-    family = plant_set(cast(Any, [plant]), Sampling(60.0, 2.4e4), DIRECTIONS)
+    plant = replace(drawn(rng, 4), A=np.diag([-1.0, -1.0 - gap, -1.0 - 2.0 * gap, -3.0]))
+    family = plant_set([plant], Sampling(60.0, 2.4e4), DIRECTIONS)
     x, y = rng.standard_normal((1, P)) + 0j, rng.standard_normal((1, M)) + 0j
     found = form_slopes(family.slopes, np.array([0]), family.variable(np.array([2.0])), x, y, False)
     for t in range(PARAMETERS):
