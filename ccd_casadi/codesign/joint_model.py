@@ -42,6 +42,7 @@ LEAST_GAIN = 1e-7  # of w2 ω_b
 LAST, FADED = 12, 0.15  # trials that gain less of all that was gained: made anew, plants tell more
 SETTLED = 3e-4  # of J: less is not worth another set of plants
 INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
+FLAT = 1e-3  # slope of λ per box, over its size: less is none
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
 
 
@@ -68,9 +69,11 @@ def proposed(
     at: JointPoint,
     reach: float,
     least_gain: float = LEAST_GAIN,
+    bent: bool = False,
 ) -> Proposal:
-    """The end of one search around a place, on the plants of these models."""
+    """The end of one search around a place, on the plants of these models; see `JointModel`."""
     model = JointModel(problem, models, at, reach)
+    model.bent = bent
     start = model.at(model.start)
     if start is None:
         return Proposal(at, 0.0)
@@ -86,9 +89,11 @@ def proposed(
 
 class JointModel(Model[tuple[LoopProblem, Assessment]]):
     """J over its `unit`, w2 ω_b in the middle, around a place; over x = (z, κ, τ), with the loops
-    at x."""
+    at x. With `bent` the plants' own curvature counts: not far from an optimum, as a model may jump
+    where a mode that it keeps meets another."""
 
     corrected = bending = True
+    bent = False
     enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
 
     def __init__(
@@ -105,6 +110,11 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self.first = uncertain.plants(self.scenarios[:1])[0]
         self.unit = -problem.w2 * place.bandwidth
         loops = self.first_loops = self.loops(middle)
+        # λ in units in which the penalty exceeds what breaking it saves of the hardware.
+        own = hardware_at(problem, self.middle)
+        saved = np.abs(own.cost_gradient).max(initial=0.0) / self.unit
+        steep = np.maximum(np.abs(own.slopes).max(axis=1, initial=0.0), FLAT)
+        self.weight = np.maximum(1.0, 2.0 * saved / (PENALTY * steep))
         self.merits: list[float] = []  # before every trial
         # A step that fails is followed by one from the same place.
         self.loops_beside = lru_cache(1)(self._loops_beside)
@@ -137,9 +147,9 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         point = ascend(self.first_loops, Point(kappa, tau, found), iterations=steps,
                        radius=FIRST).point  # fmt: skip
         x = np.concatenate([z, point.kappa, [point.tau]])
-        unmet = float(hardware_at(self.problem, self.middle).constraints.max(initial=0.0))
+        unmet = hardware_at(self.problem, self.middle).constraints * self.weight
         worth = np.exp(point.tau - self.tau)
-        worth -= PENALTY * max(point.assessment.violation, unmet)
+        worth -= PENALTY * max(point.assessment.violation, float(unmet.max(initial=0.0)))
         cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.middle)
         return self.place(x), float(cost - self.unit * worth)
 
@@ -178,11 +188,14 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         )  # fmt: skip
 
     def _loops_beside(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> list[LoopProblem]:
-        """To first order there, as a model may jump where a mode that it keeps meets another."""
         z, sampling = self.parts(here.x)[0], structured_of(self.problem).sampling
         known, found = self.known(z), []
         for step in BESIDE * np.eye(len(z)):
-            moved = [to_first_order(one, self.width * step) for one in known]
+            moved = (
+                self.known(z + step)
+                if self.bent
+                else [to_first_order(one, self.width * step) for one in known]
+            )
             found.append(on_plants(here.data[0], self.plants(z + step, moved), sampling))
         return found
 
@@ -200,7 +213,8 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         own, worth = hardware_at(self.problem, self.theta(z)), float(np.exp(tau - self.tau))
         cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.theta(z))
         slope = np.concatenate([own.cost_gradient / self.unit, np.zeros(len(kappa)), [-worth]])
-        violation = max(found.violation, float((own.constraints + INSIDE).max(initial=0.0)))
+        unmet = (own.constraints + INSIDE) * self.weight
+        violation = max(found.violation, float(unmet.max(initial=0.0)))
         return Iterate(x, cost / self.unit - worth, slope, violation, (problem, found))
 
     def ended(self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]) -> bool:
@@ -221,7 +235,8 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         found = found.only(kept)
         slopes = np.column_stack([to_theta(problem, kappa, found), found.to_kappa, found.to_tau])
         own = hardware_at(self.problem, self.theta(z))
-        of_z = np.pad(own.slopes, ((0, 0), (0, len(here.x) - count)))
+        unmet = (own.constraints + INSIDE) * self.weight
+        of_z = np.pad(self.weight[:, None] * own.slopes, ((0, 0), (0, len(here.x) - count)))
 
         def second(index: np.ndarray) -> Array:
             chosen = found.only(index)
@@ -232,6 +247,6 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
             return hessians(problem, kappa, tau, chosen, beside)
 
         return Rows(
-            np.concatenate([found.value, own.constraints + INSIDE]), np.vstack([slopes, of_z]),
+            np.concatenate([found.value, unmet]), np.vstack([slopes, of_z]),
             hessians=second, curved=int((kept < peaks).sum()),
         )  # fmt: skip

@@ -25,7 +25,7 @@ from ccd_casadi.codesign.joint_model import (
 )
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
 from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
     nearby,
     structured_of,
@@ -34,7 +34,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import violations
-from ccd_casadi.plants.plant import Evaluate, first_order
+from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
@@ -90,7 +90,7 @@ def joint_search(
             best, problem = nearly_finished(asked, models, best), asked.problem
             del make, models
             gc.collect()  # with which the bases go
-            best, near = finished(asked, best, partial(nearby, problem, ()))
+            best, near = finished(asked, best)
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
             scenarios = violations(problem, own, kappa, omega_b, final, tell)[1]
@@ -112,7 +112,7 @@ def joint_search(
         elif gained < POOR * found.gain:
             reach *= 0.3
     if not (settled or ends is not None):
-        best = finished(asked, best, partial(nearby, asked.problem, ()))[0]
+        best = finished(asked, best)[0]
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
@@ -158,33 +158,31 @@ def on_worse_plants(
 
 
 def nearly_finished(sampler: Sampler, models: Sequence[Evaluate], start: JointPoint) -> JointPoint:
-    """The joint optimum near by on what these models know of it, where the plants cost more."""
-    if plant_of(sampler.problem).nearby is None:
-        return start
+    """The joint optimum near by on the plants as these models know them."""
+    problem, best = sampler.problem, start
+    for _ in range(ENDINGS):
+        make = partial(proposed, problem, models, best, REACH, bent=True)
+        key = (*best.theta, best.bandwidth, REACH)
+        found = sampler.cached("nearly finished", key, Proposal, make)
+        best = found.end
+        if found.gain <= KEPT * abs(problem.w2 * best.bandwidth):
+            break
+    return best
 
-    def around(theta: tuple[float, ...]) -> list[Evaluate]:
-        return [first_order(model(theta), theta) for model in models]
 
-    return finished(sampler, start, around, "nearly finished")[0]
-
-
-def finished(
-    sampler: Sampler,
-    start: JointPoint,
-    around: Callable[[tuple[float, ...]], Sequence[Evaluate]],
-    name: str = "finished",
-) -> tuple[JointPoint, bool]:
-    """The joint optimum near by, on plants to first order around one place after the other: so near
-    that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether it is
-    that near, or was."""
-    problem, models, reach = sampler.problem, around(start.theta), CLOSE
+def finished(sampler: Sampler, start: JointPoint) -> tuple[JointPoint, bool]:
+    """The joint optimum near by, on the plants to first order around one place after the other: so
+    near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether
+    it is that near, or was."""
+    problem, reach = sampler.problem, CLOSE
+    models = nearby(problem, (), start.theta)
     best, J = first = JointModel(problem, models, start, reach).adapted()
     for _ in range(ENDINGS):
         make = partial(proposed, problem, models, best, reach, LAST_GAIN)
-        found = sampler.cached(name, (*best.theta, best.bandwidth, reach), Proposal, make)
+        found = sampler.cached("finished", (*best.theta, best.bandwidth, reach), Proposal, make)
         if found.gain <= KEPT * abs(J):
             return best, True
-        others = around(found.end.theta)
+        others = nearby(problem, (), found.end.theta)
         end, there = JointModel(problem, others, found.end, reach).adapted()
         reach *= 2.0 if J - there > GOOD * found.gain else 0.3
         if there < J:
