@@ -65,10 +65,8 @@ class LoopModel(Model[Assessment]):
         goal: Goal | None = None,
         reward: float = 1.0,
         floor: float = -np.inf,
-        restoring: bool = False,
     ) -> None:
         self.problem, self.goal, self.reward = problem, goal, reward
-        self.restoring = restoring
         # A step that fails is followed by one from the same place.
         self.all_rows = lru_cache(2)(
             lambda here: all_rows(problem, here.x[:-1], float(here.x[-1]), here.data)
@@ -140,7 +138,8 @@ def ascend(
 
     `restoring`: first of all within the bounds, whatever that costs of ω_b.
     """
-    model = LoopModel(problem, restoring=restoring)
+    model = LoopModel(problem)
+    model.restoring = restoring
     begin = model.assessed(start.kappa, start.tau, start.assessment)
     assert begin is not None
     n = len(begin.x)
