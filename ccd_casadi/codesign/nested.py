@@ -81,9 +81,6 @@ def solve_nested(
         return FormulationResult(message="no sampled theta is feasible")
     iterates: list[Iterate] = []
 
-    def value_of(sample: InnerSample) -> float:
-        return objective(problem, sample.theta, sample.value)
-
     def refine(number: int) -> None:
         """True inner problems spread over the region around the best θ."""
         low, high = _region(problem, _best(problem, samples), radius)
@@ -119,7 +116,7 @@ def solve_nested(
         iterate = _iterate(problem, best, sample, predicted, radius)
         iterates.append(iterate)
         samples.append(sample)
-        change = iterate.objective - value_of(best)
+        change = iterate.objective - objective(problem, best.theta, best.value)
         improved = change < 0.0
         agreed = iterate.error <= options.tolerance
         settled = abs(change) <= options.tolerance * abs(iterate.objective)

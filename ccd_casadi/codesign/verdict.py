@@ -10,7 +10,7 @@ A design is verified when no line failed; a warning is for the reader to weigh.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -46,25 +46,10 @@ class VerdictLine:
     words: str
     figures: Mapping[str, Any]
 
-
-@dataclass(frozen=True)
-class Verdict:
-    """The five lines, in the order in which they matter."""
-
-    certified: VerdictLine
-    optimal: VerdictLine
-    predicted: VerdictLine
-    survives: VerdictLine
-    deployable: VerdictLine
-
     @property
-    def failed(self) -> tuple[str, ...]:
-        """Names of the lines that failed."""
-        return tuple(name for name, line in self.lines() if line.state is State.FAILED)
-
-    def lines(self) -> tuple[tuple[str, VerdictLine], ...]:
-        """Name and line, in order."""
-        return tuple((item.name, getattr(self, item.name)) for item in fields(self))
+    def entry(self) -> dict[str, Any]:
+        """Of `verdict` in result.json."""
+        return {"state": self.state.value, "words": self.words, **self.figures}
 
 
 def optimal(
@@ -294,19 +279,6 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     )
     return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
-
-
-def verdict_dict(verdict: Verdict) -> dict[str, Any]:
-    """`verdict` of result.json."""
-    return {
-        name: {"state": line.state.value, "words": line.words, **line.figures}
-        for name, line in verdict.lines()
-    }
-
-
-def reason(verdict: Verdict) -> str:
-    """Why a design is not verified, in the words of the lines that failed."""
-    return "; ".join(f"{name}: {getattr(verdict, name).words}" for name in verdict.failed)
 
 
 def _range(low: float, high: float) -> str:

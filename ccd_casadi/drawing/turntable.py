@@ -9,12 +9,10 @@ from functools import cache
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Modes
 from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import COLOUR_MAP
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import number
 
 AZIMUTH, ELEVATION = -62.0, 44.0  # degrees, of the camera as seen from the object
 WIDTH, HEIGHT = 320, 236  # of one picture, in its own units
@@ -96,29 +94,6 @@ def still(shapes: ModeShapes, mode: ModeShape, words: str) -> str:
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(words)}">'
         f'<g transform="translate({WIDTH / 2:g} {HEIGHT / 2:g}) scale(.1)" fill="currentColor" '
         f'stroke="currentColor" stroke-width="8">' + "".join(paths) + "</g></svg>"
-    )
-
-
-def modes_html(modes: Modes) -> str:
-    """The pictures with their words: to be turned by the page's script, or small ones in a row.
-
-    Without the script, and on paper, they stand still.
-    """
-    shapes = modes.shapes
-    if not modes.turning:
-        named = [(f"{number(mode.frequency, 4)} Hz", mode) for mode in shapes.modes]
-        small = (f'<div style="flex:1 1 85px">{words}{still(shapes, mode, words)}</div>'
-                 for words, mode in named)  # fmt: skip
-        return f'<div style="display:flex;flex-wrap:wrap">{"".join(small)}</div>'
-    views = "\n".join(
-        f'<div class="view"><p>{escape(mode.title)}</p>'
-        f'<div class="drawn">{still(shapes, mode, mode.title)}</div></div>'
-        for mode in shapes.modes
-    )
-    scale = legend("displacement as a share of each mode's largest (–)")
-    return (
-        f'<div class="turntable">\n<div class="views">\n{views}\n</div>\n{scale}\n'
-        f'<script type="application/json">{data(shapes)}</script>\n</div>'
     )
 
 

@@ -7,8 +7,7 @@ import numpy as np
 
 from ccd_casadi.drawing.content import Lines, Modes
 from ccd_casadi.drawing.page import escape
-from ccd_casadi.drawing.paint import block_html, drawing_html
-from ccd_casadi.drawing.turntable import modes_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -106,7 +105,7 @@ def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
         drawn = plant.drawing({"this design": look.theta, "the start": start}).drawing
         if isinstance(drawn, Lines):  # the first row alone: it is drawn while one drags
             drawn = replace(drawn, rows=drawn.rows[:1], heights=drawn.heights[:1])
-        return f'<div class="drawn">{drawing_html(drawn, "machine")}</div>'
+        return f'<div class="drawn">{block_html(drawn, "machine")}</div>'
     return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
 
 
@@ -117,5 +116,5 @@ def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
         return ""
     pairs = zip(problem.names, problem.units, theta, strict=True)
     shown = ", ".join(f"{name} = {with_unit(value, unit, 4)}" for name, unit, value in pairs)
-    modes = modes_html(Modes(plant.shapes(theta, SHOWN_MODES)))
+    modes = block_html(Modes(plant.shapes(theta, SHOWN_MODES)))
     return f"<p>modes of the last θ solved: {escape(shown)}</p>{modes}"

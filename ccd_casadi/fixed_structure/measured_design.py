@@ -12,6 +12,7 @@ Uᵀ G V first, and the search on the whole begins where these are stable togeth
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import cast
 
 import numpy as np
@@ -175,11 +176,7 @@ def _pool(problem: LineProblem, starts: int, rng: np.random.Generator) -> list[A
 
 def _some(problem: LineProblem, kappa: Array, most: int) -> list[Array]:
     """The first `most` that are stable."""
-    found: list[Array] = []
-    for one in kappa:
-        if len(found) < most and problem.stable(one):
-            found.append(one)
-    return found
+    return list(islice(filter(problem.stable, kappa), max(most, 0)))
 
 
 def _channels_stacked(

@@ -12,7 +12,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
 from ccd_casadi.drawing.page import CSS
-from ccd_casadi.drawing.paint import block_html, head_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -22,7 +22,7 @@ from ccd_casadi.reporting.facts import conclusion, theta_axes, theta_table
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ, number, with_unit
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
@@ -41,10 +41,7 @@ def html_of(item: object) -> str:
 
 
 def _cell(*parts: Head | Block) -> str:
-    body = "\n".join(
-        head_html(part) if isinstance(part, Head) else block_html(part, f"nb{next(_figures)}")
-        for part in parts
-    )
+    body = "\n".join(block_html(part, f"nb{next(_figures)}") for part in parts)
     # the page's own rules, nested: `h1` is `.ccd h1` in here
     return f'<div class="ccd"><style>.ccd {{{_OWN}{CSS}{_SMALL}}}</style>\n{body}\n</div>'
 
@@ -81,7 +78,7 @@ def _(item: CoDesignProblem) -> str:
         (f"|S| at {number(inner.omega_low / HZ)} Hz", f"≤ {inner.S_low:g}", ""),
     ]
     if inner.compliance_max is not None:
-        facts.append(("Compliance |GS|", f"≤ {1e6 * inner.compliance_max:g} µm/N", ""))
+        facts.append(("Compliance |GS|", f"≤ {with_unit(inner.compliance_max, 'm')}/N", ""))
     facts.append(("Controller", *kind_of(item).described()))
     if item.robust is not None:
         shifts = f"resonances ±{100.0 * item.robust.shift:g} %"
