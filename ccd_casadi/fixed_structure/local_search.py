@@ -58,6 +58,7 @@ class LoopModel(Model[Assessment]):
     """The bounds of a set of loops as rows over x = (κ, τ); `goal` gives v(κ) and its gradient."""
 
     corrected = True
+    programmes = 6  # a loop costs no more than as many: the best of a step is not worth twice that
 
     def __init__(
         self,
@@ -134,10 +135,8 @@ def ascend(
     least_gain: float = 1e-8,
     restoring: bool = False,
 ) -> Ascent:
-    """Climb to a larger ω_b from a start whose loops are stable; ends where steps do not help.
-
-    `restoring`: first of all within the bounds, whatever that costs of ω_b.
-    """
+    """Climb to a larger ω_b, or with `restoring` within the bounds first, from a start whose loops
+    are stable; ends where steps do not help."""
     model = LoopModel(problem)
     model.restoring = restoring
     begin = model.assessed(start.kappa, start.tau, start.assessment)
