@@ -71,7 +71,7 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
     runners = run_race(problem, pool, search.tell, workers, known=known, last=last)
     for _ in range(0 if last else REDRAWS):
         best = runners[0].merit
-        count = max(starts // 4, 1)
+        count = max(starts // 2, 1)
         fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
         fresh = _nearest(problem, stabilising(problem, fresh), count)
         runners = run_race(problem, fresh, search.tell, workers, runners)
