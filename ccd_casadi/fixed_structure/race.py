@@ -21,7 +21,7 @@ from ccd_casadi.support.process_pool import Pool, results
 
 ROUNDS, STEPS = 81, 5  # at most, steps of each: what has ended or merged costs no more
 HALVINGS = (2, 8, 20)  # rounds after which the better half goes on
-LAST = 3  # that are never halved away
+LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 12.0  # times the gain of its last round: what a search behind may still catch up
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
