@@ -249,10 +249,12 @@ def unit_of(item: Field[Any]) -> str:
 def require_good(
     place: str, table: Mapping[str, Any], checks: Mapping[str, Test], fail: Fail
 ) -> None:
-    """Raise the error of the first key of a table that is unknown, or not as its check wants it."""
+    """Raise the error of the first key of a table that is unknown, or not as its check wants it;
+    `place`: the table's own name, of a whole file none."""
     for name, value in table.items():
+        key = f"{place}.{name}" if place else name
         if name not in checks:
-            raise fail(f"{place}.{name}", f"unknown key{closest(name, checks)}")
+            raise fail(key, f"unknown key{closest(name, checks)}")
         wrong = checks[name](value)
         if wrong is not None:
-            raise fail(f"{place}.{name}", wrong)
+            raise fail(key, wrong)

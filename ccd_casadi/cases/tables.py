@@ -5,9 +5,9 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from ccd_casadi.cases.checks import (
     ABOVE_ONE,
@@ -308,6 +308,7 @@ class Case(NotebookHtml):
     weights: WeightsTable
     inner: InnerTable
     suspension: SuspensionTable
+    places: PlacesTable
     robust: RobustTable
     controller: ControllerTable
     loop: LoopTable
@@ -318,26 +319,13 @@ class Case(NotebookHtml):
     limits: LimitsTable
     motor: MotorTable
     move: MoveTable
-    places: PlacesTable = field(default_factory=PlacesTable)
     fixed: tuple[Parameter, ...] = ()
 
 
 TABLES: dict[str, type] = {
-    "objective": ObjectiveTable,
-    "weights": WeightsTable,
-    "inner": InnerTable,
-    "suspension": SuspensionTable,
-    "places": PlacesTable,
-    "robust": RobustTable,
-    "controller": ControllerTable,
-    "loop": LoopTable,
-    "budget": BudgetTable,
-    "sampling": SamplingTable,
-    "outer": OuterTable,
-    "baseline": BaselineTable,
-    "limits": LimitsTable,
-    "motor": MotorTable,
-    "move": MoveTable,
+    name: kind
+    for name, kind in get_type_hints(Case).items()
+    if isinstance(kind, type) and is_dataclass(kind) and kind is not PlantTable
 }
 REQUIRED = tuple(  # tables with a key that has no default
     name for name, kind in TABLES.items() if MISSING in [item.default for item in fields(kind)]

@@ -44,7 +44,15 @@ def result_dict(
     verdict = {  # in the order in which they matter
         "certified": verified.certified_line(),
         "optimal": optimal_line(verified, tolerance, verified.inner_gap, known),
-        "predicted": predicted_line(verified, tolerance, error, outcome, quality),
+        "predicted": predicted(
+            error=error,
+            tolerance=tolerance,
+            value=verified.value,
+            left_out=quality[0].at_point if quality else None,
+            extrapolates=quality[0].extrapolates if quality else (),
+            surrogate=bool(outcome.surrogates),
+            of=problem.figure,
+        ),
         "survives": verified.survives_line(),
         "deployable": deployable(verified.survival, problem.sampling),
     }
@@ -93,24 +101,6 @@ def result_dict(
         **move_entry(problem, verified.theta, verified.controller),
     }
     return json_values(result)
-
-
-def predicted_line(
-    verified: Verified, tolerance: float, error: float, outcome: FormulationResult,
-    quality: tuple[Quality, ...],
-) -> VerdictLine:  # fmt: skip
-    """Surrogate against truth, `error` relative, and the surrogate without the design."""
-    figure, at = verified.problem.figure, quality[0].at_point if quality else None
-    return predicted(
-        error=error,
-        tolerance=tolerance,
-        left_out=None if at is None else abs(at[0]) / (figure.factor * verified.value),
-        left_out_size=None if at is None else abs(at[0]),
-        sigmas=None if at is None else at[1],
-        extrapolates=quality[0].extrapolates if quality else (),
-        surrogate=bool(outcome.surrogates),
-        of=figure,
-    )
 
 
 def optimal_line(
