@@ -170,7 +170,7 @@ def test_a_local_solve_takes_joint_steps_and_stops_where_another_has_ended(tmp_p
 def test_breaking_a_constraint_costs_more_than_the_hardware_that_it_saves() -> None:
     """J falls along a constraint's slope by less than the penalty rises, also where J is mass."""
     problem = problem_of(load_case(ROOT / "examples" / "guided_beam" / "case.toml"))
-    problem = with_range(replace(problem, w1=1e6 * problem.w1))
+    problem = with_range(replace(problem, w1=1e6))
     kappa = np.zeros(len(structure_of(problem).names))
     at = JointPoint(problem.start, tuple(kappa), 2.0 * np.pi * 20.0)
     model = JointModel(problem, nearby(problem, (), at.theta), at, 0.3)
