@@ -28,7 +28,7 @@ from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.inner_problem.figure import BANDWIDTH
-from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
@@ -101,13 +101,15 @@ class ListedStructured:
 
 
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
-    """From θ to the least J near by."""
+    """From θ to the least J near by; by steps along the truth where the joint search breaks λ."""
+    best = first = sampler.values(theta, "near by")[0]
+    asked = sampler
     if sampler.problem.figure is BANDWIDTH:
         tell = printer("near by", sampler.quiet)
-        sampler, best, _ = joint_search(sampler, theta, tell, ends=())
-    else:
-        best = pieces_from(sampler, sampler.values(theta, "near by")[0], SETTLED, FAR)
-    problem = sampler.problem
+        asked, best, _ = joint_search(sampler, theta, tell, ends=())
+    if best.theta == first.theta or violated(asked.problem, best.theta):  # it lost λ
+        asked, best = sampler, pieces_from(sampler, first, SETTLED, FAR)
+    problem = asked.problem
     J = objective_of(problem, best)
     if not np.isfinite(J):
         return _nothing(best.shortfall)
