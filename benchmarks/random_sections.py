@@ -46,7 +46,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopCurve, LoopProblem
-from ccd_casadi.fixed_structure.sections_design import MARGIN, RESTORING, DesignSearch
+from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.plants.modal import Suspension
@@ -209,7 +209,7 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     end = ascend(problem, first, iterations=CLIMB)
     point, looked = at_its_bandwidth(problem, end.point), end.evaluations
     if point.assessment.violation > MARGIN:
-        end = ascend(problem, point, iterations=RESTORED, penalty=RESTORING, radius=0.05)
+        end = ascend(problem, point, iterations=RESTORED, restoring=True, radius=0.05)
         point, looked = at_its_bandwidth(problem, end.point), looked + end.evaluations
     search = DesignSearch(problem, plants, asked.sampling, seed=seed)
     return asked, search.designed(point, (), 1, looked)

@@ -1,6 +1,6 @@
 """Where the actuators of the rib stage stand, and how many: what a place buys at equal force.
 
-    python benchmarks/rib_stage_places.py [--stages NAME ...] [--places N] [--write] [--draw]
+    python benchmarks/rib_stage_places.py [--stages NAME ...] [--layouts R ...] [--write] [--draw]
 
 At each stage and layout below every channel's largest bandwidth is searched by itself, with the
 structure and bounds of runs/rib_stage_built.toml, on the stage with twenty flexible modes, with and
@@ -8,23 +8,23 @@ without payload: as it is and all modes 2 % lower and higher, at half the dampin
 the slowest channel. Each actuator has a sensor at its place. Layouts keep the symmetry of the
 square, so that lift, tip (as tilt) and twist are channels of their own:
 
-    4   at (±r, ±r)
-    5   the same and one in the centre: lift does not drive its first mode
-    8   at (±r, ±r) and at the corners: lift, tip and twist do not drive a mode each (that of lift
-        and tip the first, that of twist the second: the first is what the channel is for)
+    0.09        four, at (±r, ±r)
+    0.09+0      five: one in the centre too, for lift alone
+    0.08+0.15   eight: four on each of two squares
 
 **Equal force**: n actuators share the copper of four, so that forces f cost |f|² n/4 of what they
-cost there. KS is that force for a displacement of the corners (of the whole, in twist by the first
-mode), GS the displacement of the corners for a load on the stage, wherever actuators and sensors
-are; both keep the bounds of the case.
+cost there. KS is that force for a displacement of the corners, GS the displacement of the corners
+for a load there, wherever actuators and sensors are (`reference` of [places]: the least forces that
+do the work of that load on 1, x, y, x y); both keep the bounds of the case.
 
-`--write` keeps the rows in benchmarks/rib_stage_places.json. Of those of four actuators `--whole`
-climbs the whole loop on the whole set of the case: the finer mesh, the payload, the worst plants of
-the box. `--draw` makes a picture of the rows of the first stage.
+`--write` keeps the rows in benchmarks/rib_stage_places.json. `--whole` climbs the whole loop of
+each on the whole set of the case: the finer mesh, the payload, the worst plants of the box.
+`--draw` makes a picture of the rows of the first stage.
 """  # fmt: skip
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -74,9 +74,8 @@ SHIFT, DAMPING = 0.02, 0.5
 PAYLOAD = ((0.03, 0.0, 0.05),)  # m, m, kg: that of the case's set
 CHANNELS = ("z", "tip", "twist")
 RING = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])  # signs; as the case's corners
-PATTERNS = {"z": (1, 1, 1, 1), "tip": (1, 1, -1, -1), "twist": (1, -1, 1, -1)}
-QUIET = {"z": 0, "tip": 0, "twist": 1}  # which of the modes that a channel sees is not driven
 POINTS = np.vstack([[(0.0, 0.0)], *(r * RING for r in RADII)])
+MOTIONS = {"z": np.ones(len(POINTS)), "tip": POINTS[:, 1], "twist": POINTS.prod(axis=1)}
 
 
 @dataclass(frozen=True)
@@ -108,53 +107,26 @@ def problem() -> CoDesignProblem:
 
 
 def ring(r: float) -> list[int]:
-    return [1 + 4 * RADII.index(r) + i for i in range(4)]
+    return [1 + 4 * RADII.index(r) + i for i in range(4)] if r else [0]
 
 
-def layout(count: int, r: float, modal: ModalPlant) -> Layout:
-    """Four, five or eight actuators, of which four at (±r, ±r)."""
-    whole = {name: np.array(PATTERNS[name], float) for name in CHANNELS}
-    if count == 4:
-        return Layout(tuple(ring(r)), {name: v / 2.0 for name, v in whole.items()})
-    other = [0] if count == 5 else ring(RADII[-1])
-    rows, found = (*ring(r), *other), {}
-    for name, v in whole.items():
-        second = np.append(np.zeros(4), v if count == 8 else (1.0 if name == "z" else 0.0))
-        first = np.append(v, np.zeros(len(other)))
-        if not second.any():
-            found[name] = first / 2.0
-            continue
-        B = modal.B[:, rows] @ np.column_stack([first / 2.0, second / np.linalg.norm(second)])
-        seen = sorted(np.flatnonzero(~modal.rigid & _seen(B)), key=lambda k: modal.natural[k])
-        a, b = B[seen[QUIET[name]]]
-        found[name] = (b * first / 2.0 - a * second / np.linalg.norm(second)) / np.hypot(a, b)
-    return Layout(rows, found)
+def layout(radii: Sequence[float]) -> Layout:
+    """Actuators at (±r, ±r) of each; every channel by the least forces that do its work."""
+    rows = [row for r in radii for row in ring(r)]
+    motions = {name: motion[rows] for name, motion in MOTIONS.items()}
+    return Layout(tuple(rows), {name: v / np.linalg.norm(v) for name, v in motions.items()})
 
 
-def _seen(B: np.ndarray) -> np.ndarray:
-    """Which modes are driven by any column."""
-    size = np.abs(B).reshape(len(B), -1).max(axis=1)
-    return np.asarray(size > 1e-6 * size.max())
-
-
-def reading(where: Layout, name: str, modal: ModalPlant) -> float:
-    """What a channel's axis shows of its motion: of 1 m, of 1 rad, or of the first twist mode."""
-    v, rows = where.directions[name], list(where.rows)
-    if name == "z":
-        return float(v.sum())
-    if name == "tip":
-        return float(v @ POINTS[rows, 1])
-    seen = modal.B[:, ring(HALF)] @ PATTERNS["twist"]
-    first = min(np.flatnonzero(~modal.rigid & _seen(seen)), key=lambda k: modal.natural[k])
-    return abs(float(modal.B[first, rows] @ v))
+def reading(where: Layout, name: str) -> float:
+    """What a channel's axis shows of its motion, of 1 m, 1 rad or x y."""
+    return float(where.directions[name] @ MOTIONS[name][list(where.rows)])
 
 
 def channel(
     modals: list[ModalPlant], where: Layout, name: str, M_K: float
 ) -> tuple[list[ScaledPlant], float]:
     """SISO plants from equal-force input to displacement at the corners, and their lever, η."""
-    corners = layout(4, HALF, modals[0])
-    out = reading(corners, name, modals[0]) / reading(where, name, modals[0])
+    out = reading(layout([HALF]), name) / reading(where, name)
     V, rows, found = where.directions[name][:, None], list(where.rows), []
     for modal in modals:
         own = replace(
@@ -201,15 +173,19 @@ def _active(made: Any) -> list[str]:
 
 
 def on_the_whole_set(row: dict[str, Any]) -> dict[str, Any]:
-    """What four actuators keep with the finer mesh, the payload and the box's worst plants.
+    """What the loop keeps with the finer mesh, the payload and the box's worst plants.
 
-    M_K of each channel makes the bound on KS the same force for a displacement of the corners.
+    Inputs are loads at the corners: M_K of each channel makes its bound on KS one on equal force.
     """
-    r, text = row["r"], CASE.read_text()
-    points = (r * RING).tolist()
-    places = f"actuators = {points}\nsensors = {points}\n"
-    text = text.replace('outputs = "corners"', f'{places}outputs = "corners"')
-    M_K = {c: 4.5e4 / row["levers"][c] for c in CHANNELS}
+    text = CASE.read_text()
+    points = [point for r in row["radii"] for point in ((r * RING).tolist() if r else [[0.0, 0.0]])]
+    edge = [[HALF, 0.0], [0.0, HALF], [-HALF, 0.0], [0.0, -HALF]]
+    nodes = f"{[*POINTS.tolist(), *edge]}"
+    places = f"nodes = {nodes}\nactuators = {points}\nsensors = {points}\n"
+    places = f"[places]\n{places}reference = {(HALF * RING).tolist()}\n\n[theta.h]"
+    text = text.replace('outputs = "corners"', f'actuators = {nodes}\noutputs = "corners"')
+    text = text.replace("[theta.h]", places, 1)
+    M_K = {c: 4.5e4 * row["levers"][c] for c in CHANNELS}
     text = text.replace("M_K = 4.5e4", f"M_K = {max(M_K.values()):.9g}")
     for c in CHANNELS:
         table = f"[controller.channel.{c}]\n"
@@ -224,8 +200,8 @@ def on_the_whole_set(row: dict[str, Any]) -> dict[str, Any]:
     stacked = np.zeros(whole.slices[whole.free[-1]].stop)
     for i in whole.free:
         c = whole.decoupling.names[i]
-        own, gain = np.array(row["kappa"][c]), 1.0 / row["levers"][c]
-        stacked[whole.slices[i]] = whole.structures[i].in_units(own, 1.0, gain)
+        own = np.array(row["kappa"][c])
+        stacked[whole.slices[i]] = whole.structures[i].in_units(own, 1.0, row["levers"][c])
     begun = with_structured(asked, warm_starts=(tuple(map(float, stacked)),))
     return climbed(replace(begun, start=stage_theta(row["stage"])))
 
@@ -264,24 +240,29 @@ MORE = {"light": (1.0, 3.0, 3.0, 3.0, 9.0, 75.0)}  # 0.456 kg, 56 % below the se
 def keep(row: dict[str, Any]) -> None:
     """The row in place of an earlier one of the same stage and layout."""
     rows = json.loads(RESULTS.read_text()) if RESULTS.is_file() else []
-    key = ("stage", "actuators", "r")
+    key = ("stage", "radii")
     rows = [other for other in rows if any(other[k] != row[k] for k in key)] + [row]
     RESULTS.write_text(json.dumps(json_values(rows), indent=1) + "\n")
 
 
+def count(row: dict[str, Any]) -> int:
+    """Its actuators."""
+    return len([i for r in row["radii"] for i in ring(r)])
+
+
 def draw(name: str) -> None:
-    """The first mode that lift drives, with the places, and bandwidths over r of a stage."""
+    """The first modes in lift and twist, with the places, and bandwidths of each layout."""
     rows = [row for row in json.loads(RESULTS.read_text()) if row["stage"] == name]
     line = np.linspace(-HALF, HALF, 13)
     grid = [(x, y) for x in line for y in line]
     plant = rib_stage(NAMES, actuators=grid, sensors=grid)
     system = mechanics(plant, stage_theta(name), derivatives=False)
     modal = modal_plant(system, problem().suspension)
-    corners = [0, 12, 156, 168]
-    lift = np.flatnonzero(~modal.rigid & _seen(modal.B[:, corners].sum(axis=1)))
+    drive = np.abs(modal.B[:, [0, 12, 156, 168]].sum(axis=1))
+    lift = np.flatnonzero(~modal.rigid & (drive > 1e-6 * drive.max()))
     modes = [min(lift, key=lambda k: modal.natural[k]), np.flatnonzero(~modal.rigid)[0]]
-    four = sorted((row for row in rows if row["actuators"] == 4), key=lambda row: row["r"])
-    best = max(four, key=lambda row: -row["J"])
+    shown = {n: max((row for row in rows if count(row) == n), key=lambda row: -row["J"])
+             for n in sorted({count(row) for row in rows})}  # fmt: skip
     fig, axes = plt.subplots(1, 3, figsize=(12.5, 3.9), width_ratios=(1, 1, 1.15))
     x, y = 1e3 * np.array(grid).T
     for ax, k, words in zip(axes, modes, ("lift", "twist"), strict=False):
@@ -289,17 +270,19 @@ def draw(name: str) -> None:
         ax.tricontourf(x, y, z, levels=np.linspace(-1, 1, 15), cmap="RdBu_r", alpha=0.75)
         ax.tricontour(x, y, z, levels=[0.0], colors="k", linewidths=0.8)
         ax.plot(*(1e3 * HALF * RING.T), "k+", markersize=10, label="corners", clip_on=False)
-        ax.plot(*(1e3 * best["r"] * RING.T), "o", color="#d55e00", mec="w", ms=9, label="placed")
+        for (n, row), marker in zip(shown.items(), "o^s", strict=False):
+            at = 1e3 * POINTS[[i for r in row["radii"] for i in ring(r)]].T
+            ax.plot(*at, marker, mec="w", ms=9, label=f"{n} placed")
         title = f"first mode in {words}: {modal.natural[k] / HZ:.0f} Hz"
         ax.set(aspect="equal", xlabel="x (mm)", ylabel="y (mm)", title=title)
     axes[0].legend(loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.42), frameon=False)
-    for c, colour in zip(CHANNELS, ("#0072b2", "#009e73", "#cc79a7"), strict=True):
-        for count, style in ((4, "o-"), (5, "^"), (8, "s")):
-            own = sorted((row["r"], row["hz"][c]) for row in rows if row["actuators"] == count)
-            if own:
-                label = f"{c}, {count}" if c == "z" or count == 4 else None
-                axes[2].plot(*(np.array(own).T * [[1e3], [1.0]]), style, color=colour, label=label)
-    axes[2].set(xlabel="r (mm)", ylabel="Hz", title=f"bandwidth, stage of {best['mass']:.3f} kg")
+    rows.sort(key=lambda row: (count(row), row["radii"]))
+    names = [" + ".join(f"{1e3 * r:.0f}" for r in row["radii"]) for row in rows]
+    for c, marker in zip(CHANNELS, "os^", strict=True):
+        axes[2].plot(names, [row["hz"][c] for row in rows], marker, label=c)
+    whole = [row.get("whole", {}).get("bandwidth_hz", np.nan) for row in rows]
+    axes[2].plot(names, whole, "kD", mfc="none", label="all, on the whole set")
+    axes[2].set(xlabel="r (mm)", ylabel="Hz", title=f"bandwidth, stage of {rows[0]['mass']:.3f} kg")
     axes[2].legend(frameon=False)
     axes[2].grid(alpha=0.3)
     fig.tight_layout()
@@ -309,23 +292,22 @@ def draw(name: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--stages", nargs="*", default=["shipped", "sequential", "light"])
-    parser.add_argument("--counts", nargs="*", type=int, default=[4, 5, 8])
-    parser.add_argument("--radii", nargs="*", type=float, default=list(RADII))
+    parser.add_argument("--layouts", nargs="*", default=[f"{r:g}" for r in RADII], metavar="R[+R]")
     parser.add_argument("--starts", type=int, default=2)
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--whole", action="store_true", help="of the rows that are kept")
     parser.add_argument("--draw", action="store_true")
     given = parser.parse_args()
+    layouts = [[float(r) for r in words.split("+")] for words in given.layouts]
     if given.draw:
         draw(given.stages[0])
         return
     if given.whole:
         for row in json.loads(RESULTS.read_text()):
-            chosen = row["stage"] in given.stages and row["r"] in given.radii
-            if chosen and row["actuators"] == 4:
+            if row["stage"] in given.stages and row["radii"] in layouts:
                 began = process_time()
                 row["whole"] = on_the_whole_set(row)
-                words = f"{row['stage']}, 4 at {1e3 * row['r']:.0f} mm: {row['whole']}"
+                words = f"{row['stage']}, {row['radii']}: {row['whole']}"
                 print(f"{words}, {process_time() - began:.0f} s", flush=True)
                 keep(row)
         return
@@ -337,28 +319,25 @@ def main() -> None:
         mass = 1.0 / float(ones @ ones)
         print(f"{name}: {mass:.4f} kg, {process_time() - began:.0f} s", flush=True)
         known: dict[str, list[Known]] = {c: [] for c in CHANNELS}
-        for count in given.counts:
-            for r in given.radii:
-                if count == 8 and r == HALF:
-                    continue
-                where, hz, met = layout(count, r, modals[0]), {}, {}
-                kappa, levers = {}, {}
-                for c in CHANNELS:
-                    plants, lever = channel(modals, where, c, asked.weights.M_K)
-                    value, last, active = bandwidth(asked, plants, c, lever, known[c], given.starts)
-                    hz[c], met[c], levers[c] = value / HZ, active, lever
-                    if last is not None:
-                        known[c] = [last, *known[c]][:2]
-                        kappa[c] = last.kappa.tolist()
-                omega = HZ * min(hz.values())
-                J = asked.w1 * mass + asked.w2 * omega
-                row = {"stage": name, "mass": mass, "actuators": count, "r": r, "hz": hz, "J": J,
-                       "active": met, "levers": levers, "kappa": kappa}  # fmt: skip
-                print(f"  {count} at {1e3 * r:.0f} mm: {omega / HZ:.2f} Hz, J {J:.3f}; "
-                      + ", ".join(f"{c} {hz[c]:.1f} {met[c]}" for c in CHANNELS)
-                      + f"; {process_time() - began:.0f} s", flush=True)  # fmt: skip
-                if given.write:
-                    keep(row)
+        for radii in layouts:
+            where, hz, met = layout(radii), {}, {}
+            kappa, levers = {}, {}
+            for c in CHANNELS:
+                plants, lever = channel(modals, where, c, asked.weights.M_K)
+                value, last, active = bandwidth(asked, plants, c, lever, known[c], given.starts)
+                hz[c], met[c], levers[c] = value / HZ, active, lever
+                if last is not None:
+                    known[c] = [last, *known[c]][:2]
+                    kappa[c] = last.kappa.tolist()
+            omega = HZ * min(hz.values())
+            J = asked.w1 * mass + asked.w2 * omega
+            row = {"stage": name, "mass": mass, "radii": radii, "hz": hz, "J": J,
+                   "active": met, "levers": levers, "kappa": kappa}  # fmt: skip
+            print(f"  {radii}: {omega / HZ:.2f} Hz, J {J:.3f}; "
+                  + ", ".join(f"{c} {hz[c]:.1f} {met[c]}" for c in CHANNELS)
+                  + f"; {process_time() - began:.0f} s", flush=True)  # fmt: skip
+            if given.write:
+                keep(row)
 
 
 if __name__ == "__main__":

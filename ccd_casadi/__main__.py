@@ -10,7 +10,7 @@ from types import ModuleType
 from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.interrupts import raise_on_ctrl_c
 from ccd_casadi.support.options import one_line
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.package_text import package_text, template
 from ccd_casadi.support.terminal import say
 
 # word -> the module of its `main`, and what it does
@@ -105,18 +105,13 @@ def new(folder: Path) -> int:
 
 def overview(folder: Path) -> str:
     """The commands, and the cases and finished runs that lie in a folder."""
-    lines = ["ccd WORD ..., each with --help:"]
-    lines += [f"  {word:12} {does}" for word, (_, does) in COMMANDS.items()]
-    lines += [f"  {word:12} {does}" for word, does in OWN.items()]
     near = [*sorted(folder.glob("*/result.json")), *sorted(folder.glob("*/*/result.json"))]
     runs = [path.parent for path in near]
     files = [*sorted(folder.glob("*.toml")), *sorted(folder.glob("*/*.toml"))]
+    words = [*((word, does) for word, (_, does) in COMMANDS.items()), *OWN.items()]
     cases = [path for path in files if _is_case(path)]
-    lines += ["", "cases here", *(f"  ccd solve {path}" for path in cases)] if cases else []
-    lines += ["", "finished runs", *(f"  ccd robustness {path}" for path in runs)] if runs else []
-    if not cases:
-        lines += ["", "no case file here; begin with: ccd new my_stage"]
-    return "\n".join(lines)
+    made = template("templates/overview.txt").render(words=words, cases=cases, runs=runs)
+    return made.rstrip()
 
 
 def _is_case(path: Path) -> bool:

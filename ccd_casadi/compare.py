@@ -1,10 +1,9 @@
 """`python -m ccd_casadi.compare CASE.toml`: every method side by side on one case."""
 
 import argparse
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
+from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import inform, say
 
@@ -32,7 +31,11 @@ def table(comparison: "Comparison") -> str:
     return "\n".join(lines)
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.compare", "Run every method on one case, side by side.", SCHEDULER,
+    needs=["ccd_casadi.studies.comparison"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.toml_writer import case_to_toml
     from ccd_casadi.sampling.cluster import pool
@@ -60,13 +63,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     if statuses == {"infeasible"}:
         return ExitCode.INFEASIBLE
     return ExitCode.DONE if statuses == {"verified"} else ExitCode.NOT_VERIFIED
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser("ccd_casadi.compare", "Run every method on one case, side by side.")
-    add_scheduler(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.studies.comparison"])
 
 
 if __name__ == "__main__":

@@ -7,9 +7,10 @@ design that is not certified does not count, and among those that are the lowest
 import argparse
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
-from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
 from ccd_casadi.support.options import add_break_frequencies, break_frequencies, positive
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
@@ -52,7 +53,17 @@ def _problem(
     return problem, theta, point
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.cross_check",
+    "Compare one synthesis by every back end. CASE.toml may be the folder of a finished solve.",
+    option("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file"),
+    partial(add_break_frequencies, "of a weight (default: the best at theta, or the run's)"),
+    option("--limit", type=positive, default=60.0, metavar="SECONDS",
+           help="time limit of each optional back end (default: 60)"),
+    needs=["ccd_casadi.codesign.result", "ccd_casadi.synthesis.backends.mixed"],
+    without_effect=["--seed"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
     from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
@@ -125,23 +136,6 @@ def _conclusion(found: "Sequence[BackendResult]") -> str:
     if not wrong:
         return f"agree to {100 * AGREE:g} %: {', '.join(right)}"
     return f"disagree; the certificate is with {', '.join(right)}, not with {', '.join(wrong)}"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser(
-        "ccd_casadi.cross_check",
-        "Compare one synthesis by every back end. CASE.toml may be the folder of a finished solve.",
-        without_effect=["--seed"],
-    )
-    arguments.add_argument("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file")
-    add_break_frequencies(arguments, "of a weight (default: the best at theta, or the run's)")
-    arguments.add_argument(
-        "--limit", type=positive, default=60.0, metavar="SECONDS",
-        help="time limit of each optional back end (default: 60)",
-    )  # fmt: skip
-    needs = ["ccd_casadi.codesign.result", "ccd_casadi.synthesis.backends.mixed"]
-    return run(command, arguments, argv, needs=needs)
 
 
 if __name__ == "__main__":

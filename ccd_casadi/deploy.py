@@ -2,12 +2,11 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
-from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import one_line, positive, real
 from ccd_casadi.support.progress import Progress
@@ -18,7 +17,40 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     from ccd_casadi.deployment.outcome import Deployment
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+def _delay(arguments: argparse.ArgumentParser) -> None:
+    """--delay or --delay-samples."""
+    either = arguments.add_mutually_exclusive_group()
+    words = "time from reading y to the new u, in s"
+    either.add_argument("--delay", metavar="SECONDS", type=real(), help=words)
+    words = "the same time in sampling periods (default: 1)"
+    either.add_argument(
+        "--delay-samples", metavar="X", type=real(), default=Timing.delay_samples, help=words
+    )
+
+
+@command(
+    "ccd_casadi.deploy",
+    "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
+    option("--rate-hz", metavar="X", type=positive,
+           help="sampling rate (default: the next round rate above what is needed)"),
+    _delay,
+    option("--lead", choices=["on", "off"], default="on",
+           help="a lead that compensates hold and delay (default: on, which lowers the rate)"),
+    option("--unverified", action="store_true",
+           help="deploy a run that is not verified; the result is not verified either"),
+    option("--saturation", metavar="NEWTON", type=positive,
+           help="limit every u to plus or minus this, with anti-windup (default: off)"),
+    option("--fmu", action="store_true",
+           help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC "
+           "names"),
+    *(option(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
+      for name, metavar, words in (
+          ("--sensor-step", "METRE", "of the simulated sensor"),
+          ("--force-step", "NEWTON", "of the simulated actuator"),
+          ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"))),
+    add_move_options, needs=["ccd_casadi.deployment.pipeline"], make=run_parser,
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
@@ -100,26 +132,12 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.deployment.words import figure_rows, order_words, status_words
     from ccd_casadi.reporting.verdict import advice
+    from ccd_casadi.support.package_text import template
 
-    needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
-    lines = [
-        ("status", status_words(run, found)),
-        *([("decision", advice(run.result))] if advice(run.result) else []),
-        ("order", order_words(run, found)),
-        ("rate", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
-                 f"{found.conversion.value}; needed {needed}"),
-        *((name.lower(), f"{value}, {words}") for name, value, words in figure_rows(run, found)),
-    ]  # fmt: skip
-    if not found.stable:
-        lines.append(("", found.shortfalls[0]))
-    if found.members:
-        worst = found.worst
-        peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"
-        words = f"{1 + len(found.members)} plants: {peak}"
-        lines.append(("robust set", f"{words} ({place_words(worst.at)})"))
-    if found.statics is not None:
-        lines.append(("at rest", found.statics.words))
-    return "\n".join(f"{name:13s} {words}" for name, words in lines)
+    return template("templates/deploy.txt", place_words=place_words).render(
+        d=found, status=status_words(run, found), decision=advice(run.result),
+        order=order_words(run, found), figures=figure_rows(run, found),
+    ).rstrip()  # fmt: skip
 
 
 def _shortfall(found: "Deployment") -> str:
@@ -131,38 +149,6 @@ def _shortfall(found: "Deployment") -> str:
     if found.needed_hz is None:
         return f"{words}; with this delay no rate is; shorten the delay"
     return f"{words}; {found.needed_hz:.6g} Hz is needed"
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.deploy",
-        "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
-    )
-    add = arguments.add_argument
-    words = "sampling rate (default: the next round rate above what is needed)"
-    add("--rate-hz", metavar="X", type=positive, help=words)
-    delay = arguments.add_mutually_exclusive_group()
-    words = "time from reading y to the new u, in s"
-    delay.add_argument("--delay", metavar="SECONDS", type=real(), help=words)
-    delay.add_argument("--delay-samples", metavar="X", type=real(), default=Timing.delay_samples,
-                       help="the same time in sampling periods (default: 1)")  # fmt: skip
-    words = "a lead that compensates hold and delay (default: on, which lowers the rate)"
-    add("--lead", choices=["on", "off"], default="on", help=words)
-    words = "deploy a run that is not verified; the result is not verified either"
-    add("--unverified", action="store_true", help=words)
-    words = "limit every u to plus or minus this, with anti-windup (default: off)"
-    add("--saturation", metavar="NEWTON", type=positive, help=words)
-    words = "also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC names"
-    add("--fmu", action="store_true", help=words)
-    for name, metavar, words in (
-        ("--sensor-step", "METRE", "of the simulated sensor"),
-        ("--force-step", "NEWTON", "of the simulated actuator"),
-        ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
-    ):
-        add(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
-    add_move_options(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])
 
 
 if __name__ == "__main__":

@@ -4,13 +4,18 @@ Serves one page on the loopback address until Ctrl-C.
 """
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
-from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.explore", "Drag a design and see its certified loop, in the browser.",
+    option("--no-open", action="store_true", help="only print the address, open no browser"),
+    needs=["ccd_casadi.codesign.result"], make=run_parser, metavar="CASE.toml|RUN_DIR",
+    about="a case file, or the folder of a finished solve",
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.support.errors import require
 
@@ -41,20 +46,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     finally:
         explorer.close()
     return ExitCode.DONE
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.explore",
-        "Drag a design and see its certified loop, in the browser.",
-        metavar="CASE.toml|RUN_DIR",
-        about="a case file, or the folder of a finished solve",
-    )
-    arguments.add_argument(
-        "--no-open", action="store_true", help="only print the address, open no browser"
-    )
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":

@@ -1,15 +1,22 @@
 """`python -m ccd_casadi.gap CASE.toml [--theta m1=60,m2=60]`: what no controller can reach."""
 
 import argparse
-from collections.abc import Sequence
 from time import perf_counter
 from typing import Any
 
-from ccd_casadi.support.command_line import ExitCode, parser, run
+from ccd_casadi.support.command_line import ExitCode, command, option
 from ccd_casadi.support.units import HZ
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.gap",
+    "Bound the bandwidth of every controller on the model at one theta; print JSON. "
+    "CASE.toml may be the folder of a finished solve.",
+    option("--theta", metavar="m1=60,m2=60", help="the hardware (default: the case's start)"),
+    needs=["ccd_casadi.limitations.of_problem"],
+    without_effect=("--out", "--workers", "--seed", "--quiet"),
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; of a run's folder at its θ, beside its own bandwidth."""
     from ccd_casadi.cases.case import load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
@@ -37,20 +44,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     }
     print(json_text(answer))
     return ExitCode.DONE
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser(
-        "ccd_casadi.gap",
-        "Bound the bandwidth of every controller on the model at one theta; print JSON. "
-        "CASE.toml may be the folder of a finished solve.",
-        without_effect=("--out", "--workers", "--seed", "--quiet"),
-    )
-    arguments.add_argument(
-        "--theta", metavar="m1=60,m2=60", help="the hardware (default: the case's start)"
-    )
-    return run(command, arguments, argv, needs=["ccd_casadi.limitations.of_problem"])
 
 
 if __name__ == "__main__":

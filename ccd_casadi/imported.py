@@ -1,11 +1,10 @@
 """`python -m ccd_casadi.imported FOLDER`: result files or matrices at samples into modes.csv."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import integer
 from ccd_casadi.support.terminal import inform
@@ -27,7 +26,17 @@ def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
     return reduced_table(folder, options.modes, options.static_correction)
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.imported",
+    "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
+    option("--modes", type=integer(1), default=10, metavar="N",
+           help="modes of matrices (default: 10)"),
+    option("--static-correction", action="store_true", help="exact static compliance of matrices"),
+    needs=["ccd_casadi.plants.imported.results"], make=run_parser, metavar="FOLDER",
+    about="the folder with index.csv and dofs.csv",
+    without_effect=["--workers", "--seed", "--no-user-code"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.plants.imported.modal_table import write_modal_table
 
@@ -41,22 +50,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     N, r = table.omega.shape
     inform(f"{file}: {N} samples of {r} modes, {', '.join(table.names)}")
     return ExitCode.DONE
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.imported",
-        "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
-        metavar="FOLDER",
-        about="the folder with index.csv and dofs.csv",
-        without_effect=["--workers", "--seed", "--no-user-code"],
-    )
-    add = arguments.add_argument
-    words = "modes of matrices (default: 10)"
-    add("--modes", type=integer(1), default=10, metavar="N", help=words)
-    add("--static-correction", action="store_true", help="exact static compliance of matrices")
-    return run(command, arguments, argv, needs=["ccd_casadi.plants.imported.results"])
 
 
 if __name__ == "__main__":

@@ -2,13 +2,12 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
 from ccd_casadi.support.options import add_break_frequencies, break_frequencies
 from ccd_casadi.support.terminal import inform
 
@@ -19,7 +18,15 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 PROGRESS = partial(inform, stream=sys.stderr)  # stdout is for the answer
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.inner", "Find the best controller at one theta; print it as JSON.",
+    option("--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"),
+    option("--begin-at", metavar="FOLDER", type=Path,
+           help="sections: start one search from the controller of this run, not many"),
+    partial(add_break_frequencies, "of a weight; with both: one synthesis, no search"),
+    needs=["ccd_casadi.codesign.result"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
@@ -92,19 +99,6 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
     }
     print(json_text(answer))
     return ExitCode.of(found.status)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser(
-        "ccd_casadi.inner", "Find the best controller at one theta; print it as JSON."
-    )
-    add = arguments.add_argument
-    add("--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none")
-    words = "sections: start one search from the controller of this run, not many"
-    add("--begin-at", metavar="FOLDER", type=Path, help=words)
-    add_break_frequencies(arguments, "of a weight; with both: one synthesis, no search")
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":

@@ -6,16 +6,28 @@ case gives, what limits the bandwidth, and the rule of thumb against what was ac
 """
 
 import argparse
-from collections.abc import Sequence
 from time import perf_counter
 
-from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
+from ccd_casadi.support.command_line import (
+    SCHEDULER,
+    ExitCode,
+    command,
+    option,
+    run_folder,
+    run_parser,
+)
 from ccd_casadi.support.options import integer
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import inform
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.insight", "Trade hardware cost against bandwidth.",
+    option("--points", metavar="N", type=integer(2, 9999), default=20,
+           help="most points on the front (default: 20)"),
+    SCHEDULER, needs=["ccd_casadi.codesign.insight"], make=run_parser,
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.insight import insight_dict
@@ -53,15 +65,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     inform(f"answer        {page.head.decision}")
     inform(f"page          {folder / 'insight.html'}")
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser("ccd_casadi.insight", "Trade hardware cost against bandwidth.")
-    words = "most points on the front (default: 20)"
-    arguments.add_argument("--points", metavar="N", type=integer(2, 9999), default=20, help=words)
-    add_scheduler(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.insight"])
 
 
 if __name__ == "__main__":

@@ -5,14 +5,18 @@ its design, as far as case.toml, controller.json and result.json hold it.
 """
 
 import argparse
-from collections.abc import Sequence
 
-from ccd_casadi.support.command_line import ExitCode, run, run_parser
+from ccd_casadi.support.command_line import ExitCode, command, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.terminal import inform
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
+    needs=["ccd_casadi.drawing.stored"], make=run_parser,
+    without_effect=["--out", "--workers", "--seed"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """Draw every page of the folder, and of those of deployments and the like below it."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.drawing.stored import NAME, draw, read_pages
@@ -35,15 +39,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     write_index(folder)
     inform("\n".join(f"drawn         {path}" for path in drawn))
     return ExitCode.DONE
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
-        without_effect=["--out", "--workers", "--seed"],
-    )  # fmt: skip
-    return run(command, arguments, argv, needs=["ccd_casadi.drawing.stored"])
 
 
 if __name__ == "__main__":

@@ -2,12 +2,11 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ccd_casadi.codesign import FORMULATIONS
-from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_parser
+from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, real
 from ccd_casadi.support.process_pool import PATIENCE
@@ -18,7 +17,16 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     from ccd_casadi.codesign.verified import Solution
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "surrogates.retrain", "True samples where they help the optimum most, then a new fit.",
+    option("--budget", metavar="N", type=integer(1), default=500,
+           help="most syntheses that retraining adds in total (default: 500)"),
+    option("--tolerance", metavar="X", type=real(1e-12, 0.5),
+           help="relative agreement of prediction and truth (default: the case's)"),
+    SCHEDULER, needs=["ccd_casadi.codesign.run"], make=run_parser,
+    about="the run folder; with --out a copy there is retrained",
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
@@ -82,21 +90,6 @@ def formulation_in(folder: Path) -> str:
         words = f"{formulation!r:.60} is unknown; give {', '.join(FORMULATIONS)}"
         raise UserError(f"{path}: formulation: {words}")
     return str(formulation)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "surrogates.retrain", "True samples where they help the optimum most, then a new fit.",
-        about="the run folder; with --out a copy there is retrained",
-    )  # fmt: skip
-    add = arguments.add_argument
-    add("--budget", metavar="N", type=integer(1), default=500,
-        help="most syntheses that retraining adds in total (default: 500)")  # fmt: skip
-    add("--tolerance", metavar="X", type=real(1e-12, 0.5),
-        help="relative agreement of prediction and truth (default: the case's)")  # fmt: skip
-    add_scheduler(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
 
 if __name__ == "__main__":

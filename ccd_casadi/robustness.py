@@ -1,19 +1,42 @@
 """`python -m ccd_casadi.robustness RUN_DIR`: what a finished design survives."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 
 from ccd_casadi.robust.demands import Demands, add_move_options, move_limits
-from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, positive, real
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from ccd_casadi.support.terminal import inform, plain
 
+PERCENT = real(0.0, 50.0, strict=True)
 
-def command(options: argparse.Namespace) -> ExitCode:
+
+@command(
+    "ccd_casadi.robustness",
+    "Find what a design survives: plants, tolerances, noise, a move.",
+    option("--controller", type=Path, metavar="FILE",
+           help="judge this controller, not the run's: .json, .mat or .toml, see "
+           "docs/robustness.md"),
+    option("--shift", type=PERCENT, default=5.0, metavar="PERCENT",
+           help="resonance shift; default 5"),
+    option("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
+           help="range of factors of the damping; default 0.5 2"),
+    option("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
+           help="tolerance of every hardware parameter; default 1"),
+    option("--samples", type=integer(1), default=200, metavar="N",
+           help="number of random sets of hardware; default 200"),
+    option("--noise", type=positive, default=1.0, metavar="X",
+           help="sensor noise, m/√Hz; default 1"),
+    option("--disturbance", type=positive, default=1.0, metavar="X",
+           help="density of the force at every actuator, N/√Hz; default 1"),
+    option("--axis", type=integer(1), default=1, metavar="N",
+           help="output that moves; default 1"),
+    add_move_options, needs=["ccd_casadi.robust.study"], make=run_parser,
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
@@ -65,32 +88,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     inform(plain("\n".join(filter(None, (page.head.decision, *conclusion(finished, found))))))
     inform(f"page          {folder / 'robustness.html'}")
     return ExitCode.DONE
-
-
-PERCENT = real(0.0, 50.0, strict=True)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.robustness", "Find what a design survives: plants, tolerances, noise, a move."
-    )
-    add = arguments.add_argument
-    words = "judge this controller, not the run's: .json, .mat or .toml, see docs/robustness.md"
-    add("--controller", type=Path, metavar="FILE", help=words)
-    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="resonance shift; default 5")
-    add("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
-        help="range of factors of the damping; default 0.5 2")  # fmt: skip
-    add("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
-        help="tolerance of every hardware parameter; default 1")  # fmt: skip
-    add("--samples", type=integer(1), default=200, metavar="N",
-        help="number of random sets of hardware; default 200")  # fmt: skip
-    add("--noise", type=positive, default=1.0, metavar="X", help="sensor noise, m/√Hz; default 1")
-    add("--disturbance", type=positive, default=1.0, metavar="X",
-        help="density of the force at every actuator, N/√Hz; default 1")  # fmt: skip
-    add("--axis", type=integer(1), default=1, metavar="N", help="output that moves; default 1")
-    add_move_options(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 
 
 if __name__ == "__main__":

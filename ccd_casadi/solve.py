@@ -2,12 +2,12 @@
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign import FORMULATIONS
-from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
+from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.units import counted
@@ -21,54 +21,24 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
     from ccd_casadi.codesign.design_entries import budget_lines, move_lines
-    from ccd_casadi.inner_problem.sections_words import channel_words
+    from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words, gain_words
     from ccd_casadi.reporting.facts import cost_words, loop_lines, theta_words
     from ccd_casadi.reporting.verdict import advice, terminal_lines
     from ccd_casadi.sampling.spent import cost_words as spent_words
+    from ccd_casadi.support.package_text import template
 
-    result = solution.result
-    if result["status"] == "infeasible":
-        return f"no feasible design: {result['reason']}"
-    controller = result.get("controller")
-    peak = f"peak {result['sensitivity_peak']:.5f} at {result['sensitivity_peak_hz']:.4g} Hz"
-    lines = [
-        f"status        {result['status']}  {result['reason']}".rstrip(),
-        *(f"decision      {words}" for words in (advice(result),) if words),
-        *terminal_lines(result),
-        f"theta         {theta_words(result)}",
-        f"objective     {result['objective']:.4f}   hardware cost {cost_words(result, 6)}",
-        *inner_value_lines(result),
-        *_weights_lines(result),
-        *([] if controller is None else controller_lines(controller)),
-        f"sensitivity   {peak}, |S| {result['sensitivity_low']:.4g} at omega_low",
-        *(f"              {channel_words(own)}" for own in result.get("channel_bounds", ())),
-        f"compliance    {result.get('compliance_words', 'not known')}",
-        *loop_lines(result),
-        *budget_lines(result),
-        *move_lines(result),
-        f"binding       {', '.join(result['active']) or 'nothing'}",
-        *design_plant_lines(result.get("robust") or {}),
-        f"cost          {spent_words(result)}",
-    ]
-    lines += [f"note          {words}" for words in result.get("notes", ())]
-    return "\n".join(lines)
-
-
-def controller_lines(controller: Mapping[str, Any]) -> list[str]:
-    """A controller of fixed structure: its order and gain, its sections in Hz."""
-    from ccd_casadi.inner_problem.sections_words import SectionWords, gain_words
-
-    return [
-        f"controller    order {controller['order']}, gain {gain_words(controller)}",
-        *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
-    ]
-
-
-def _weights_lines(result: Mapping[str, Any]) -> list[str]:
-    if result["omega_S_hz"] is None:
-        return []
-    at = (f"omega_{name} = {result[f'omega_{name}_hz']:.5g} Hz" for name in "ST")
-    return [f"weights       {', '.join(at)}"]
+    r = solution.result
+    words = template("templates/solve.txt", gain_words=gain_words, channel_words=channel_words)
+    if r["status"] == "infeasible":
+        return words.render(r=r).rstrip()
+    found = r.get("controller", {}).get("sections", ())
+    return words.render(
+        r=r, decision=advice(r), verdict=terminal_lines(r), theta=theta_words(r),
+        hardware=cost_words(r, 6), inner_value=inner_value_lines(r), spent=spent_words(r),
+        sections=[SectionWords(**item) for item in found],
+        loop_and_budget=[*loop_lines(r), *budget_lines(r), *move_lines(r)],
+        design_plant=design_plant_lines(r.get("robust") or {}),
+    ).rstrip()  # fmt: skip
 
 
 def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
@@ -144,7 +114,17 @@ def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
     return replace(solution, result=solution.result | {"reason": "; ".join(filter(None, words))})
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.solve", "Design a stage and its controller together.",
+    option("--formulation", choices=FORMULATIONS,
+           help="default: nested, or direct with many parameters or lists"),
+    option("--resume", action="store_true",
+           help="print what the run folder holds; every run continues from it"),
+    option("--no-report", action="store_true",
+           help="write no pages, for jobs that only need result.json"),
+    SCHEDULER, needs=["ccd_casadi.codesign.run"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
@@ -190,20 +170,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     if options.quiet and code is not ExitCode.DONE:
         say(f"{options.case}: {solution.result['reason']}", sys.stderr)
     return code
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser("ccd_casadi.solve", "Design a stage and its controller together.")
-    add = arguments.add_argument
-    words = "default: nested, or direct with many parameters or lists"
-    add("--formulation", choices=FORMULATIONS, help=words)
-    words = "print what the run folder holds; every run continues from it"
-    add("--resume", action="store_true", help=words)
-    words = "write no pages, for jobs that only need result.json"
-    add("--no-report", action="store_true", help=words)
-    add_scheduler(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
 
 if __name__ == "__main__":

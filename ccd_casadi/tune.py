@@ -2,16 +2,30 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
 
-from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
 from ccd_casadi.support.options import integer, one_line, positive, real
 from ccd_casadi.support.terminal import inform, say
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.tune", "Find the fastest PID with notches for a plant that exists.",
+    *(option(name, metavar=metavar, type=kind, default=default,
+             help=words if default is None else f"{words} (default: {default:g})")
+      for name, metavar, kind, default, words in (
+          ("--rate-hz", "X", positive, None, "sampling rate; responses include the hold"),
+          ("--delay", "SECONDS", real(), 0.0, "delay in s besides that in DATA"),
+          ("--s-max", "X", real(1.0, strict=True), 1.8, "bound of |S|"),
+          ("--shape", "X", real(1.0), 1.1, "bound of |S| over ω/(√2 ω_b)"),
+          ("--effort", "X", positive, 20.0, "bound of |KS| over 1/|G| about ω_b"),
+          ("--lead", "N", integer(0), 1, "number of leads, with --biquads"),
+          ("--biquads", "N", integer(0), None, "number of notches (default: by the resonances)"))),
+    needs=["ccd_casadi.codesign.tuning"], make=run_parser, metavar="DATA", nargs="+",
+    about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
     from ccd_casadi.codesign.inner_answer import answer_of
     from ccd_casadi.codesign.tuning import tune
@@ -68,27 +82,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     if answer.status != "verified":
         say(one_line(f"{case.file}: {answer.status}: {result['reason']}"), sys.stderr)
     return ExitCode.of(answer.status)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.tune", "Find the fastest PID with notches for a plant that exists.",
-        metavar="DATA", nargs="+",
-        about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
-    )  # fmt: skip
-    for name, metavar, kind, default, words in (
-        ("--rate-hz", "X", positive, None, "sampling rate; responses include the hold"),
-        ("--delay", "SECONDS", real(), 0.0, "delay in s besides that in DATA"),
-        ("--s-max", "X", real(1.0, strict=True), 1.8, "bound of |S|"),
-        ("--shape", "X", real(1.0), 1.1, "bound of |S| over ω/(√2 ω_b)"),
-        ("--effort", "X", positive, 20.0, "bound of |KS| over 1/|G| about ω_b"),
-        ("--lead", "N", integer(0), 1, "number of leads, with --biquads"),
-        ("--biquads", "N", integer(0), None, "number of notches (default: by the resonances)"),
-    ):
-        shown = words if default is None else f"{words} (default: {default:g})"
-        arguments.add_argument(name, metavar=metavar, type=kind, default=default, help=shown)
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.tuning"])
 
 
 if __name__ == "__main__":

@@ -4,14 +4,17 @@ Writes worth.json: hardware first by a rule of thumb, the best design found, wha
 """
 
 import argparse
-from collections.abc import Sequence
 
-from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.command_line import ExitCode, command, run_folder
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.terminal import inform
 
 
-def command(options: argparse.Namespace) -> ExitCode:
+@command(
+    "ccd_casadi.worth", "Estimate what co-design gains over the sequential way.",
+    needs=["ccd_casadi.studies.worth"],
+)  # fmt: skip
+def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
@@ -31,12 +34,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     write_json(folder / "worth.json", found | {"seed": options.seed, "versions": versions()})
     inform("\n".join([*worth_words(found), f"file          {folder / 'worth.json'}"]))
     return ExitCode.DONE
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point."""
-    arguments = parser("ccd_casadi.worth", "Estimate what co-design gains over the sequential way.")
-    return run(command, arguments, argv, needs=["ccd_casadi.studies.worth"])
 
 
 if __name__ == "__main__":

@@ -7,12 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from surrogates.covariance import Kernel
-from surrogates.gaussian_process import GaussianProcess
+from surrogates.gaussian_process import GaussianProcess, conditioned
 from surrogates.interface import SurrogateFitError
-from surrogates.maximum_likelihood import fit_process
+from surrogates.maximum_likelihood import calibrated, estimate, uneven_noise
 from surrogates.samples import checked
 
 Noise = ArrayLike | None
+# Observations that an exact process holds: 200 MB and some ten seconds to factorise.
+EXACT_LIMIT = 5000
 
 
 def fit(
@@ -52,8 +54,8 @@ def fit(
     Raises
     ------
     SurrogateFitError
-        Wrong shapes, values that are not finite, negative noise, or an unknown kernel; the sentence
-        says what to do.
+        Wrong shapes, values that are not finite, negative noise, an unknown kernel, or more samples
+        than an exact process holds; the sentence says what to do.
     """
     samples = checked(X, Y, lower, upper, dY, noise)
     if starts < 1:
@@ -63,7 +65,13 @@ def fit(
     except ValueError:
         known = ", ".join(Kernel)
         raise SurrogateFitError(f"unknown kernel {kernel!r}; it is one of: {known}") from None
-    return fit_process(samples, family, seed, starts)
+    if samples.observations > EXACT_LIMIT:
+        raise SurrogateFitError(
+            f"{samples.observations} observations are more than the {EXACT_LIMIT} an exact "
+            "Gaussian process holds: take fewer samples, or leave gradients out"
+        )
+    parameters = estimate(samples, family, seed, starts)
+    return calibrated(conditioned(parameters, samples, family, uneven_noise(samples)))
 
 
 def fit_outputs(

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from surrogates.covariance import Hyperparameters, Kernel
-from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
-from surrogates.interface import Array, SurrogateFitError
+from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, loo_errors
+from surrogates.interface import Array
 from surrogates.likelihood import LENGTH_BOUNDS, NOISE_BOUNDS, SIGNAL_BOUNDS, log_likelihood
 from surrogates.samples import Samples
 
@@ -19,35 +19,14 @@ POLISH_ORDER = 600
 # Relative jitter during the search, so that no trial point is lost to rounding.
 SEARCH_JITTER = 1e-15
 SINGULAR = 1e10  # -log p where K is: a wall, flat, so that the line search backs off
-# Observations that an exact process holds: 200 MB and some ten seconds to factorise.
-EXACT_LIMIT = 5000
 
 
-def fit_process(
-    samples: Samples, kernel: Kernel = Kernel.MATERN52, seed: int = 0, starts: int = 5
-) -> GaussianProcess:
-    """Return the process that maximises log p(Y, dY | X) (R & W eq. 5.8).
+def estimate(samples: Samples, kernel: Kernel, seed: int, starts: int) -> Hyperparameters:
+    """Return the hyperparameters that maximise log p(Y, dY | X) (R & W eq. 5.8).
 
-    Over length scales, signal and, where it is not given, noise variance, from
-    `starts` seeded starts; its bands are then `calibrated`. That of gradients is estimated
-    always.
-
-    Raises:
-        SurrogateFitError: more observations than an exact process holds, contradictory
-            samples with no noise.
+    Length scales, signal and, where it is not given, noise variance, from `starts` seeded starts on
+    at most 600 of the observations; that of gradients is estimated always.
     """
-    if samples.observations > EXACT_LIMIT:
-        raise SurrogateFitError(
-            f"{samples.observations} observations are more than the {EXACT_LIMIT} an exact "
-            "Gaussian process holds: take fewer samples, or leave gradients out"
-        )
-    parameters = estimate(samples, kernel, seed, starts)
-    process = conditioned(parameters, samples, kernel, uneven_noise(samples))
-    return calibrated(process)
-
-
-def estimate(samples: Samples, kernel: Kernel, seed: int = 0, starts: int = 5) -> Hyperparameters:
-    """Return the hyperparameters of `fit_process`, of at most 600 of the observations."""
     from scipy.optimize import minimize  # slow to import, and only fitting needs it
 
     own = uneven_noise(samples)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from ccd_casadi.analysis.feedforward import feedforward_slopes
 from ccd_casadi.analysis.move_limits import MoveLimits
@@ -142,7 +142,7 @@ def _heated(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
     low = most  # far below it durations are so long that rounding fills them
     while np.real(share(low)) > 1.0:
         low *= 0.1
-    a = float(brentq(lambda a: np.real(share(a)) - 1.0, low, most, xtol=1e-14 * low))
+    a = float(scipy.optimize.brentq(lambda a: np.real(share(a)) - 1.0, low, most, xtol=1e-14 * low))
     slope = np.imag(share(a + 1j * STEP)) / STEP
     return a - (_cycle(motion, a, forces, mass).heat_share - 1.0) / slope
 

@@ -19,9 +19,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.analysis.setpoint import Setpoint
-from ccd_casadi.lti.closed_loop import ClosedLoop
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.recurrence import states
@@ -236,10 +234,3 @@ def forward_force(
     """Setpoint (N,) and Σ_i F_i r^(i) (N, m) at `time`, F (5, m) of `feedforward`."""
     r = held_setpoint(profile, time, period)
     return r[0], r.T @ forward
-
-
-def driven_states(closed: ClosedLoop, G: StateSpace, r: Array, force: Array) -> Array:
-    """States (N, n) of a sampled loop by its first setpoint and a force ahead (N, m)."""
-    driven = np.outer(r, closed.B_r[:, 0])
-    driven[:, : len(G.A)] += force @ G.B.T
-    return states(closed.A, driven)

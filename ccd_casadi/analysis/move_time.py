@@ -25,7 +25,7 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.analysis.motor import STEP, MotionAt
-from ccd_casadi.analysis.move import driven_states, forward_force
+from ccd_casadi.analysis.move import forward_force
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
 from ccd_casadi.lti.hold import Sampling, sampled, tustin
@@ -52,7 +52,9 @@ class _Crossing:
         self.stable, self.time = bool(np.abs(self.poles).max() < 1.0), np.inf
         if not self.stable:
             return
-        self.x = driven_states(loop, G, r, f)  # the last at rest but for the loop's own modes
+        driven = np.outer(r, loop.B_r[:, 0])
+        driven[:, : len(G.A)] += f @ G.B.T
+        self.x = states(loop.A, driven)  # the last at rest but for the loop's own modes
         self.still = np.eye(len(loop.A)) - loop.A
         self.rest = np.linalg.solve(self.still, loop.B_r[:, 0] * r[-1])
         self.W = np.linalg.inv(self.V)

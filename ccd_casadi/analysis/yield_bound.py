@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from scipy.special import betaincinv
+import scipy
 
 CONFIDENCE, CONFIDENCE_WORDS = 1.0 - 1e-6, "1 - 1e-6"
 
@@ -26,7 +26,7 @@ def yield_bound(survived: int, draws: int, confidence: float = CONFIDENCE) -> fl
         raise ValueError(f"confidence is {confidence}; give more than 0 and less than 1")
     if survived == 0:
         return 0.0
-    return float(betaincinv(survived, draws - survived + 1, 1.0 - confidence))
+    return float(scipy.special.betaincinv(survived, draws - survived + 1, 1.0 - confidence))
 
 
 @dataclass(frozen=True)

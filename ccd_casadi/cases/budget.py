@@ -18,17 +18,8 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
-from ccd_casadi.cases.checks import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Check,
-    Fail,
-    every,
-    require_good,
-    rows,
-    short_repr,
-    text,
-)
+from ccd_casadi.cases import checks
+from ccd_casadi.cases.checks import Fail, short_repr
 from ccd_casadi.cases.tables import BudgetTable
 
 # Unit -> factor of a density to SI, and whether the number is its square root.
@@ -46,23 +37,23 @@ PATH = ("mass", "damping", "stiffness")
 
 def _corner(value: Any) -> str | None:
     parts = value if isinstance(value, list | tuple) else [value]
-    good = len(parts) in (1, 2) and all(POSITIVE(part) is None for part in parts)
+    good = len(parts) in (1, 2) and all(checks.POSITIVE(part) is None for part in parts)
     return None if good else "is none"
 
 
-CORNERS = every(
-    Check(_corner, {"type": ["number", "array"]}),
+CORNERS = checks.every(
+    checks.Check(_corner, {"type": ["number", "array"]}),
     "give a list of Hz, or of [Hz, damping ratio], all above 0",
 )
-TABLE_CHECKS: dict[str, Check] = {
-    "name": text,
-    "unit": text,
-    "level": POSITIVE,
+TABLE_CHECKS: dict[str, checks.Check] = {
+    "name": checks.text,
+    "unit": checks.text,
+    "level": checks.POSITIVE,
     "zeros_hz": CORNERS,
     "poles_hz": CORNERS,
-    "psd": rows(2),
-    "file": text,
-    **dict.fromkeys(PATH, NOT_NEGATIVE),
+    "psd": checks.rows(2),
+    "file": checks.text,
+    **dict.fromkeys(PATH, checks.NOT_NEGATIVE),
 }
 
 
@@ -96,7 +87,7 @@ def _checked(
 ) -> Mapping[str, Any]:
     still = kind is not Kind.FLOOR_MOTION
     known = {key: one for key, one in TABLE_CHECKS.items() if not (still and key in PATH)}
-    require_good(place, entry, known, fail)
+    checks.require_good(place, entry, known, fail)
     if entry.get("unit") not in UNITS[kind]:
         choices = ", ".join(f'"{unit}"' for unit in UNITS[kind])
         raise fail(f"{place}.unit", f"is {short_repr(entry.get('unit'))}; choose one of {choices}")

@@ -158,13 +158,12 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     tables["budget"] = checked_budget(tables["budget"], path.parent, fail)
     tables["places"] = checked_places(tables["places"], path.parent, fail)
     plant = plant_table(data["plant"], path, fail)
-    files = tables["robust"].plants
-    absolute = tuple(str((path.parent / file).resolve()) for file in files)
-    for place in absolute:
-        plant_table(dict(data["plant"]) | options_in(place, fail), path, fail)
-    tables["robust"] = replace(tables["robust"], plants=absolute)
+    own = dict(data["plant"])
+    plants = tuple(_options_of(one, own, path, fail) for one in tables["robust"].plants)
+    tables["robust"] = replace(tables["robust"], plants=plants)
     places, size = tables["places"], tables["motor"].size
-    of_case = (*names_in((*places.actuators, *places.sensors)), *filter(None, [size]))
+    named = names_in((*places.actuators, *places.sensors, places.present))
+    of_case = (*named, *filter(None, [size]))
     theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
     for parameter in fixed:
         if parameter.varies and controller.structure != "sections":
@@ -203,16 +202,20 @@ def _number_of_the_whole(check: Test, value: Any) -> str | None:
     return f"is {short_repr(value)}; {_PER_CHANNEL}" if isinstance(value, list) else check(value)
 
 
-def options_in(place: str, fail: Fail) -> dict[str, Any]:
-    """The plant options in a file that [robust] names. Raises CaseError where it has none."""
+def _options_of(
+    one: str | Mapping[str, Any], own: dict[str, Any], path: Path, fail: Fail
+) -> dict[str, Any]:
+    """The plant options in a file that [robust] names, or in a table of it, checked."""
     try:
-        found = read_toml(Path(place))
+        found = one if isinstance(one, Mapping) else read_toml(path.parent / one)
     except CaseError as error:
         raise fail("robust.plants", str(error)) from None
     for key in ("model", "function"):
         if key in found:
-            raise fail("robust.plants", f"{place}: {key} is not an option of a plant; drop it")
-    return found
+            words = f"{short_repr(one)}: {key} is not an option of a plant; drop it"
+            raise fail("robust.plants", words)
+    checked = plant_table({**own, **found}, path, fail).options
+    return {key: checked[key] for key in found}
 
 
 def parse_theta(case: Case, text: str) -> tuple[float, ...]:

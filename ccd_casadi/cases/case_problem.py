@@ -3,8 +3,7 @@
 from typing import Any
 
 from ccd_casadi.cases.budget import error_budget
-from ccd_casadi.cases.case import CaseError, options_in
-from ccd_casadi.cases.checks import Fail
+from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import structured_problem, weights_of
@@ -18,7 +17,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.plants.modal import Suspension
-from ccd_casadi.plants.registry import data_option, model_named
+from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import kept_quiet
@@ -121,15 +120,11 @@ def problem_of(case: Case) -> CoDesignProblem:
 
 
 def _option_sets(case: Case) -> tuple[Options, ...]:
-    """The plant options of every file that [robust] names, data files by their absolute path."""
-    found = []
-    for file in case.robust.plants:
-        options = options_in(file, Fail(case.path))
-        data = data_option(case.plant.model)
-        if data in options:
-            options[data] = str((case.path.parent / options[data]).resolve())
-        found.append(tuple(sorted((key, _frozen(value)) for key, value in options.items())))
-    return tuple(found)
+    """The options of every plant that [robust] names."""
+    return tuple(
+        tuple(sorted((key, _frozen(value)) for key, value in options.items()))
+        for options in case.robust.plants
+    )
 
 
 def _robust(table: RobustTable) -> RobustSet | None:

@@ -166,7 +166,11 @@ factors = every(POSITIVE, "give a list of numbers above 0")
 numbers = every(ANY, "give a list of numbers", 1)
 listed = Check(numbers.test, _list(ANY.schema, 2))
 named = _good({"type": "string", "minLength": 1}, lambda v: bool(v) and isinstance(v, str), "")
-files = every(named, "give a list of file names in quotes")
+_named_or_table = Check(
+    lambda value: None if isinstance(value, Mapping) else named(value),
+    {"type": ["string", "object"], "minLength": 1},
+)
+plant_options = every(_named_or_table, "give a list of file names in quotes, or of tables")
 names = every(Check(text.test, named.schema), "give a list of texts in quotes", 1)
 coordinate = Check(
     lambda value: (
@@ -177,6 +181,7 @@ coordinate = Check(
 places = every(
     every(coordinate, "", 1, 3), 'give rows of numbers and names of [theta], as [["x", 0.1]]'
 )
+names_of_theta = every(named, "give a list of names of [theta] in quotes")
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
@@ -244,10 +249,12 @@ def unit_of(item: Field[Any]) -> str:
 def require_good(
     place: str, table: Mapping[str, Any], checks: Mapping[str, Test], fail: Fail
 ) -> None:
-    """Raise the error of the first key of a table that is unknown, or not as its check wants it."""
+    """Raise the error of the first key of a table that is unknown, or not as its check wants it;
+    `place`: the table's own name, of a whole file none."""
     for name, value in table.items():
+        key = f"{place}.{name}" if place else name
         if name not in checks:
-            raise fail(f"{place}.{name}", f"unknown key{closest(name, checks)}")
+            raise fail(key, f"unknown key{closest(name, checks)}")
         wrong = checks[name](value)
         if wrong is not None:
-            raise fail(f"{place}.{name}", wrong)
+            raise fail(key, wrong)

@@ -149,7 +149,7 @@ class BaselineTable:
         "first steps of the descents, as shares of the box", (0.02, 0.05, 0.1), check=steps
     )
     starts: int = key(
-        "starts of the descents: the case's own, a Latin hypercube", 3, check=count(1)
+        "starts of the descents: the case's own, then a Latin hypercube", 3, check=count(1)
     )
     max_iterations: int = key("most iterations of a descent", 100, check=count(1))
 

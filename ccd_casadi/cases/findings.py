@@ -100,7 +100,7 @@ def _dip(zero: Zero) -> Finding:
         f"a transmission zero at {z:.4g} Hz, damping {100 * zero.damping_ratio:.2g} %: the "
         f"plant's gain falls to {100 * zero.dip:.2g} % of its surroundings, and so much "
         f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
-        "Hz unless M_K pays for it"
+        "Hz unless M_K allows that force"
     )
     return Finding(Severity.NOTE, Topic.ZERO, words)
 

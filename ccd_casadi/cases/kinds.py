@@ -106,7 +106,7 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
             words = "has an effect on a bounded KS only; give controller.weighted_level, or drop it"
             raise fail(f"controller.channel.{name}.M_K", words)
     if len(tables["robust"].plants) > MOST_PLANTS:
-        raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
+        raise fail("robust.plants", f"names more than {MOST_PLANTS} plants; name the extreme ones")
 
 
 def with_structure(case: Case, structure: str) -> Case:

@@ -24,30 +24,30 @@ class MotorTable:
         "of the warm coil", None, check=one_or_more, unit="ohm"
     )
     peak_current: float | tuple[float, ...] | None = key(
-        "the largest for moments; absent: any", None, check=one_or_more, unit="A"
+        "largest short-time current; absent: no limit", None, check=one_or_more, unit="A"
     )
     moving_mass: float | tuple[float, ...] | None = key(
         "added to the plant where each force enters", None, check=one_or_more, unit="kg"
     )
     rms_power: float | None = key(
-        "heat of all motors together, mean of a cycle, at most", None, unit="W"
+        "largest heat of all motors together, mean over a cycle", None, unit="W"
     )
-    size: str = key("the [theta] that is the moving mass, of any or of a list", "")
+    size: str = key("name of the [theta] parameter that is the moving mass", "")
 
 
 @dataclass(frozen=True)
 class MoveTable:
     """[move]: a setpoint of third or fourth order, made over and over."""
 
-    distance: float | None = key("from rest to rest", None, unit="m")
-    velocity: float | None = key("at most", None, unit="m/s")
+    distance: float | None = key("length of the move, from rest to rest", None, unit="m")
+    velocity: float | None = key("largest", None, unit="m/s")
     acceleration: float | None = key(
         "of the move; absent: the largest that the motor allows", None, unit="m/s²"
     )
-    jerk: float | None = key("at most", None, unit="m/s³")
-    snap: float | None = key("at most; absent: jerk/sample", None, unit="m/s⁴")
-    settle_band: float | None = key("of the error, to either side", None, unit="m")
-    dwell: float = key("from a move to the next", 0.0, check=NOT_NEGATIVE, unit="s")
+    jerk: float | None = key("largest", None, unit="m/s³")
+    snap: float | None = key("largest; absent: jerk/sample", None, unit="m/s⁴")
+    settle_band: float | None = key("half width of the window of the error", None, unit="m")
+    dwell: float = key("pause between two moves", 0.0, check=NOT_NEGATIVE, unit="s")
 
 
 def check_motion(tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Fail) -> None:

@@ -20,8 +20,8 @@ KEYS: dict[str, tuple[Check, str]] = {
     "fixed": (ANY, "instead of bounds: its value, which is not searched"),
     "varies": (
         flag,
-        "with sections: true where it is not chosen but takes all values in between, as "
-        "a stroke does; `start` is the model",
+        "with sections: true: not chosen; the loop holds at every value, as along a stroke; "
+        "`start` is the model",
     ),
 }
 

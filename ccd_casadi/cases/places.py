@@ -18,6 +18,8 @@ def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
             raise fail(f"places.{name}", "is missing; add it")
     if (table.quiet or table.damped) and not table.axes:
         raise fail("places.axes", "is false, and quiet and damped modes are of axes; give true")
+    if table.reference and (table.axes or not table.sensors):
+        raise fail("places.reference", "needs sensors, and has no place beside axes; drop one")
     rows = table.nodes
     if isinstance(rows, str):
         try:
@@ -37,6 +39,6 @@ def places_of(table: PlacesTable) -> Places | None:
     if table == PlacesTable():
         return None
     values = {item.name: getattr(table, item.name) for item in fields(Places)}
-    for name in ("actuators", "sensors"):
+    for name in ("actuators", "sensors", "reference"):
         values[name] = tuple(map(tuple, values[name]))
     return Places(**values)

@@ -72,10 +72,13 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
 
 
 def _absolute(case: Path, name: str, key: str, fail: Fail) -> str:
-    """A file or folder that a case names, so that the resolved case means the same elsewhere."""
+    """A file or folder that a case names, so that the resolved case means the same elsewhere; of a
+    run folder that was copied the one beside the case."""
     with suppress(OSError, ValueError):
-        if (place := (case.parent / name).resolve()).exists():
-            return str(place)
+        given = Path(name)
+        for place in (given, given.name if given.is_absolute() else given):
+            if (found := (case.parent / place).resolve()).exists():
+                return str(found)
     raise fail(key, f"there is no {short_repr(name)}; give its path relative to the case file")
 
 

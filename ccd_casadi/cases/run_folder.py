@@ -43,7 +43,7 @@ from ccd_casadi.synthesis.weights import Weights
 if TYPE_CHECKING:
     import control
 
-SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is no further above it
+SHORTFALL = 1e-6  # relative: a stored bound is met when the norm now is no further above it
 
 
 @dataclass(frozen=True)
@@ -129,8 +129,11 @@ def _read_mixed(
     hz = [_number(path, result, key) for key in ("omega_S_hz", "omega_T_hz")]
     weights, plant = problem.weights.at(HZ * hz[0], HZ * hz[1]), scaled_plant(problem, theta)
     controller = _controller(folder / "controller.json", plant)
+    certificate = result.get("certificate")
+    bound = _number(path, certificate if isinstance(certificate, Mapping) else {}, "norm_bound")
     figures = measure(
-        plant, controller, weights, gamma=_number(path, result, "gamma") * (1.0 + SHORTFALL),
+        plant, controller, weights,
+        gamma=max(bound, _number(path, result, "gamma")) * (1.0 + SHORTFALL),
         omega_low=problem.inner.omega_low, gamma_opt=_number(path, result, "gamma_opt"),
         gamma_lower_bound=_number(path, result, "gamma_lower_bound"),
     )  # fmt: skip

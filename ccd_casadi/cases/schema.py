@@ -4,7 +4,7 @@ Both are made of the definitions that check a case (`tables`), so that they cann
 The schema lets more pass than the checks do: what hangs on several keys is left to them.
 """
 
-from collections.abc import Iterable, Mapping
+import json
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
@@ -14,105 +14,47 @@ from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.parameters import KEYS as THETA
 from ccd_casadi.cases.tables import REQUIRED, TABLES
+from ccd_casadi.cases.toml_writer import toml
 from ccd_casadi.plants.registry import model_names
-
-DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_PLANT = {
-    "model": 'a model of the package, or "measured": a frequency response; or give function',
-    "function": '"my_plant.py:model", relative to the case file: a Python function of θ',
-}
+from ccd_casadi.support.package_text import package_text, template
 
 
 def case_schema() -> dict[str, Any]:
     """The JSON Schema of a case file."""
-    tables: dict[str, Any] = {
-        "plant": {
-            "type": "object",
-            "description": "The plant; every other key goes to the model or function.",
-            "properties": {
-                "model": {
-                    "enum": sorted({*model_names(), MEASURED}), "description": _PLANT["model"],
-                },
-                "function": {
-                    "type": "string", "pattern": r".+\.py:\w+$", "description": _PLANT["function"],
-                },
-            },
-            "oneOf": [{"required": ["model"]}, {"required": ["function"]}],
-        },
-        "theta": {
-            "type": "object",
-            "description": "A table [theta.NAME] for each hardware parameter.",
-            "minProperties": 1,
-            "additionalProperties": {
-                "type": "object",
-                "properties": {
-                    key: {**check.schema, "description": says}
-                    for key, (check, says) in THETA.items()
-                },
-                "anyOf": [
-                    {"required": keys} for keys in (["lower", "upper"], ["values"], ["fixed"])
-                ],
-                "additionalProperties": False,
-            },
-        },
-    }  # fmt: skip
+    found: dict[str, Any] = json.loads(package_text("templates/case.schema.json"))
+    tables = found["properties"]
+    tables["plant"]["properties"]["model"]["enum"] = sorted({*model_names(), MEASURED})
+    tables["theta"]["additionalProperties"]["properties"] = {
+        key: {**check.schema, "description": says} for key, (check, says) in THETA.items()
+    }
     tables |= {name: _table(kind) for name, kind in TABLES.items()}
     channels = tables["controller"]["properties"]["channel"]
     channels["additionalProperties"] = _table(ChannelTable)
+    checks = {key: dict(check.schema) for key, check in TABLE_CHECKS.items()}
     for kind, units in UNITS.items():
         spectrum = {
             "type": "object",
-            "properties": {key: dict(check.schema) for key, check in TABLE_CHECKS.items()},
+            "properties": checks | {"unit": {"enum": list(units)}},
             "required": ["unit"],
             "additionalProperties": False,
         }
-        spectrum["properties"]["unit"] = {"enum": list(units)}  # type: ignore[index]
         entry = tables["budget"]["properties"][kind.value]
         entry["anyOf"] = [spectrum, {"type": "array", "items": spectrum}]
-    of_data = {"plant": {"properties": {"model": {"const": MEASURED}}, "required": ["model"]}}
-    return {
-        "$schema": DRAFT,
-        "title": "A case of ccd-casadi",
-        "type": "object",
-        "properties": tables,
-        "required": ["plant", "inner"],
-        "if": {"properties": of_data},
-        "else": {"required": ["theta", *REQUIRED]},  # what was measured has no θ to choose
-        "additionalProperties": False,
-    }
+    found["else"]["required"] += REQUIRED  # what was measured has no θ to choose
+    return found
 
 
 def keys_page() -> str:
     """Every key of a case file in tables, as Markdown."""
-    lines = [
-        "# Case file",
-        "",
-        "Every table and key, made by `ccd keys` from the definitions that check a case.",
-        "An unknown key is an error. `ccd schema` prints the same as JSON Schema, for an editor",
-        "that completes and checks TOML while you write: `ccd new` puts it beside its case.",
-        "",
-        "## [plant]",
-        "",
-        *_rows((key, "", "", says) for key, says in _PLANT.items()),
-        "",
-        "Every other key goes to the model or the function as a keyword.",
-        "",
-        "## [theta.NAME]",
-        "",
-        *_rows(
-            (key, "required" if key in ("lower", "upper") else "", "", says)
-            for key, (_, says) in THETA.items()
-        ),
-        "",
-        "With `values` or `fixed` no bounds are given; see [own plant](own_plant.md).",
-    ]
-    for name, kind in {**TABLES, "controller.channel.NAME": ChannelTable}.items():
-        lines += ["", f"## [{name}]", "", *_rows(map(_row, fields(kind)))]
-        if name == "budget":
-            lines += ["", "A spectrum is a table, or several in double brackets, with the keys "
-                      + ", ".join(f"`{key}`" for key in TABLE_CHECKS)
-                      + "; see [error budgets](error_budget.md)."]  # fmt: skip
-    return "\n".join(lines) + "\n"
+    required = ("lower", "upper")
+    theta = ((key, "required" * (key in required), "", says) for key, (_, says) in THETA.items())
+    kinds = {**TABLES, "controller.channel.NAME": ChannelTable}
+    plant = case_schema()["properties"]["plant"]["properties"]
+    return template("templates/keys.md").render(
+        plant=((key, "", "", own["description"]) for key, own in plant.items()), theta=theta,
+        tables={name: [_row(item) for item in fields(kind)] for name, kind in kinds.items()},
+        spectrum=TABLE_CHECKS,
+    )  # fmt: skip
 
 
 def _table(kind: type) -> dict[str, Any]:
@@ -135,30 +77,9 @@ def _required(item: Field[Any]) -> bool:
     return item.default is MISSING
 
 
-def _shown(default: Any) -> str:
-    if default is None or default == ():
-        return "absent"
-    if isinstance(default, tuple):
-        return str(list(default))
-    if isinstance(default, bool):
-        return str(default).lower()
-    return f'"{default}"' if isinstance(default, str) else str(default)
-
-
-def _values(schema: Mapping[str, Any]) -> str:
-    names = ", ".join(f'"{value}"' for value in schema.get("enum", ()))
-    return f" (one of {names})" if names else ""
-
-
 def _row(item: Field[Any]) -> tuple[str, str, str, str]:
-    default = "required" if _required(item) else _shown(item.default)
-    return item.name, default, unit_of(item), item.metadata["says"] + _values(check_of(item).schema)
-
-
-def _rows(rows: Iterable[tuple[str, str, str, str]]) -> list[str]:
-    head = ["| key | default | unit | meaning |", "|---|---|---|---|"]
-    # a bar in the words would end the cell
-    return head + [
-        f"| `{key}` | {default} | {unit} | {says.replace('|', chr(92) + '|')} |"
-        for key, default, unit, says in rows
-    ]
+    default = "absent" if item.default in (None, ()) else toml(item.default)
+    default = "required" if _required(item) else default
+    names = ", ".join(map(toml, check_of(item).schema.get("enum", ())))
+    says = item.metadata["says"] + (f" (one of {names})" if names else "")
+    return item.name, default, unit_of(item), says

@@ -5,9 +5,9 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from ccd_casadi.cases.checks import (
     ABOVE_ONE,
@@ -16,13 +16,15 @@ from ccd_casadi.cases.checks import (
     choice,
     count,
     factors,
-    files,
     interval,
     key,
+    names_of_theta,
     number,
     numbers_of_modes,
     places,
+    plant_options,
     points,
+    rows,
     signed,
     tables,
     text_or_rows,
@@ -172,7 +174,7 @@ class InnerTable:
         check=choice("bandwidth", "rms_error", "move_time"),
     )
     bandwidth_least_hz: float | None = key(
-        'with another minimise than "bandwidth": the bandwidth that is kept at least', None
+        'least bandwidth, where minimise is not "bandwidth"', None
     )
 
 
@@ -196,8 +198,8 @@ class RobustTable:
     middle, the controller is synthesised for; "auto" tries all three and keeps the best.
 
     With sections the box between these ends counts, searched for its worst plants, and besides:
-    `mode_shift` of each flexible mode on its own, `gain` of the whole plant, `plants`: TOML files
-    of plant options (loads, positions).
+    `mode_shift` of each flexible mode on its own, `gain` of the whole plant, `plants`: options of
+    other plants (loads, positions), in TOML files or tables; as tables once it is read.
     """
 
     resonance_shift: float = key(
@@ -222,8 +224,8 @@ class RobustTable:
         0.0,
         check=number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
     )
-    plants: tuple[str, ...] = key(
-        "sections: TOML files of plant options: other loads, positions, meshes", (), check=files
+    plants: tuple[Any, ...] = key(
+        "sections: options of other plants, in TOML files or tables", (), check=plant_options
     )
 
 
@@ -258,11 +260,23 @@ class PlacesTable:
         False,
     )
     quiet: tuple[int, ...] = key(
-        "with axes: flexible modes, from 1, which these leave alone", (), check=numbers_of_modes
+        "with axes: flexible modes, from 1, that these leave alone", (), check=numbers_of_modes
     )
     damped: tuple[int, ...] = key(
-        "with axes: flexible modes, from 1, each an axis of its own", (), check=numbers_of_modes
+        "with axes: flexible modes, from 1, each with its own axis", (), check=numbers_of_modes
     )
+    reference: tuple[tuple[float, ...], ...] = key(
+        "3 or (with twist) 4 points of a plane: inputs are loads, outputs displacements there",
+        (),
+        check=rows(2),
+        unit="m",
+    )
+    present: tuple[str, ...] = key(
+        "with either: a [theta] for each actuator, 1 where it is there, else 0",
+        (),
+        check=names_of_theta,
+    )
+    choose: int = key("how many of these are there at most", 0)
 
 
 @dataclass(frozen=True)
@@ -294,6 +308,7 @@ class Case(NotebookHtml):
     weights: WeightsTable
     inner: InnerTable
     suspension: SuspensionTable
+    places: PlacesTable
     robust: RobustTable
     controller: ControllerTable
     loop: LoopTable
@@ -304,26 +319,13 @@ class Case(NotebookHtml):
     limits: LimitsTable
     motor: MotorTable
     move: MoveTable
-    places: PlacesTable = field(default_factory=PlacesTable)
     fixed: tuple[Parameter, ...] = ()
 
 
 TABLES: dict[str, type] = {
-    "objective": ObjectiveTable,
-    "weights": WeightsTable,
-    "inner": InnerTable,
-    "suspension": SuspensionTable,
-    "places": PlacesTable,
-    "robust": RobustTable,
-    "controller": ControllerTable,
-    "loop": LoopTable,
-    "budget": BudgetTable,
-    "sampling": SamplingTable,
-    "outer": OuterTable,
-    "baseline": BaselineTable,
-    "limits": LimitsTable,
-    "motor": MotorTable,
-    "move": MoveTable,
+    name: kind
+    for name, kind in get_type_hints(Case).items()
+    if isinstance(kind, type) and is_dataclass(kind) and kind is not PlantTable
 }
 REQUIRED = tuple(  # tables with a key that has no default
     name for name, kind in TABLES.items() if MISSING in [item.default for item in fields(kind)]

@@ -28,21 +28,22 @@ def case_to_toml(case: Case) -> str:
 
 def _pairs(table: Mapping[str, Any]) -> list[str]:
     given = {key: value for key, value in table.items() if value is not None}
-    return [f"{_toml_key(key)} = {_toml(value)}" for key, value in given.items()]
+    return [f"{_toml_key(key)} = {toml(value)}" for key, value in given.items()]
 
 
 def _toml_key(key: str) -> str:
-    return key if re.fullmatch("[A-Za-z0-9_-]+", key) else _toml(key)
+    return key if re.fullmatch("[A-Za-z0-9_-]+", key) else toml(key)
 
 
-def _toml(value: Any) -> str:
+def toml(value: Any) -> str:
+    """A value as TOML writes it; tables in one line."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         escaped = "".join(_escape(letter) for letter in value)
         return f'"{escaped}"'
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
+        return "[" + ", ".join(map(toml, value)) + "]"
     if isinstance(value, Mapping):
         return "{" + ", ".join(_pairs(value)) + "}"
     return repr(value)

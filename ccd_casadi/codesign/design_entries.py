@@ -66,10 +66,7 @@ def mixed_dict(problem: CoDesignProblem, theta: Sequence[float], design: Design)
 def controller_dict(controller: StateSpace) -> dict[str, Any]:
     """controller.json: row-major lists, SI, input e = r - y, output u."""
     return {
-        "A": controller.A.tolist(),
-        "B": controller.B.tolist(),
-        "C": controller.C.tolist(),
-        "D": controller.D.tolist(),
+        **{name: getattr(controller, name).tolist() for name in "ABCD"},
         "input": "e = r - y",
         "output": "u",
         "units": "SI, time in s",

@@ -47,7 +47,7 @@ def widen(sampler: Sampler, x: Array) -> tuple[Array, float]:
             break
         share = min(1.0, held + step)
         narrower = replace(problem, robust=problem.robust.scaled(share))
-        found = polish(sampler.of(narrower, traced=share == 1.0), x)
+        found = polish(sampler.of(narrower, traced=share == 1.0).truth, x)
         if found.acceptable:
             x, held, step = found.x, share, 2.0 * step
         else:

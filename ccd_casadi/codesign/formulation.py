@@ -1,11 +1,16 @@
 """What a formulation leaves behind: its iterates, its surrogate, and the design it ends with."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.sampling.samples import QuantitySample
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.sampling.samples import InnerSample, QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
 
@@ -28,6 +33,16 @@ class Iterate:
     radius: float
 
 
+def iterate_of(
+    problem: CoDesignProblem, theta: tuple[float, ...], predicted: float, truth: float,
+    *, error: float, step: float, radius: float = 1.0,
+) -> Iterate:  # fmt: skip
+    """A round with J as it was promised and as it is, infinite where there is no true value."""
+    promised, J = (objective(problem, theta, value) for value in (predicted, truth))
+    J = J if np.isfinite(truth) else np.inf
+    return Iterate(theta, predicted, truth, promised, J, error, step, radius)
+
+
 @dataclass(frozen=True)
 class FormulationResult:
     """x = (θ, ln ω_S, ln ω_T) of the best verified design (None: infeasible) and the way there.
@@ -44,12 +59,8 @@ class FormulationResult:
     message: str = ""
 
 
-@dataclass(frozen=True)
-class KnownSamples:
-    """What a formulation may begin with in place of its own plan: θ (n, n_θ), designs there."""
-
-    thetas: Array
-    samples: tuple[QuantitySample, ...]
+# What a formulation may begin with in place of its own plan: samples at θ, or at (θ, ω_S, ω_T).
+KnownSamples = Sequence[InnerSample | QuantitySample]
 
 
 @dataclass(frozen=True)

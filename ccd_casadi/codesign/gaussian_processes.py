@@ -109,7 +109,7 @@ def recommendation(qualities: Sequence[Quality]) -> str:
             "is not."
             if len(qualities) == 1
             else "The larger of two local peaks is kinked where they are equal; the rounds refit "
-            "by the design, where one of them is the larger."
+            "near the design, where one of them is the larger."
         )
     beyond = [q.name.replace("_", " ") for q in qualities if q.extrapolates]
     if beyond:

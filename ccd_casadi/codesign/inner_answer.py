@@ -106,10 +106,24 @@ def mixed_answer(
         point = (found.optimum.figures.omega_S, found.optimum.figures.omega_T)
     if problem.robust is not None:
         head["design_at"] = problem.robust.design_at
-    certified, figures, controller = _design(problem, theta, point)
-    figures = head | figures | {"syntheses": syntheses}
-    figures["objective"] = objective(problem, theta, HZ * (figures["bandwidth_hz"] or 0.0))
-    return InnerAnswer("verified" if certified else "not_verified", figures, controller, rows)
+    plant, made = scaled_plant(problem, theta), final_design(problem, theta, point)
+    feasible = problem.inner.feasible(made.figures)
+    answer = head | {
+        **json_values(mixed_dict(problem, theta, made)),
+        "active": list(active_constraints(problem.inner, made.figures)) if feasible else [],
+        "feasible": feasible,
+        "local_peaks": [
+            {"hz": hz, "sensitivity": gain}
+            for hz, gain in peaks_of(Loop(plant.plant_si(), made.controller))
+        ],
+        "natural_hz": [float(omega) / HZ for omega in plant.natural],
+        **budget_entry(problem, theta, made.controller),
+        **move_entry(problem, theta, made.controller),
+        "syntheses": syntheses,
+        "objective": objective(problem, theta, np.nan_to_num(made.figures.bandwidth)),
+    }
+    status = "verified" if made.figures.certified else "not_verified"
+    return InnerAnswer(status, answer, controller_dict(made.controller), rows)
 
 
 def _best_at(
@@ -121,29 +135,6 @@ def _best_at(
         return float(np.nan_to_num(true_design(choice, theta, *point).values[1], nan=np.inf))
 
     return min(design_choices(problem), key=peak)
-
-
-def _design(
-    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float]
-) -> tuple[bool, dict[str, Any], dict[str, Any]]:
-    """Whether the synthesis is certified, its figures, and controller.json."""
-    plant = scaled_plant(problem, theta)
-    made = final_design(problem, theta, point)
-    figures = made.figures
-    feasible = problem.inner.feasible(figures)
-    answer = {
-        **json_values(mixed_dict(problem, theta, made)),
-        "active": list(active_constraints(problem.inner, figures)) if feasible else [],
-        "feasible": feasible,
-        "local_peaks": [
-            {"hz": hz, "sensitivity": gain}
-            for hz, gain in peaks_of(Loop(plant.plant_si(), made.controller))
-        ],
-        "natural_hz": [float(omega) / HZ for omega in plant.natural],
-        **budget_entry(problem, theta, made.controller),
-        **move_entry(problem, theta, made.controller),
-    }
-    return figures.certified, answer, controller_dict(made.controller)
 
 
 def measured_answer(

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.kkt import INSIDE, first_order
+from ccd_casadi.codesign.kkt import INSIDE, TrueDesign, first_order
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import SAME_PEAK, other_peaks
-from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.quadratic import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, minimise
@@ -51,8 +49,7 @@ class _Design:
 
 
 def descend(
-    problem: CoDesignProblem,
-    quantities: TrueQuantities,
+    truth: TrueQuantities,
     x: Array,
     *,
     steps: int = 30,
@@ -64,7 +61,7 @@ def descend(
     At most `steps` designs are asked for; none more once it is in the basin of an optimum (x, J)
     where others `ended`. Returns the start where it is not certified.
     """
-    model = _Peaks(problem, quantities, ended)
+    model = _Peaks(truth, ended)
     here = model.at((x - model.lower) / model.width)
     if here is None or model.ended(here, here):
         return x
@@ -81,14 +78,9 @@ class _Peaks(Model[_Design]):
 
     growing = True
 
-    def __init__(
-        self,
-        problem: CoDesignProblem,
-        quantities: TrueQuantities,
-        known: Sequence[tuple[Array, float]],
-    ) -> None:
-        self.problem, self.quantities = problem, quantities
-        self.lower, upper = lifted_bounds(problem)
+    def __init__(self, truth: TrueQuantities, known: Sequence[tuple[Array, float]]) -> None:
+        self.truth = truth
+        self.lower, upper = lifted_bounds(truth.problem)
         self.width = upper - self.lower
         self.low, self.high = np.zeros(len(upper)), np.ones(len(upper))
         self.known = [((at - self.lower) / self.width, J) for at, J in known]
@@ -97,19 +89,17 @@ class _Peaks(Model[_Design]):
     def at(self, x: Array) -> Iterate[_Design] | None:
         """A certified design with ∇J, its constraints and its peaks."""
         z = np.clip(x, 0.0, 1.0)
-        where = self.lower + self.width * z
-        made = self.quantities.at(where)
-        problem = self.problem
+        there = TrueDesign(self.truth, self.lower + self.width * z)
+        made = there.design
         if not made.figures.certified or made.made is None:
             return None
-        peaks = other_peaks(problem, where, made, BAND)
-        rows = first_order(problem, where, made, peaks, INSIDE)
+        peaks = other_peaks(there.problem, there.x, made, BAND)
+        rows = first_order(there, peaks, INSIDE)
         place = float(np.log(made.figures.sensitivity_peak_frequency))
         others = [(name, 0.0, 0) for name in rows.names[1 : len(rows.names) - len(peaks)]]
         tags = (("peak", place, made.made.worst), *others, *(peak.tag for peak in peaks))
-        J = objective(problem, where[: len(problem.names)], made.figures.bandwidth)
-        violation = max(0.0, float(rows.g.max()))
-        return Iterate(z, J, rows.gradient, violation, _Design(rows.g, rows.jacobian, tags))
+        data, violation = _Design(rows.g, rows.jacobian, tags), max(0.0, float(rows.g.max()))
+        return Iterate(z, there.objective, rows.gradient, violation, data)
 
     def rows(self, here: Iterate[_Design], radius: float) -> Rows:
         """Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong."""

@@ -18,14 +18,21 @@ J is good to some 1e-9 of its terms, so that a method which watches it fall ends
 of its gradient is 1e-6; the gradients themselves are good to 1e-10.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import null_space
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import PeakConstraint, other_peaks
-from ccd_casadi.inner_problem.objective import constraint_sizes, hardware_at
+from ccd_casadi.inner_problem.objective import (
+    constraint_sizes,
+    hardware_at,
+    objective_terms,
+    violated,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import (
@@ -42,62 +49,98 @@ from ccd_casadi.synthesis.derivatives import Sensitivities
 
 INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is feasible as given
 SMOOTH = 1e-6  # residual up to which nothing speaks of a kink
+LEVEL = 1e-8  # of the terms of J, which may cancel: what ω_b is good to
 NEAR = 1e-3  # of the box: a longer step is not of the basin that the residual spoke of
 
 
-def kkt_certificate(
-    problem: CoDesignProblem,
-    x: Array,
-    design: Sensitivities,
-    true_at: Callable[[Array], Sensitivities] | None = None,
-) -> KktCertificate:
-    """First-order residuals at x; the second-order check too where `true_at` may synthesise."""
-    plain = _certificate(problem, x, active_at(problem, x, design), true_at)
+@dataclass(frozen=True)
+class TrueDesign:
+    """The true design at x = (θ, ln ω_S, ln ω_T), and by what it is held against others."""
+
+    truth: TrueQuantities
+    x: Array
+
+    @property
+    def problem(self) -> CoDesignProblem:
+        """Whose design it is."""
+        return self.truth.problem
+
+    @property
+    def design(self) -> Sensitivities:
+        """The synthesis with its derivatives."""
+        return self.truth.at(self.x)
+
+    @property
+    def theta(self) -> Array:
+        """θ of x."""
+        return self.x[: len(self.problem.names)]
+
+    @property
+    def acceptable(self) -> bool:
+        """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
+        met = self.problem.inner.feasible(self.design.figures)
+        return met and not violated(self.problem, self.theta)
+
+    @cached_property
+    def terms(self) -> tuple[float, float]:
+        """Those of J."""
+        return objective_terms(self.problem, self.theta, self.design.figures.bandwidth)
+
+    @property
+    def objective(self) -> float:
+        """J."""
+        return sum(self.terms)
+
+    @cached_property
+    def kkt(self) -> KktCertificate:
+        """Its first-order certificate."""
+        return kkt_certificate(self)
+
+    @property
+    def residual(self) -> float:
+        """Of the optimality conditions, scaled."""
+        return max(self.kkt.stationarity, self.kkt.complementarity)
+
+    def rise(self, other: "TrueDesign") -> float:
+        """By how much another J is larger, over what J may differ by and still be the same."""
+        return (other.objective - self.objective) / (LEVEL * sum(map(abs, self.terms)))
+
+
+def kkt_certificate(here: TrueDesign, second: bool = False) -> KktCertificate:
+    """First-order residuals; the second-order check too where `second` lets it synthesise."""
+    plain = _certificate(here, active_at(here), second)
     if plain.stationarity <= SMOOTH:
         return plain
-    others = other_peaks(problem, x, design, ACTIVE)
+    others = other_peaks(here.problem, here.x, here.design, ACTIVE)
     if not others:  # with them a difference of gradients would mix one peak with another
         return plain
-    return _certificate(problem, x, active_at(problem, x, design, others), None)
+    return _certificate(here, active_at(here, others), False)
 
 
-def active_at(
-    problem: CoDesignProblem,
-    x: Array,
-    design: Sensitivities,
-    others: tuple[PeakConstraint, ...] = (),
-) -> ActiveSet:
-    """The active constraints and bounds at x, with `others` besides the problem's own."""
-    lower, upper = lifted_bounds(problem)
-    here = first_order(problem, x, design, others)
-    return active_set((x - lower) / (upper - lower), here, (*problem.names, "omega_S", "omega_T"))
+def active_at(here: TrueDesign, others: tuple[PeakConstraint, ...] = ()) -> ActiveSet:
+    """The active constraints and bounds, with `others` besides the problem's own."""
+    lower, upper = lifted_bounds(here.problem)
+    variables = (*here.problem.names, "omega_S", "omega_T")
+    return active_set((here.x - lower) / (upper - lower), first_order(here, others), variables)
 
 
-def _certificate(
-    problem: CoDesignProblem,
-    x: Array,
-    at: ActiveSet,
-    true_at: Callable[[Array], Sensitivities] | None,
-) -> KktCertificate:
+def _certificate(here: TrueDesign, at: ActiveSet, second: bool) -> KktCertificate:
     mu = at.multipliers()
     Z = at.free(mu)
     found = at.certificate(mu, at.residual(mu), np.inf if Z.shape[1] == 0 else None)
-    if found.second_order is not None or true_at is None:
+    if found.second_order is not None or not second:
         return found
-    columns = lagrangian_hessian(problem, x, Z, found.multipliers, true_at)
+    columns = lagrangian_hessian(here, Z, found.multipliers)
     return at.certificate(mu, found.stationarity, reduced_curvature(Z, columns, at.size))
 
 
 def first_order(
-    problem: CoDesignProblem,
-    x: Array,
-    design: Sensitivities,
-    others: tuple[PeakConstraint, ...] = (),
-    inside: float = 0.0,
+    here: TrueDesign, others: tuple[PeakConstraint, ...] = (), inside: float = 0.0
 ) -> FirstOrder:
-    """J, the bounds on the loop (ln, `inside` tighter), λ, and `others` like the bounds, at x."""
-    count, (lower, upper) = len(problem.names), lifted_bounds(problem)
-    own, sizes = hardware_at(problem, x[:count]), constraint_sizes(problem)
+    """J, the bounds on the loop (ln, `inside` tighter), λ, and `others` like the bounds."""
+    problem, design, count = here.problem, here.design, len(here.problem.names)
+    lower, upper = lifted_bounds(problem)
+    own, sizes = hardware_at(problem, here.theta), constraint_sizes(problem)
     total = np.hstack([design.to_theta, design.to_break_frequencies]) * (upper - lower)
     gradient = problem.w2 * total[0]
     gradient[:count] += own.cost_gradient
@@ -114,58 +157,51 @@ def first_order(
 
 
 def lagrangian_hessian(
-    problem: CoDesignProblem,
-    x: Array,
-    directions: Array,
-    multipliers: Mapping[str, float],
-    true_at: Callable[[Array], Sensitivities],
+    here: TrueDesign, directions: Array, multipliers: Mapping[str, float]
 ) -> Array | None:
     """∇²L Z (n, k) by differences of true gradients, unit-box variables; None where not certified.
 
     `multipliers` by the certificate's names.
     """
-    lower, upper = lifted_bounds(problem)
+    lower, upper = lifted_bounds(here.problem)
     width = upper - lower
 
     def slope(z: Array) -> Array | None:
-        at = lower + width * z
-        design = true_at(at)
-        if not design.figures.certified:
+        there = TrueDesign(here.truth, lower + width * z)
+        if not there.design.figures.certified:
             return None
-        here = first_order(problem, at, design)
-        mu = np.array([multipliers.get(name, 0.0) for name in here.names]) * here.sizes
-        return here.gradient + mu @ here.jacobian
+        found = first_order(there)
+        mu = np.array([multipliers.get(name, 0.0) for name in found.names]) * found.sizes
+        return found.gradient + mu @ found.jacobian
 
-    return hessian_products(slope, (x - lower) / width, directions)
+    return hessian_products(slope, (here.x - lower) / width, directions)
 
 
-def newton_step(
-    problem: CoDesignProblem, quantities: TrueQuantities, x: Array, kkt: KktCertificate
-) -> Array | None:
-    """Where the step from x ends; None without a positive reduced Hessian, or past `NEAR`.
+def newton_step(here: TrueDesign) -> Array | None:
+    """Where the step ends; None without a positive reduced Hessian, or past `NEAR`.
 
-    x = (θ, ln ω_S, ln ω_T) with its certificate `kkt` of the plain conditions. The Hessian takes
-    two true designs per free direction. Nocedal and Wright, Numerical Optimization, 18.1.
+    From a design whose certificate is of the plain conditions. The Hessian takes two true designs
+    per free direction. Nocedal and Wright, Numerical Optimization, 18.1.
     """
-    here = active_at(problem, x, quantities.at(x))
-    held = np.array([kkt.multipliers[name] > 0.0 for name in here.labels], bool)
-    A = here.rows[held]
-    inside = np.array([INSIDE * (name in problem.inner.bounds) for name in here.labels])
-    aim = np.where(np.arange(held.size) < here.constraints, -(here.slack + inside), 0.0)[held]
+    problem, mu, at = here.problem, here.kkt.multipliers, active_at(here)
+    held = np.array([mu[name] > 0.0 for name in at.labels], bool)
+    A = at.rows[held]
+    inside = np.array([INSIDE * (name in problem.inner.bounds) for name in at.labels])
+    aim = np.where(np.arange(held.size) < at.constraints, -(at.slack + inside), 0.0)[held]
     Z = null_space(A)
     if Z.shape[1] == 0:  # a vertex
         return None
-    columns = lagrangian_hessian(problem, x, Z, kkt.multipliers, quantities.at)
+    columns = lagrangian_hessian(here, Z, mu)
     if columns is None:
         return None
     H = Z.T @ columns
     H = 0.5 * (H + H.T)
     if np.linalg.eigvalsh(H).min() <= 0.0:
         return None
-    d = -Z @ np.linalg.solve(H, Z.T @ here.gradient)
+    d = -Z @ np.linalg.solve(H, Z.T @ at.gradient)
     if A.size:
         d = d + np.linalg.lstsq(A, aim, rcond=None)[0]
     if np.abs(d).max() > NEAR:
         return None
     lower, upper = lifted_bounds(problem)
-    return np.clip(x + (upper - lower) * d, lower, upper)
+    return np.clip(here.x + (upper - lower) * d, lower, upper)

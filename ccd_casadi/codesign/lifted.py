@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -22,7 +22,6 @@ from ccd_casadi.inner_problem.objective import constraint_shares, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import QuantitySample
-from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
 
 STEP = 1e-4  # share of the box below which a step counts as small
@@ -72,7 +71,7 @@ def solve_lifted(
         X = design("sobol", lower, upper, points, seed)
         samples = [s for s in sampler.quantities(X) if s.certified]
     else:
-        samples = list(given.samples)
+        samples = [sample for sample in given if isinstance(sample, QuantitySample)]
     if len(samples) < len(lower) + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)
@@ -101,7 +100,14 @@ def solve_lifted(
         predicted = np.array([float(process.predict(x[None, :])[0]) for process in processes])
         with sampler.spent.on("rounds"):
             sample = sampler.quantities(x, f"verifying round {round_number + 1}")[0]
-        iterate = _iterate(problem, incumbent, sample, predicted)
+        away = np.inf if incumbent is None else x - incumbent.x
+        errors = np.abs(sample.values[:-1] - predicted)  # of ω_b relative, of ln of the bounded
+        errors[0] /= sample.values[0]
+        iterate = iterate_of(
+            problem, sample.x[: len(problem.names)], float(predicted[0]), float(sample.values[0]),
+            error=float(errors.max()) if sample.certified else np.inf,
+            step=float(np.abs(away / (upper - lower)).max()),
+        )  # fmt: skip
         iterates.append(iterate)
         settled = incumbent is not None and abs(
             iterate.objective - _objective(problem, incumbent)
@@ -181,25 +187,3 @@ def _better(
         return max(0.0, _violation(problem, s) - FEASIBLE), _objective(problem, s)
 
     return min(incumbent, sample, key=rank)
-
-
-def _iterate(
-    problem: CoDesignProblem,
-    incumbent: QuantitySample | None,
-    sample: QuantitySample,
-    predicted: Array,
-) -> Iterate:
-    """Error: the largest of ω_b (relative) and of ln of the bounded figures (absolute)."""
-    lower, upper = lifted_bounds(problem)
-    theta = sample.x[: len(problem.names)]
-    error = np.inf
-    if sample.certified:
-        errors = np.abs(sample.values[:-1] - predicted)
-        errors[0] /= sample.values[0]
-        error = float(errors.max())
-    step = np.inf
-    if incumbent is not None:
-        step = float(np.abs((np.array(sample.x) - incumbent.x) / (upper - lower)).max())
-    promised, truth = float(predicted[0]), float(sample.values[0])
-    objectives = objective(problem, theta, promised), objective(problem, theta, truth)
-    return Iterate(theta, promised, truth, *objectives, error, step, 1.0)

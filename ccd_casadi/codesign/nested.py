@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -75,14 +75,11 @@ def solve_nested(
         plan = design(options.plan, lower, upper, options.points, seed)
         thetas = _allowed(problem, np.unique(np.vstack([plan, problem.start]), axis=0))
     else:
-        thetas = given.thetas
+        thetas = np.array([sample.x[: len(lower)] for sample in given])
     samples = sampler.values(thetas)
     if not any(sample.feasible for sample in samples):
         return FormulationResult(message="no sampled theta is feasible")
     iterates: list[Iterate] = []
-
-    def value_of(sample: InnerSample) -> float:
-        return objective(problem, sample.theta, sample.value)
 
     def refine(number: int) -> None:
         """True inner problems spread over the region around the best θ."""
@@ -116,10 +113,13 @@ def solve_nested(
         predicted = float(surrogate.predict(theta[None, :])[0])
         with sampler.spent.on("rounds"):
             sample = sampler.values(theta, f"verifying round {round_number + 1}")[0]
-        iterate = _iterate(problem, best, sample, predicted, radius)
+        error = float(abs(predicted / sample.value - 1.0)) if sample.feasible else np.inf
+        step = float(np.abs((theta - best.theta) / (upper - lower)).max())
+        figures = {"error": error, "step": step, "radius": radius}
+        iterate = iterate_of(problem, sample.theta, predicted, sample.value, **figures)
         iterates.append(iterate)
         samples.append(sample)
-        change = iterate.objective - value_of(best)
+        change = iterate.objective - objective(problem, best.theta, best.value)
         improved = change < 0.0
         agreed = iterate.error <= options.tolerance
         settled = abs(change) <= options.tolerance * abs(iterate.objective)
@@ -210,19 +210,3 @@ def _starts(
     top = sorted(inside, key=lambda s: problem.w2 * s.value)[: max(1, count // 4)]
     spread = design("sobol", low, high, max(count - len(top), 1), seed)
     return np.vstack([np.array([s.theta for s in top]).reshape(-1, len(low)), spread])
-
-
-def _iterate(
-    problem: CoDesignProblem,
-    best: InnerSample,
-    sample: InnerSample,
-    predicted: float,
-    radius: float,
-) -> Iterate:
-    lower, upper = box(problem)
-    promised, J, error = objective(problem, sample.theta, predicted), np.inf, np.inf
-    if sample.feasible:
-        J = objective(problem, sample.theta, sample.value)
-        error = float(abs(predicted / sample.value - 1.0))
-    step = float(np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max())
-    return Iterate(sample.theta, predicted, sample.value, promised, J, error, step, radius)

@@ -16,7 +16,7 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
@@ -110,19 +110,21 @@ class Outer(ABC):
     def solve_formulation(
         self, formulation: Formulation, seed: int, given: KnownSamples | None = None
     ) -> FormulationResult:
-        """One formulation, from the samples that are given where there are any."""
+        """One formulation, from the samples that are given where there are any.
+
+        Lifted over θ alone is nested: what is lifted are the exact gradients.
+        """
         if isinstance(formulation, Direct):
             with self.sampler.spent.on("search"):
                 return self.solve_on_truth(formulation.starts, seed)
-        if isinstance(formulation, Nested):
-            return solve_nested(self.sampler, formulation, seed=seed, given=given)
-        return self.solve_lifted(formulation, seed, given)
-
-    @abstractmethod
-    def solve_lifted(
-        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
-    ) -> FormulationResult:
-        """The lifted formulation, from the samples that are given where there are any."""
+        lifted = isinstance(formulation, Lifted)
+        if isinstance(formulation, Lifted):
+            if self.extra_variables:
+                return solve_lifted(self.sampler, formulation, seed=seed, given=given)
+            points = formulation.points or 6 * len(self.problem.names)
+            options = {key: value for key, value in vars(formulation).items() if key != "points"}
+            formulation = Nested("sobol", points, **options)
+        return solve_nested(self.sampler, formulation, seed=seed, given=given, gradients=lifted)
 
     def solve_on_truth(self, starts: int, seed: int) -> FormulationResult:
         """The direct formulation: local solves from the case's start and a Sobol set beside it.

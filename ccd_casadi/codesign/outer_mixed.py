@@ -5,19 +5,17 @@ x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import cast
 
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
-from ccd_casadi.codesign.direct import TrueDesign, polish
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
+from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import SETTLED, descend
-from ccd_casadi.codesign.kkt import kkt_certificate
-from ccd_casadi.codesign.lifted import Lifted, solve_lifted
+from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
@@ -34,20 +32,12 @@ from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design
 from surrogates import design
 
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
 BASIN = 1e-4  # residual of an end whose basin is not searched again
-
-
-@dataclass(frozen=True)
-class MixedEnd(End):
-    """With the synthesis there and its derivatives."""
-
-    design: Sensitivities
 
 
 class MixedOuter(Outer):
@@ -59,11 +49,6 @@ class MixedOuter(Outer):
     @property
     def bounds(self) -> tuple[Array, Array]:
         return lifted_bounds(self.problem)
-
-    def solve_lifted(
-        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
-    ) -> FormulationResult:
-        return solve_lifted(self.sampler, formulation, seed=seed, given=given)
 
     def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """The true inner problem at a few θ tells an infeasible case from a formulation that
@@ -80,7 +65,7 @@ class MixedOuter(Outer):
         best = max(feasible, key=lambda sample: sample.bandwidth)
         return replace(outcome, x=best.joint, agreed=False)
 
-    def polished(self, x: Array) -> MixedEnd:
+    def polished(self, x: Array) -> End:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
         problem, sampler, truth = self.problem, self.sampler, self.sampler.truth
         lower, upper = lifted_bounds(problem)
@@ -89,12 +74,12 @@ class MixedOuter(Outer):
             before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
             with polishing as progress, sampler.spent.on("polish"):
-                end = polish(sampler, x)
+                end = polish(truth, x)
                 progress.advance()
             sampler.report(before)
             at_bounds = np.where(end.x - lower <= width, lower, end.x)
             at_bounds = np.where(upper - end.x <= width, upper, at_bounds)
-            onto = TrueDesign(problem, at_bounds, truth.at(at_bounds))
+            onto = TrueDesign(truth, at_bounds)
             end = onto if onto.acceptable else end
             with sampler.spent.on("checks"):
                 inner = sampler.values(end.theta, "verifying")[0]
@@ -104,7 +89,7 @@ class MixedOuter(Outer):
                 break
             x = inner.joint
         J = end.objective if end.acceptable else np.inf
-        return MixedEnd(end.x, bandwidth, J, end.kkt, float(gap), end.design)
+        return End(end.x, bandwidth, J, end.kkt, float(gap))
 
     def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
         if inputs < end.x.size:
@@ -115,14 +100,14 @@ class MixedOuter(Outer):
     def local_solve(
         self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
-        problem, truth = self.problem, self.sampler.truth
+        truth = self.sampler.truth
         # where no design is feasible it goes from the middle of the weights' frequencies
         begin = np.where(np.isfinite(sample.joint), sample.joint, np.mean(self.bounds, axis=0))
         basins = [(place.x, place.objective) for place in known if place.stationary]
         settled = SETTLED if settled is None else settled
-        end = descend(problem, truth, begin, ended=basins, settled=settled)
+        end = descend(truth, begin, ended=basins, settled=settled)
         for x in (end, begin):
-            made = TrueDesign(problem, x, truth.at(x))
+            made = TrueDesign(truth, x)
             if made.acceptable:
                 return Place(x, made.objective, made.kkt.stationarity <= BASIN)
         return None
@@ -131,10 +116,10 @@ class MixedOuter(Outer):
         return failure_words(self.sampler, solution, share)
 
     def verified(self, end: End, rounds: int) -> VerifiedDesign:
-        end = cast(MixedEnd, end)
         problem, sampler, x = self.problem, self.sampler, end.x
+        here = TrueDesign(sampler.truth, x)
         theta = tuple(float(v) for v in self.theta_of(x))
-        figures = end.design.figures
+        figures = here.design.figures
         make = partial(final_design, problem, theta, (figures.omega_S, figures.omega_T))
         final = sampler.cached("final", tuple(x), Design, make)
         free = replace(problem, suspension=Suspension(0.0, 0.0))
@@ -154,9 +139,9 @@ class MixedOuter(Outer):
             value=final.figures.bandwidth,
             objective=objective(problem, theta, final.figures.bandwidth),
             hardware_cost=hardware_cost(plant_of(problem), theta),
-            kkt=kkt_certificate(problem, x, end.design, sampler.truth.at),
+            kkt=kkt_certificate(here, second=True),
             inner_gap=end.gap,
-            feasible=final.figures.certified and TrueDesign(problem, x, end.design).acceptable,
+            feasible=final.figures.certified and here.acceptable,
             unsuspended=unsuspended,
             references=check_references(problem, theta, final, sampler.workers, sampler.quiet),
             robust=robust,

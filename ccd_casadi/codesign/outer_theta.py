@@ -12,9 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
-from ccd_casadi.codesign.lifted import Lifted
-from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
@@ -40,16 +38,6 @@ class ThetaOuter(Outer, ABC):
     @property
     def global_check_is_cheap(self) -> bool:
         return False
-
-    def solve_lifted(
-        self, formulation: Lifted, seed: int, given: KnownSamples | None = None
-    ) -> FormulationResult:
-        """Nested; what is lifted are the exact gradients, as x is θ."""
-        options = Nested(
-            "sobol", formulation.points or 6 * len(self.problem.names), formulation.starts,
-            formulation.tolerance, formulation.max_refinements, formulation.kernel,
-        )  # fmt: skip
-        return solve_nested(self.sampler, options, seed=seed, given=given, gradients=True)
 
     def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """None: what falls short at the nearest θ, in words."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import null_space
 
-from ccd_casadi.codesign.kkt import active_at, kkt_certificate, lagrangian_hessian
+from ccd_casadi.codesign.kkt import TrueDesign, active_at, lagrangian_hessian
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.codesign.theta_kkt import active_theta, theta_kkt
@@ -34,7 +34,6 @@ from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.synthesis.derivatives import Sensitivities
 
 WEAK = 1e-6  # a multiplier below this share of ‖∇J‖∞ holds nothing
 
@@ -87,31 +86,26 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
 
     Costs 2n true syntheses for n variables, none where the constraints alone determine x.
     """
-    quantities, n = TrueQuantities(problem), x.size
-    design = quantities.at(x)
-    kkt = kkt_certificate(problem, x, design)
-    here = active_at(problem, x, design)
-    kinked = not set(_strong(kkt)) <= set(here.labels)
+    here, n = TrueDesign(TrueQuantities(problem), x), x.size
+    design, kkt, active = here.design, here.kkt, active_at(here)
+    kinked = not set(_strong(kkt)) <= set(active.labels)
     if kinked:  # where local peaks are equal, each is a constraint
-        here = active_at(problem, x, design, other_peaks(problem, x, design, ACTIVE))
+        active = active_at(here, other_peaks(problem, x, design, ACTIVE))
 
     def hessian() -> Array | None:
         if kinked:
             return None  # the second derivatives of each peak are not known
-        with Progress(2 * n, "second derivatives", quiet=quiet) as progress:
-
-            def at(point: Array) -> Sensitivities:
-                progress.advance()
-                return quantities.at(point)
-
-            return lagrangian_hessian(problem, x, np.eye(n), kkt.multipliers, at)
+        with Progress(1, f"{2 * n} second derivatives", quiet=quiet) as progress:
+            found = lagrangian_hessian(here, np.eye(n), kkt.multipliers)
+            progress.advance()
+        return found
 
     lower, upper = lifted_bounds(problem)
     slope = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * (upper - lower)
     bounds = [_Parameter(name, bound, np.zeros(n), {name: -1.0 / bound})
               for name, (_, bound) in problem.inner.bounds.items()]  # fmt: skip
     known = _Parameter("w2", problem.w2, slope, cost=float(design.values[0]))
-    return _responses(problem, x, (lower, upper), kkt, here, hessian, [known, *bounds], slope)
+    return _responses(problem, x, (lower, upper), kkt, active, hessian, [known, *bounds], slope)
 
 
 def structured_responses(

@@ -6,7 +6,7 @@ itself said of it (`at_solve`), so that a command may be given again.
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -16,19 +16,9 @@ from ccd_casadi.codesign.design_entries import budget_entry, move_entry
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.codesign.verdict import (
-    State,
-    Verdict,
-    VerdictLine,
-    deployable,
-    optimal,
-    predicted,
-    reason,
-    verdict_dict,
-)
+from ccd_casadi.codesign.verdict import State, VerdictLine, deployable, optimal, predicted
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values, write_json
@@ -48,13 +38,27 @@ def result_dict(
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     problem, tolerance = verified.problem, terms.tolerance
-    plant = plant_of(problem)
     promised = predicted_value(outcome, verified.point, verified.value)
     error = abs(promised / verified.value - 1.0)
-    verdict = verdict_of(outcome, verified, tolerance, error, quality, look)
+    known = verified.searched(outcome, look)
+    verdict = {  # in the order in which they matter
+        "certified": verified.certified_line(),
+        "optimal": optimal_line(verified, tolerance, verified.inner_gap, known),
+        "predicted": predicted(
+            error=error,
+            tolerance=tolerance,
+            value=verified.value,
+            left_out=quality[0].at_point if quality else None,
+            extrapolates=quality[0].extrapolates if quality else (),
+            surrogate=bool(outcome.surrogates),
+            of=problem.figure,
+        ),
+        "survives": verified.survives_line(),
+        "deployable": deployable(verified.survival, problem.sampling),
+    }
     evidence = verified.evidence(promised)
     held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}
-    stationary = optimal_line(outcome, verified, tolerance, look, gap=0.0)
+    stationary = optimal_line(verified, tolerance, 0.0, known)
     checks = {
         "certificate": verified.certified,
         "constraints": verified.feasible,
@@ -64,13 +68,14 @@ def result_dict(
         **verified.checks(),
     }
     failed = [name for name, passed in checks.items() if not passed]
-    why = f"failed: {', '.join(failed)} ({reason(verdict)})"
+    lost = [f"{name}: {line.words}" for name, line in verdict.items() if line.state is State.FAILED]
+    why = f"failed: {', '.join(failed)} ({'; '.join(lost)})"
     words = "; ".join(part for part in (why, outcome.message) if part) if failed else ""
     result = {
         **verified.figures(),
         "status": "not_verified" if failed else "verified",
         "reason": words,
-        "verdict": verdict_dict(verdict),
+        "verdict": {name: line.entry for name, line in verdict.items()},
         "formulation": terms.formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": problem.parameter_units,
@@ -83,11 +88,12 @@ def result_dict(
         "checks": checks,
         "active": list(verified.active),
         "inner_gap": verified.inner_gap,
-        "kkt": kkt_dict(verified.kkt),
-        "globality": globality_dict(outcome.outer),
+        # a vertex has no second-order figure, and says so
+        "kkt": {**vars(verified.kkt), "vertex": verified.kkt.second_order == math.inf},
+        "globality": outcome.outer or OuterSolution((), 0),
         "box_look": {} if look is None else look.entry,
-        "notes": list(plant.notes(verified.theta)),
-        "iterates": [asdict(iterate) for iterate in outcome.iterates],
+        "notes": list(plant_of(problem).notes(verified.theta)),
+        "iterates": outcome.iterates,
         **run_entry(terms, spent, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
         **evidence,
@@ -97,45 +103,11 @@ def result_dict(
     return json_values(result)
 
 
-def verdict_of(
-    outcome: FormulationResult,
-    verified: Verified,
-    tolerance: float,
-    error: float,
-    quality: tuple[Quality, ...] = (),
-    look: GlobalCheck | None = None,
-) -> Verdict:
-    """The five lines on a verified design; `error` is that of its predicted value."""
-    problem = verified.problem
-    figure, at = problem.figure, quality[0].at_point if quality else None
-    return Verdict(
-        certified=verified.certified_line(),
-        optimal=optimal_line(outcome, verified, tolerance, look, gap=verified.inner_gap),
-        predicted=predicted(
-            error=error,
-            tolerance=tolerance,
-            left_out=None if at is None else abs(at[0]) / (figure.factor * verified.value),
-            left_out_size=None if at is None else abs(at[0]),
-            sigmas=None if at is None else at[1],
-            extrapolates=quality[0].extrapolates if quality else (),
-            surrogate=bool(outcome.surrogates),
-            of=figure,
-        ),
-        survives=verified.survives_line(),
-        deployable=deployable(verified.survival, problem.sampling),
-    )
-
-
 def optimal_line(
-    outcome: FormulationResult,
-    verified: Verified,
-    tolerance: float,
-    look: GlobalCheck | None,
-    *,
-    gap: float,
+    verified: Verified, tolerance: float, gap: float, searched: tuple[str, Mapping[str, Any]]
 ) -> VerdictLine:
-    """Whether θ is stationary, and whether anything better is known."""
-    known, figures = verified.searched(outcome, look)
+    """Whether θ is stationary, and whether anything better is known, where it was `searched`."""
+    known, figures = searched
     line = optimal(
         verified.kkt,
         level=verified.kkt_level,
@@ -177,28 +149,6 @@ def run_entry(terms: Terms, spent: Mapping[str, int], moved: bool = False) -> di
     }
 
 
-def kkt_dict(certificate: KktCertificate) -> dict[str, Any]:
-    """The optimality certificate; a vertex has no second-order figure, and says so."""
-    second = certificate.second_order
-    return asdict(certificate) | {
-        "second_order": None if second is None or math.isinf(second) else second,
-        "vertex": second is not None and math.isinf(second),
-    }
-
-
-def globality_dict(solution: OuterSolution | None) -> dict[str, Any]:
-    """Starts tried, distinct local optima of the last problem solved, the best J of each."""
-    if solution is None:
-        return {"starts": 0, "optima": []}
-    return {
-        "starts": solution.starts,
-        "optima": [
-            {"objective": item.objective, "starts": item.starts, "x": item.x.tolist()}
-            for item in solution.optima
-        ],
-    }
-
-
 def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     """A line as the solve wrote it; empty where a run is older than verdicts."""
     verdict = result.get("verdict")
@@ -219,7 +169,6 @@ def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine)
     if not before or not out.resolve().is_relative_to(folder):
         return run
     result = dict(read_json(folder / "result.json"))
-    found = {"state": line.state.value, "words": line.words, **line.figures, "at_solve": before}
-    result["verdict"] = {**result["verdict"], name: found}
+    result["verdict"] = {**result["verdict"], name: line.entry | {"at_solve": before}}
     write_json(folder / "result.json", result)
     return replace(run, result=result)

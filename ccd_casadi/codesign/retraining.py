@@ -137,7 +137,7 @@ class Job:
             words = "too few points where the truth has a value"
             return FormulationResult(message=words)
         sampled = 2 * len(self.outer.problem.names) + 2 if self.over_theta else 1
-        rounds = min(int(self.left / (self._cost(len(given.thetas)) * sampled)), ROUNDS)
+        rounds = min(int(self.left / (self._cost(len(given)) * sampled)), ROUNDS)
         options = formulation_of(self.case, name)
         assert not isinstance(options, Direct)
         options = replace(options, tolerance=tolerance, max_refinements=max(rounds - 1, 0))
@@ -171,9 +171,7 @@ class Job:
                 return None
             words = f"leaves {len(kept)} samples, too few for a first fit; give a larger one"
             raise UserError(f"--budget {self.budget} {words}")
-        thetas = np.array([sample.x for sample in kept])[:, : len(self.outer.problem.names)]
-        quantities = [sample for sample in kept if isinstance(sample, QuantitySample)]
-        return KnownSamples(thetas, tuple(quantities))
+        return kept
 
     def _stored(self) -> "list[Seen]":
         """Samples of the store within the bounds, oldest first, failures among them."""

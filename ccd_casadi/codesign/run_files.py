@@ -36,6 +36,9 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
         (folder / name).unlink(missing_ok=True)
     text = case_to_toml(resolved(case, solution))
     write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
+    own = Path((case.plant.function or "").rsplit(":", 1)[0])
+    if own.is_file() and own.parent != folder.resolve():
+        write_whole(folder / own.name, own.read_bytes())  # for who gets the folder alone
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:

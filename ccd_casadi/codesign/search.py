@@ -5,7 +5,8 @@ better the search begins anew with it. Then a global check over the box, and on 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
@@ -41,13 +42,10 @@ def search_outer(
     `known`: x of a local optimum that another search has found, in place of the formulation.
     """
     outer = outer.prepared(seed)
-    rounds = 0
-    while True:
-        rounds += 1
+    for rounds in count(1):
+        outcome = FormulationResult(known, agreed=True)
         if known is None:
             outcome = outer.solve_formulation(formulation, seed)
-        else:
-            outcome = FormulationResult(known, agreed=True)
         if outcome.x is None:
             outcome = outer.fallback(outcome, seed)
         if outcome.x is None:
@@ -55,20 +53,20 @@ def search_outer(
         end = outer.polished(outcome.x)
         more = None if rounds == AGAIN else outer.extended(end)
         if more is None:
-            search = _looked(SearchResult(outer, outcome, end, rounds), formulation, seed)
-            assert search.end is not None
-            moved = search.end is not end and rounds < AGAIN
-            more, end = outer.extended(search.end) if moved else None, search.end
+            outcome, found, look = _looked(outer, outcome, end, formulation, seed)
+            moved = found is not end and rounds < AGAIN
+            more, end = outer.extended(found) if moved else None, found
         if more is None:
-            return search
+            break
         goes_on = known is not None or isinstance(formulation, Direct)
         outer, known = more, end.x if goes_on else None
+    return SearchResult(outer, outcome, end, rounds, look)
 
 
-def _looked(search: SearchResult, formulation: Formulation, seed: int) -> SearchResult:
+def _looked(
+    outer: Outer, outcome: FormulationResult, end: End, formulation: Formulation, seed: int
+) -> tuple[FormulationResult, End, GlobalCheck]:
     """After the global check over the box, and a last try where the end is not stationary."""
-    outer, outcome, end = search.outer, search.outcome, search.end
-    assert end is not None
     with outer.sampler.spent.on("box_look"):
         look = global_check(outer, end, formulation.box_points, seed)
     if look.x is not None:
@@ -84,7 +82,7 @@ def _looked(search: SearchResult, formulation: Formulation, seed: int) -> Search
         missed = abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
         if missed > formulation.tolerance:  # left out, it tells how they support the design
             outcome = outer.with_training_sample(outcome, end)
-    return replace(search, outcome=outcome, end=end, look=look)
+    return outcome, end, look
 
 
 def best_end(ends: Sequence[End], level: float, tolerance: float) -> End:

@@ -36,20 +36,21 @@ def design_dict(
     judged = design.certificate
     assert judged is not None
     highest = max(judged.plants, key=lambda plant: plant.S_peak)
-    sampling = problem.sampling
+    sampling, loop = problem.sampling, dict[str, Any]()
+    if all(plant.stable for plant in judged.plants):  # else there are no margins and steps
+        assert design.controller is not None
+        plants = [plant.plant_si() for plant in plants_of(problem, theta)]
+        loop = loop_entry(plants, design.controller, sampling, design.bandwidth, highest.S_peak)
     grown = max(plant.stability for plant in judged.plants)
     if sampling is not None:  # of the spectral radius: the real part that it comes from
         grown = float(np.log1p(grown)) / sampling.period
     ratios = judged.worst
     return {
-        "omega_S_hz": None,
-        "omega_T_hz": None,
+        **dict.fromkeys(("omega_S_hz", "omega_T_hz")),
         "outcome": design.outcome.name.lower(),
         "reason": "" if design.certified else design.words,
         "bandwidth_hz": design.bandwidth / HZ,
-        "gamma_opt": None,
-        "gamma": None,
-        "gamma_lower_bound": None,
+        **dict.fromkeys(("gamma_opt", "gamma", "gamma_lower_bound")),
         "sensitivity_peak": highest.S_peak,
         "sensitivity_peak_hz": highest.S_peak_frequency / HZ,
         "sensitivity_low": max(plant.S_low for plant in judged.plants),
@@ -60,7 +61,7 @@ def design_dict(
             problem.inner.omega_low / HZ,
         ),
         "KS_max": max(plant.KS for plant in judged.plants),
-        **_loop_entry(problem, theta, design, highest.S_peak),
+        **loop,
         **_channel_entry(bounds_of(problem), judged),
         "certificate": {
             "stable": all(plant.stable for plant in judged.plants),
@@ -83,18 +84,6 @@ def design_dict(
             "kkt_residual": design.kkt_residual,
         },
     }
-
-
-def _loop_entry(
-    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, peak: float
-) -> dict[str, Any]:
-    """Margins and steps on the plants of the set; nothing of an unstable loop."""
-    assert design.certificate is not None
-    assert design.controller is not None
-    if not all(plant.stable for plant in design.certificate.plants):
-        return {}
-    plants = [plant.plant_si() for plant in plants_of(problem, theta)]
-    return loop_entry(plants, design.controller, problem.sampling, design.bandwidth, peak)
 
 
 def active_of(design: SectionsDesign) -> list[str]:

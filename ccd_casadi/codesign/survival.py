@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.inner_problem.kinds import MixedSensitivity
@@ -186,7 +186,7 @@ def highest(f: Function, places: Sequence[float], values: Sequence[float]) -> fl
     if middle < max(left, right) or 2.0 * middle - min(left, right) <= 0.0:
         return None
     options = {"xatol": 1e-5 * (places[2] - places[0]) + LEAST}
-    found = minimize_scalar(lambda x: -f(float(x)), bounds=(places[0], places[2]),
+    found = scipy.optimize.minimize_scalar(lambda x: -f(float(x)), bounds=(places[0], places[2]),
                             method="bounded", options=options)  # fmt: skip
     return float(found.x) if -found.fun >= middle else places[1]
 

@@ -23,8 +23,8 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+import scipy
 from scipy.linalg import qr
-from scipy.optimize import nnls
 
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.objective import (
@@ -125,7 +125,7 @@ def joint_residual(
     outer = np.hstack([to_theta.T, ends, A.T]) / size
     goals = envelope.goal / unit, -direct / size
     loose = np.pad(envelope.slack / unit, (0, k))
-    found, _ = nnls(
+    found, _ = scipy.optimize.nnls(
         np.vstack([EQUATION * inner, outer, np.diag(loose)]),
         np.concatenate([EQUATION * goals[0], goals[1], np.zeros(count + k)]),
         maxiter=100 * (count + k),

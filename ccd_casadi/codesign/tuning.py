@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import whosmat
+import scipy
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.fixed_structure.bounds import Bounds
@@ -204,7 +204,7 @@ def _plant(
 def _of_file(path: Path) -> MeasuredResponse | interchange.NamedSystem:
     """A measured response, or the one model of a .mat file."""
     try:
-        variables = whosmat(path) if path.suffix.lower() == ".mat" else []
+        variables = scipy.io.whosmat(path) if path.suffix.lower() == ".mat" else []
     except Exception:  # a damaged file: what reads it says so
         variables = []
     names = {name for name, _, _ in variables}

@@ -10,7 +10,7 @@ A design is verified when no line failed; a warning is for the reader to weigh.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -46,25 +46,10 @@ class VerdictLine:
     words: str
     figures: Mapping[str, Any]
 
-
-@dataclass(frozen=True)
-class Verdict:
-    """The five lines, in the order in which they matter."""
-
-    certified: VerdictLine
-    optimal: VerdictLine
-    predicted: VerdictLine
-    survives: VerdictLine
-    deployable: VerdictLine
-
     @property
-    def failed(self) -> tuple[str, ...]:
-        """Names of the lines that failed."""
-        return tuple(name for name, line in self.lines() if line.state is State.FAILED)
-
-    def lines(self) -> tuple[tuple[str, VerdictLine], ...]:
-        """Name and line, in order."""
-        return tuple((item.name, getattr(self, item.name)) for item in fields(self))
+    def entry(self) -> dict[str, Any]:
+        """Of `verdict` in result.json."""
+        return {"state": self.state.value, "words": self.words, **self.figures}
 
 
 def optimal(
@@ -160,18 +145,17 @@ def predicted(
     *,
     error: float,
     tolerance: float,
-    left_out: float | None = None,
-    left_out_size: float | None = None,
-    sigmas: float | None = None,
+    value: float = math.nan,
+    left_out: tuple[float, float] | None = None,
     extrapolates: Sequence[str] = (),
     surrogate: bool = True,
     of: FigureOfMerit = BANDWIDTH,
 ) -> VerdictLine:
-    """Surrogate against truth at the design.
+    """Surrogate against truth at the design, whose `value` is in SI.
 
-    Where the design is itself one of the samples the surrogate reproduces it and `error` shows
-    nothing: `left_out` (relative) is the error there without it, `left_out_size` the same in the
-    unit of what is predicted, `of`, for the eye, and `sigmas` in deviations.
+    Where the design is itself one of the samples the surrogate reproduces it and `error` (relative)
+    shows nothing: `left_out` is the error there without it, in the unit of what is predicted, `of`,
+    for the eye, and in deviations.
     """
     what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
@@ -179,8 +163,9 @@ def predicted(
         words = "nothing was predicted: the search used true values"
         return VerdictLine(State.PASSED, words, figures)
     if left_out is not None:
-        size = f"left_out_{unit.lower()}"
-        figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}
+        size, sigmas = abs(left_out[0]), left_out[1]
+        share = size / (of.factor * value)
+        figures |= {"left_out": share, f"left_out_{unit.lower()}": size, "left_out_sigmas": sigmas}
     if not error <= tolerance:
         words = (
             f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
@@ -194,10 +179,9 @@ def predicted(
         return VerdictLine(State.PASSED, words, figures)
     words = (
         f"the optimum is a training sample; left out, its {what} is missed by "
-        f"{left_out_size:.2g} {unit} ({100 * left_out:.2g} %"
-        + (f", {sigmas:.1f} sigma)" if sigmas is not None else ")")
+        f"{size:.2g} {unit} ({100 * share:.2g} %, {sigmas:.1f} sigma)"
     )
-    if left_out <= tolerance or (sigmas is not None and sigmas <= SIGMAS and left_out <= 0.01):
+    if share <= tolerance or (sigmas <= SIGMAS and share <= 0.01):
         return VerdictLine(State.PASSED, words, figures)
     words += ": the samples around do not support the design"
     return VerdictLine(State.WARNED, words, figures)
@@ -294,19 +278,6 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     )
     return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
-
-
-def verdict_dict(verdict: Verdict) -> dict[str, Any]:
-    """`verdict` of result.json."""
-    return {
-        name: {"state": line.state.value, "words": line.words, **line.figures}
-        for name, line in verdict.lines()
-    }
-
-
-def reason(verdict: Verdict) -> str:
-    """Why a design is not verified, in the words of the lines that failed."""
-    return "; ".join(f"{name}: {getattr(verdict, name).words}" for name in verdict.failed)
 
 
 def _range(low: float, high: float) -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar
 
-from ccd_casadi.codesign.design_entries import controller_dict, mixed_dict
+from ccd_casadi.codesign.design_entries import mixed_dict
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import State, VerdictLine, survives
 from ccd_casadi.codesign.verified import Verified
@@ -98,9 +98,6 @@ class VerifiedDesign(Verified):
             stable = [check.figures.certificate.stable for check in self.references]
             found["closer_models"] = all(stable)
         return found
-
-    def controller_entry(self) -> dict[str, Any]:
-        return controller_dict(self.controller)
 
     def certified_line(self) -> VerdictLine:
         design, bounds = self.design.figures, self.problem.inner.bounds

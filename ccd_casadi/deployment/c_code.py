@@ -21,7 +21,7 @@ from ccd_casadi.deployment.realisation import (
     plain_title,
 )
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.package_text import filled
+from ccd_casadi.support.package_text import template
 
 COMPILE = (
     "cc -std=c99 -O2 -ffp-contract=off -Wall -Wextra -pedantic "
@@ -50,37 +50,22 @@ def c_files(
 
     `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none.
     """
-    K, limit, L = realisation.system, realisation.saturation, realisation.back_calculation
+    K, limit = realisation.system, realisation.saturation
     n, p, m = len(K.A), K.B.shape[1], len(K.C)
     errors, forwards, first, forces = vectors(realisation)
-    header = _part(
-        FILES[0],
-        title=plain_title(title), period=f"{K.period:.17g}", rate=f"{1.0 / K.period:.10g}",
-        delay=f"{delay:.10g}",
-        limits="v[k]" if limit is None else f"v[k] within +-{limit:.17g} N",
-        back="" if L is None else " + L (u[k] - v[k])",
-        ahead=f"{delay + 0.5 * K.period:.6g}", verified="verified" if verified else "NOT verified",
-        n=n, p=p, m=m, room=max(n, 1),
-    )  # fmt: skip
-    clip = "" if limit is None else _part("clip.c", limit=f"{limit:.17g}")
-    source = _part(
-        FILES[1],
-        blocks="{" + ", ".join(str(size) for size in realisation.blocks or (0,)) + "}",
-        A=_numbers(realisation.block_entries), B=_numbers(K.B), C=_numbers(K.C),
-        D=_numbers(K.D), room=max(n, 1), clip=clip,
-        L="" if L is None else _part("back.c", L=_numbers(L)),
-        X=_numbers(takeover(K)),
-        F=_numbers(np.zeros((ORDER + 1, m, p)) if forward is None else forward),
-        cut_declared="    double cut[CONTROLLER_FORCES];\n" if clip else "",
-        cut_used="" if L is None else _part("lead_back.c"),
-    )  # fmt: skip
-    test = _part(
-        FILES[2],
-        compile=COMPILE, tolerance=f"{TOLERANCE:g}", samples=SAMPLES,
-        errors=_numbers(errors), forwards=_numbers(forwards), first=_numbers(first),
-        forces=_numbers(forces),
-    )  # fmt: skip
-    return dict(zip(FILES, (header, source, test), strict=True))
+    values = {
+        "title": plain_title(title), "verified": verified, "n": n, "p": p, "m": m,
+        "period": f"{K.period:.17g}", "rate": f"{1.0 / K.period:.10g}", "delay": f"{delay:.10g}",
+        "ahead": f"{delay + 0.5 * K.period:.6g}", "room": max(n, 1),
+        "limit": None if limit is None else f"{limit:.17g}", "L": realisation.back_calculation,
+        "blocks": realisation.blocks or (0,), "A": realisation.block_entries,
+        "B": K.B, "C": K.C, "D": K.D, "X": takeover(K),
+        "F": np.zeros((ORDER + 1, m, p)) if forward is None else forward,
+        "compile": COMPILE, "tolerance": f"{TOLERANCE:g}", "samples": SAMPLES,
+        "errors": errors, "forwards": forwards, "first": first, "forces": forces,
+    }  # fmt: skip
+    made = (template(f"deployment/templates/{name}", initialiser=_initialiser) for name in FILES)
+    return {name: each.render(values) for name, each in zip(FILES, made, strict=True)}
 
 
 def vectors(realisation: Realisation) -> tuple[Array, Array, Array, Array]:
@@ -98,10 +83,5 @@ def vectors(realisation: Realisation) -> tuple[Array, Array, Array, Array]:
     return errors, forwards, first, difference_equation(realisation, errors, forwards, start)
 
 
-def _part(name: str, **values: object) -> str:
-    return filled(f"deployment/templates/{name}", **values)
-
-
-def _numbers(values: Array) -> str:
-    """An initialiser."""
+def _initialiser(values: Array) -> str:
     return f"{{\n    {literals(values, 4)}\n}}"

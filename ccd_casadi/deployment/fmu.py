@@ -16,11 +16,10 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from xml.sax.saxutils import escape
 
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.package_text import filled, package_text
+from ccd_casadi.support.package_text import package_text, template
 
 FILE = "controller.fmu"
 NAME = "controller"  # modelIdentifier
@@ -89,14 +88,9 @@ def _description(errors: int, forces: int, period: float, guid: str, title: str)
          'causality="output" description="force" variability="discrete" initial="exact"'),
     )  # fmt: skip
     named = [(f"{letter}{i + 1}", *rest) for letter, n, *rest in groups for i in range(n)]
-    variables = "".join(
-        f'\n    <ScalarVariable name="{name}" valueReference="{reference}" {about}>'
-        f'\n      <Real unit="{unit}" start="0.0" />\n    </ScalarVariable>'
-        for reference, (name, unit, about) in enumerate(named)
-    )
     first = errors + forces + 1
-    outputs = "".join(f'\n      <Unknown index="{first + i}" />' for i in range(forces))
-    text = filled("deployment/templates/modelDescription.xml", model=NAME, guid=guid,
-                  title=escape(title, {'"': "&quot;"}), period=f"{period:.17g}",
-                  variables=variables, outputs=outputs)  # fmt: skip
+    text = template("deployment/templates/modelDescription.xml").render(
+        model=NAME, guid=guid, title=title, period=f"{period:.17g}", variables=named,
+        outputs=range(first, first + forces),
+    )  # fmt: skip
     return text.encode()

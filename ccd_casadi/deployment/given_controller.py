@@ -11,7 +11,6 @@ A table (TOML, or JSON of the same form) is what one enters in a drive:
     low_pass = [{ pole_hz = 900.0, pole_damping = 0.7 }]           # second order; first without
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from ccd_casadi.budget.sources import polynomial
 from ccd_casadi.cases.case import read_toml
+from ccd_casadi.cases.checks import POSITIVE, Fail, require_good, tables
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.lti.hold import Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
@@ -126,31 +126,23 @@ def _from_matrices(path: Path, table: Mapping[str, Any]) -> tuple[StateSpace, fl
 
 
 def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:
-    def number(place: str, value: Any) -> float:
-        good = isinstance(value, int | float) and not isinstance(value, bool)
-        if not good or not 0.0 < value < np.inf:
-            raise UserError(f"{path}: {place}: is {json.dumps(value)[:40]}; give a number above 0")
-        return float(value)
-
-    known = ("gain", "integrator_hz", *SECTIONS)
-    for key in table:
-        if key not in known:
-            raise UserError(f"{path}: {key}: unknown key; known are {', '.join(known)}")
+    fail = Fail(path)
+    kinds = dict.fromkeys(SECTIONS, tables)
+    require_good("", table, {"gain": POSITIVE, "integrator_hz": POSITIVE, **kinds}, fail)
     if "gain" not in table:
-        raise UserError(f"{path}: gain: is missing; give K at s = 0 in N/m (without integrator)")
-    one = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.eye(1))
-    found = replace(one, D=np.array([[number("gain", table["gain"])]]))
+        raise fail("gain", "is missing; give K at s = 0 in N/m (without integrator)")
+    gain = np.array([[float(table["gain"])]])
+    found = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), gain)
     if "integrator_hz" in table:
-        w = HZ * number("integrator_hz", table["integrator_hz"])
-        found = found.series(StateSpace(np.zeros((1, 1)), np.eye(1), np.array([[w]]), np.eye(1)))
+        w = np.array([[HZ * table["integrator_hz"]]])
+        found = found.series(StateSpace(np.zeros((1, 1)), np.eye(1), w, np.eye(1)))
     for kind, (needed, optional) in SECTIONS.items():
-        rows = table.get(kind, [])
+        rows, keys = table.get(kind, []), (*needed, *optional)
         for i, row in enumerate(rows if isinstance(rows, list) else [rows], 1):
-            place = f"{kind} {i}"
-            if not isinstance(row, Mapping) or not set(needed) <= set(row) <= {*needed, *optional}:
-                raise UserError(f"{path}: {place}: give {', '.join((*needed, *optional))}")
-            values = {key: number(f"{place}: {key}", value) for key, value in row.items()}
-            found = found.series(_section(values))
+            if not set(needed) <= set(row) <= set(keys):
+                raise fail(f"{kind} {i}", f"give {', '.join(keys)}")
+            require_good(f"{kind} {i}", row, dict.fromkeys(keys, POSITIVE), fail)
+            found = found.series(_section({key: float(value) for key, value in row.items()}))
     # a gain alone gets a state that nothing sees: what certifies a loop expects one
     return found if len(found.A) else found.series(UNSEEN)
 

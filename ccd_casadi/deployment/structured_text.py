@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.deployment.anti_windup import takeover
 from ccd_casadi.deployment.realisation import Realisation, literal, literals, plain_title
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.package_text import filled
+from ccd_casadi.support.package_text import template
 
 FILE = "controller.st"
 TEMPLATE = f"deployment/templates/{FILE}"
@@ -29,16 +29,12 @@ def structured_text(realisation: Realisation, *, title: str, delay: float, verif
     L = realisation.back_calculation
     starts = np.repeat(np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes).astype(int)
     ends = starts + np.repeat(sizes, sizes) - 1
-    limit, words = realisation.saturation, "verified" if verified else "NOT verified"
-    return filled(
-        TEMPLATE,
-        title=plain_title(title), period=f"{K.period:.17g}", delay=f"{delay:.10g}", verified=words,
-        limit=literal(1e308 if limit is None else limit),
-        n=n, m=m, p=p, q=p + m, n1=n - 1, m1=m - 1, p1=p - 1, nn1=n * n - 1, np1=n * p - 1,
-        mn1=m * n - 1, mp1=m * p - 1, nm1=n * m - 1, nq1=n * (p + m) - 1,
-        first=", ".join(map(str, starts)), last=", ".join(map(str, ends)),
-        A=_numbers(A), B=_numbers(B), C=_numbers(C), D=_numbers(K.D), X=_numbers(X),
-        L=_numbers(np.zeros((n, m)) if L is None or not len(K.A) else L),
+    limit = realisation.saturation
+    return template(TEMPLATE, numbers=_numbers).render(
+        title=plain_title(title), period=f"{K.period:.17g}", delay=f"{delay:.10g}",
+        verified=verified, limit=literal(1e308 if limit is None else limit), n=n, m=m, p=p,
+        starts=starts, ends=ends, A=A, B=B, C=C, D=K.D, X=X,
+        L=np.zeros((n, m)) if L is None or not len(K.A) else L,
     )  # fmt: skip
 
 

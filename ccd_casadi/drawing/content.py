@@ -119,6 +119,12 @@ class Table:
         rows = tuple(tuple(json_values(row)) for row in self.rows)
         object.__setattr__(self, "rows", rows)
 
+    @property
+    def numeric(self) -> list[bool]:
+        """Which columns hold no text."""
+        columns = range(len(self.head))
+        return [all(not isinstance(row[i], str) for row in self.rows) for i in columns]
+
     @staticmethod
     def of(head: Sequence[str], *columns: Iterable[Any]) -> "Table":
         """From columns of equal length."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Lines, Modes, Panel, Picture, Place, Table
+from ccd_casadi.drawing.content import Panel
 from ccd_casadi.drawing.labels import (
     POINT,
     SIZE,
@@ -18,9 +18,7 @@ from ccd_casadi.drawing.labels import (
     legend_height,
     scales_of,
 )
-from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
-from ccd_casadi.drawing.turntable import modes_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,44 +30,17 @@ BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none
 LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a panel
 
 
-def figure_lines(figure: Lines, key: str) -> str:
-    """Rows of panels as HTML, a picture each; `key` is unique in the page.
+def panel_html(panel: Panel, beside: int, height: float, key: str, title: str) -> str:
+    """A panel of a row of `beside` ones as a picture, height in inches; `key` is unique in the
+    page."""
 
-    As pictures of their own the panels of a row stand below each other where a page is narrow.
-    """
-    heights = figure.heights or (2.9,) * len(figure.rows)
-    parts = []
-    with style():
-        for i, (row, height) in enumerate(zip(figure.rows, heights, strict=True)):
-            drawn = [
-                _placed(panel, WIDTH / len(row), height, f"{key}-{i}{j}", figure.title)
-                for j, panel in enumerate(row)
-            ]
-            parts.append(f'<div class="panels n{len(row)}">{"".join(drawn)}</div>')
-    return "\n".join(parts)
+    def picture(own: str, inches: float) -> str:
+        with style():
+            figure, axes = drawn_axes(panel, inches, height)
+            words = f"{title}: {panel.title or panel.y_label}"
+            return to_svg(figure, own, words, _for_cursor(axes, panel, height), 100.0)
 
-
-def _placed(what: Place, width: float, height: float, key: str, title: str) -> str:
-    match what:
-        case Panel() if width == WIDTH:
-            return at_both_widths(
-                lambda own, inches: _picture(what, inches, height, own, title), key, width
-            )
-        case Panel():
-            return _picture(what, width, height, key, title)
-        case Modes():
-            return f"<div>{modes_html(what)}</div>"
-        case Table():
-            return f"<div>{table_html(what)}</div>"
-        case Picture():
-            return f"<div>{what.svg}</div>"
-    return ""
-
-
-def _picture(panel: Panel, width: float, height: float, key: str, title: str) -> str:
-    figure, axes = drawn_axes(panel, width, height)
-    title = f"{title}: {panel.title or panel.y_label}"
-    return to_svg(figure, key, title, _for_cursor(axes, panel, height), 100.0)
+    return picture(key, WIDTH / beside) if beside > 1 else at_both_widths(picture, key, WIDTH)
 
 
 def drawn_axes(panel: Panel, width: float, height: float) -> tuple["Figure", "Axes"]:

@@ -5,23 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ccd_casadi.drawing import svg
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.drawing.labels import scales_of
-from ccd_casadi.drawing.svg import (
-    BLACK,
-    COLOUR_MAP,
-    CYCLE,
-    GREY,
-    NARROW,
-    ORANGE,
-    WIDTH,
-    at_both_widths,
-    axis_label,
-    new_figure,
-    place,
-    style,
-    to_svg,
-)
 from ccd_casadi.support.arrays import Array
 
 if TYPE_CHECKING:
@@ -34,15 +20,15 @@ RING, GROUND = "#fdfdfd", "#121212"  # of markers on a map: in both themes, unli
 
 def figure_landscape(land: Landscape, key: str) -> str:
     """Filled contours of ω_b*(θ) with true samples, paths and the optimum."""
-    return at_both_widths(lambda own, inches: _landscape(land, own, inches), key, MAP_WIDTH)
+    return svg.at_both_widths(lambda own, inches: _landscape(land, own, inches), key, MAP_WIDTH)
 
 
 def _landscape(land: Landscape, key: str, width: float) -> str:
     from matplotlib.patches import Rectangle
 
-    with style():
-        figure, low = new_figure(5.4, width), 1.1 if width == MAP_WIDTH else 1.5
-        axes = place(figure, 0.75, low, width - 2.05, 5.25 - low)  # room for bar and legend
+    with svg.style():
+        figure, low = svg.new_figure(5.4, width), 1.1 if width == MAP_WIDTH else 1.5
+        axes = svg.place(figure, 0.75, low, width - 2.05, 5.25 - low)  # room for bar and legend
         axes.grid(False)
         axes.set_facecolor("#eeeeee")
         truths = land.truths.reshape(-1, 3)
@@ -61,38 +47,38 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
             x, y, hz = truths[np.isfinite(truths[:, 2])].T
             # light and dark rings tell the dots from any colour of the map
             axes.scatter(x, y, s=62, color=GROUND, zorder=2.9, clip_on=False, gid="mark-grounds")
-            dots = axes.scatter(x, y, c=hz, cmap=COLOUR_MAP, norm=norm, s=34, edgecolors=RING,
+            dots = axes.scatter(x, y, c=hz, cmap=svg.COLOUR_MAP, norm=norm, s=34, edgecolors=RING,
                                 linewidths=1.1, label=land.truth_label, zorder=3, clip_on=False,
                                 gid="mark-truths")  # fmt: skip
             filled = filled or dots
             lost = truths[~np.isfinite(truths[:, 2])]
             if len(lost):
-                axes.plot(lost[:, 0], lost[:, 1], "x", color=GREY, label="infeasible θ",
+                axes.plot(lost[:, 0], lost[:, 1], "x", color=svg.GREY, label="infeasible θ",
                           gid="mark-lost")  # fmt: skip
         if land.region is not None:
             a, b, c, d = land.region
-            axes.add_patch(Rectangle((a, c), b - a, d - c, fill=False, edgecolor=BLACK,
+            axes.add_patch(Rectangle((a, c), b - a, d - c, fill=False, edgecolor=svg.BLACK,
                                      linestyle=(0, (4, 3)), linewidth=0.8, clip_on=False,
                                      label="last trust region", gid="level-region"))  # fmt: skip
         for i, path in enumerate(land.paths):
-            axes.plot(*path.theta.T, "-o", color=CYCLE[(i + 1) % len(CYCLE)], linewidth=1.2,
+            axes.plot(*path.theta.T, "-o", color=svg.CYCLE[(i + 1) % len(svg.CYCLE)], linewidth=1.2,
                       markersize=6, clip_on=False, markerfacecolor="white", markeredgewidth=1.3,
                       label=path.label, zorder=5, gid=f"curve{i}")  # fmt: skip
         if land.optimum is not None:
             a, b = land.optimum
-            axes.plot([a], [b], "*", color=ORANGE, markersize=15, clip_on=False, zorder=7,
+            axes.plot([a], [b], "*", color=svg.ORANGE, markersize=15, clip_on=False, zorder=7,
                       markeredgecolor=RING, markeredgewidth=0.9, linestyle="none",
                       label="verified optimum", gid="mark-optimum")  # fmt: skip
         axes.set_xlim(land.first[0], land.first[-1])
         axes.set_ylim(land.second[0], land.second[-1])
-        axes.set_xlabel(axis_label(land.names[0], land.units[0]))
-        axes.set_ylabel(axis_label(land.names[1], land.units[1]))
+        axes.set_xlabel(svg.axis_label(land.names[0], land.units[0]))
+        axes.set_ylabel(svg.axis_label(land.names[1], land.units[1]))
         which = "largest bandwidth ω_b*" if land.bandwidth_hz.size else "bandwidth ω_b"
-        _colour_bar(figure, filled, axis_label(which, "Hz"))
+        _colour_bar(figure, filled, svg.axis_label(which, "Hz"))
         _legend(figure, axes)
         title = "Landscape of the largest bandwidth over the two parameters"
-        share = 100.0 if width == NARROW else 100.0 * width / WIDTH
-        return to_svg(figure, key, title, json.dumps({"scales": scales_of(axes)}), share)
+        share = 100.0 if width == svg.NARROW else 100.0 * width / svg.WIDTH
+        return svg.to_svg(figure, key, title, json.dumps({"scales": scales_of(axes)}), share)
 
 
 def _contours(axes: "Axes", x: Array, y: Array, field: Array, shown: Array) -> tuple[Any, Any]:
@@ -108,7 +94,7 @@ def _contours(axes: "Axes", x: Array, y: Array, field: Array, shown: Array) -> t
     norm = BoundaryNorm(levels, 256)
     if not field.size or not np.isfinite(field).any():
         return None, norm
-    filled = axes.contourf(x, y, field.T, levels=levels, cmap=COLOUR_MAP, norm=norm)
+    filled = axes.contourf(x, y, field.T, levels=levels, cmap=svg.COLOUR_MAP, norm=norm)
     filled.set_gid("area-field")
     lines = axes.contour(x, y, field.T, levels=levels, colors="white", linewidths=0.35)
     lines.set_gid("level-field")
@@ -132,7 +118,7 @@ def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
     if filled is not None:
         width, height = figure.get_size_inches()
         low, tall = (height * v for v in figure.axes[0].get_position().bounds[1::2])
-        beside = place(figure, width - 1.15, low, 0.17, tall)
+        beside = svg.place(figure, width - 1.15, low, 0.17, tall)
         bar = figure.colorbar(filled, cax=beside)
         bar.set_label(label)
         bar.outline.set_linewidth(0.5)
@@ -143,7 +129,7 @@ def _legend(figure: "Figure", axes: "Axes") -> None:
     from matplotlib.collections import PathCollection
 
     handles, labels = axes.get_legend_handles_labels()
-    columns = 2 if figure.get_figwidth() == NARROW else 3 if len(labels) > 4 else 4
+    columns = 2 if figure.get_figwidth() == svg.NARROW else 3 if len(labels) > 4 else 4
     made = figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
     for handle in made.legend_handles:
         if isinstance(handle, PathCollection):  # its light ring is not seen on paper

@@ -9,12 +9,10 @@ from functools import cache
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Modes
-from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import COLOUR_MAP
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import number
+from ccd_casadi.support.package_text import template
 
 AZIMUTH, ELEVATION = -62.0, 44.0  # degrees, of the camera as seen from the object
 WIDTH, HEIGHT = 320, 236  # of one picture, in its own units
@@ -83,43 +81,13 @@ def still(shapes: ModeShapes, mode: ModeShape, words: str) -> str:
     order = front[np.argsort(corner[front, :, 2].mean(axis=1), kind="stable")]
     # tenths of a unit, as whole numbers: the group scales them back
     flat = np.rint(10.0 * scale * corner[:, :, :2] * [1.0, -1.0]).astype(int)
-    paths = []
-    for q in order:
-        steps = np.diff(flat[q], axis=0).ravel()
-        start, rest = flat[q][0], " ".join(map(str, steps)).replace(" -", "-")
-        red, green, blue = rgb[q]
-        paths.append(
-            f'<path color="#{red:02x}{green:02x}{blue:02x}" d="M{start[0]} {start[1]}l{rest}z"/>'
-        )
-    # a hairline of the quad's own colour closes the seams between neighbours
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(words)}">'
-        f'<g transform="translate({WIDTH / 2:g} {HEIGHT / 2:g}) scale(.1)" fill="currentColor" '
-        f'stroke="currentColor" stroke-width="8">' + "".join(paths) + "</g></svg>"
-    )
-
-
-def modes_html(modes: Modes) -> str:
-    """The pictures with their words: to be turned by the page's script, or small ones in a row.
-
-    Without the script, and on paper, they stand still.
-    """
-    shapes = modes.shapes
-    if not modes.turning:
-        named = [(f"{number(mode.frequency, 4)} Hz", mode) for mode in shapes.modes]
-        small = (f'<div style="flex:1 1 85px">{words}{still(shapes, mode, words)}</div>'
-                 for words, mode in named)  # fmt: skip
-        return f'<div style="display:flex;flex-wrap:wrap">{"".join(small)}</div>'
-    views = "\n".join(
-        f'<div class="view"><p>{escape(mode.title)}</p>'
-        f'<div class="drawn">{still(shapes, mode, mode.title)}</div></div>'
-        for mode in shapes.modes
-    )
-    scale = legend("displacement as a share of each mode's largest (–)")
-    return (
-        f'<div class="turntable">\n<div class="views">\n{views}\n</div>\n{scale}\n'
-        f'<script type="application/json">{data(shapes)}</script>\n</div>'
-    )
+    steps = np.diff(flat[order], axis=1).reshape(len(order), -1)
+    faces = [
+        (rgb[q], f"M{x} {y}l" + " ".join(map(str, rest)).replace(" -", "-") + "z")
+        for q, (x, y), rest in zip(order, flat[order, 0], steps, strict=True)
+    ]
+    made = template("drawing/assets/still.svg")
+    return made.render(width=WIDTH, height=HEIGHT, words=words, faces=faces).strip()
 
 
 def middle_of(shapes: ModeShapes) -> Array:
@@ -158,12 +126,4 @@ def _whole(values: Array) -> list[int]:
 def legend(words: str) -> str:
     """The colour scale from 0 to 1 as an <svg> element, with words beside it."""
     shades = np.rint(colours(np.linspace(0.0, 1.0, 60))).astype(int)
-    bars = "".join(
-        f'<rect x="{16 + 4 * i}" y="4" width="4.5" height="12" fill="rgb({r},{g},{b})"/>'
-        for i, (r, g, b) in enumerate(shades)
-    )
-    return (
-        f'<svg viewBox="0 0 960 22" role="img" aria-label="{escape(words)}">{bars}'
-        '<g font-size="13"><text x="0" y="15">0</text><text x="264" y="15">1</text>'
-        f'<text x="292" y="15">{escape(words)}</text></g></svg>'
-    )
+    return template("drawing/assets/scale.svg").render(colours=shades, words=words).strip()

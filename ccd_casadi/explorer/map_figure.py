@@ -39,7 +39,7 @@ class MapFigure:
         self.names: list[Any] = [parameter.name for parameter in parameters]
         self._units = [display_unit(item.unit, item.upper) for item in parameters]
         self._selects = [
-            Select(name=f"axis_{i}", title=title, options=self.names, width=120,
+            Select(name=f"axis_{i}", title=title, options=self.names, width=105,
                    stylesheets=[DARK] if dark else [],
                    value=self.names[min(i, len(self.names) - 1)])
             for i, title in enumerate(("across", "up"))
@@ -66,9 +66,9 @@ class MapFigure:
         made.scatter("x", "y", source=self._dots, size=8, fill_color=by_value, line_color=RING)
         made.scatter("x", "y", source=self._here, marker="star", size=18, fill_color=ORANGE,
                      line_color=GROUND)  # fmt: skip
-        bar = ColorBar(color_mapper=self._colours, title="ω_b (Hz)", width=10,
-                       formatter=NumeralTickFormatter(format="0.[00]"))  # fmt: skip
-        made.add_layout(bar, "right")
+        self._bar = ColorBar(color_mapper=self._colours, title="ω_b (Hz)", width=10, visible=False,
+                             formatter=NumeralTickFormatter(format="0.[00]"))  # fmt: skip
+        made.add_layout(self._bar, "right")
         self._figure, self._words = made, Div()
 
     def root(self) -> Any:
@@ -105,6 +105,7 @@ class MapFigure:
             low, high = float(known.min()), float(known.max())
             more = 0.5 if high - low < 1e-6 * high else 0.0
             self._colours.update(low=low - more, high=high + more)
+            self._bar.visible = True  # laid out when its numbers are known, which need room
         k, m = self._scales()
         first, second = k * land.first, m * land.second
         image: dict[str, list[Any]] = {name: [] for name in self._image.data}

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
@@ -25,10 +26,12 @@ from ccd_casadi.explorer.message import Message
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure, cursor, legend_html
 from ccd_casadi.explorer.panels import EMPTY, FIGURES, LOOKS, OVER_HZ, Drawn, drawn
 from ccd_casadi.explorer.pins import Kept, Pins
+from ccd_casadi.explorer.places_figure import PlacesFigure, moves
 from ccd_casadi.explorer.session import Session, searched_exactly
 from ccd_casadi.explorer.structured import Designed, anchored, designed
 from ccd_casadi.explorer.words import machine_html, move_words, standing_html
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.package_text import package_text
@@ -63,6 +66,7 @@ class Page:
         self.pins = Pins(parameters, self.figures, kept, dark, session.case.objective.cost_unit)
         self.map = MapFigure(parameters, self.draw_map, dark)
         run, problem = session.run, session.problems.at(session.start)
+        self.places = [PlacesFigure(problem, self._placed)] if moves(problem) else []
         self._surrogate = None if run is None else run_surrogate(run.folder)
         self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
         self._of_search = False
@@ -107,6 +111,7 @@ class Page:
             "pins_place": [self.pins.table],
             "map_place": [self.map.root()],
         } | {f"{made.name}_place": [made.figure] for made in self.figures}
+        roots |= {f"{places.name}_place": [places.figure] for places in self.places}
         for name, parts in roots.items():
             for part in parts:
                 if part.sizing_mode is None:
@@ -117,6 +122,13 @@ class Page:
         self.document.js_on_event(DocumentReady, label)
 
     # drags
+
+    def _placed(self, theta: Array) -> None:
+        """A place was dragged: the sliders move to its θ, within the box."""
+        low, high = zip(*((p.lower, p.upper) for p in self.session.case.theta), strict=True)
+        inside = tuple(np.clip(theta, low, high).tolist())
+        self.controls.put(replace(self.controls.knobs(), theta=inside))
+        self.moved(True)
 
     def moved(self, let_go: bool, of_search: bool = False) -> None:
         """A slider moved: answer soon, once for all that moved meanwhile.
@@ -192,6 +204,7 @@ class Page:
         frame = look.how is not How.PRESENT and curves is not None
         changes = [change for made in self.figures for change in
                    made.changes(now.panels.get(made.name, EMPTY), colour, dash, frame)]  # fmt: skip
+        changes += [made.marks(look.theta) for made in self.places]
         changes += [self.map.mark(look.theta), (self.answer, {"data": answer})]
         self._message.send(words, changes)
         self._seen.append(look)

@@ -9,18 +9,9 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from bokeh import models
 from bokeh.core.property.descriptors import UnsetValueError
 from bokeh.events import Reset
-from bokeh.models import (
-    BoxZoomTool,
-    ColumnDataSource,
-    CrosshairTool,
-    CustomJS,
-    CustomJSHover,
-    HoverTool,
-    Range1d,
-    WheelZoomTool,
-)
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
@@ -53,7 +44,8 @@ class PanelFigure:
 
     def __init__(
         self, name: str, heading: str, dark: bool, *, log_x: bool = False, log_y: bool = False,
-        x_range: Range1d | None = None, cursor: Span | None = None, whole_circles: bool = False,
+        x_range: models.Range1d | None = None, cursor: Span | None = None,
+        whole_circles: bool = False,
     ) -> None:  # fmt: skip
         self.name, self.heading = name, heading
         self._dark, self._log_x, self._log_y, self._round = dark, log_x, log_y, whole_circles
@@ -64,18 +56,18 @@ class PanelFigure:
         self._ends: list[tuple[float, float]] = []  # of both axes, as they are shown
         self._sent: dict[str, dict[str, Any]] = {}  # by the model's id, what was last
         self._beside: list[Curve] = []
-        self.figure = self._figure(x_range or Range1d(start=0.1, end=1e4))
+        self.figure = self._figure(x_range or models.Range1d(start=0.1, end=1e4))
         self._paint(cursor)
 
-    def _figure(self, x_range: Range1d) -> Any:
+    def _figure(self, x_range: models.Range1d) -> Any:
         made: Any = figure(
             name=self.name, height=HEIGHT, sizing_mode="stretch_width", min_border_left=58,
             tools="pan,box_zoom,wheel_zoom,reset", toolbar_location="above", x_range=x_range,
-            y_range=Range1d(start=1e-3 if self._log_y else -2.0, end=2.0),
+            y_range=models.Range1d(start=1e-3 if self._log_y else -2.0, end=2.0),
             x_axis_type="log" if self._log_x else "linear",
             y_axis_type="log" if self._log_y else "linear",
         )  # fmt: skip
-        made.js_on_event(Reset, CustomJS(code=package_text("explorer/assets/follow.js")))
+        made.js_on_event(Reset, models.CustomJS(code=package_text("explorer/assets/follow.js")))
         made.toolbar.logo = None
         made.toolbar.autohide = True
         for axis in made.axis:
@@ -84,11 +76,11 @@ class PanelFigure:
             made.xaxis[0].ticker.desired_num_ticks = FEW
         if self._round:
             for tool in made.tools:  # what is zoomed keeps one scale too
-                if isinstance(tool, BoxZoomTool):
+                if isinstance(tool, models.BoxZoomTool):
                     tool.match_aspect = True
-                if isinstance(tool, WheelZoomTool):
+                if isinstance(tool, models.WheelZoomTool):
                     tool.zoom_on_axis = False
-            fit = CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)},
+            fit = models.CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)},
                            code=package_text("explorer/assets/round.js"))  # fmt: skip
             for size in ("inner_width", "inner_height"):
                 made.js_on_change(size, fit)
@@ -108,8 +100,8 @@ class PanelFigure:
                   y_offset="dy", angle="angle", text_align="align", text_baseline="baseline",
                   text_font_size="11px")  # fmt: skip
         if not self._round:
-            digits = CustomJSHover(code="return Number(value.toPrecision(5)).toString()")
-            tips = HoverTool(
+            digits = models.CustomJSHover(code="return Number(value.toPrecision(5)).toString()")
+            tips = models.HoverTool(
                 renderers=[own], mode="vline", line_policy="nearest",
                 tooltips=[("@x_label", "$snap_x{custom}"), ("@y_label", "$snap_y{custom}")],
                 formatters={"$snap_x": digits, "$snap_y": digits},
@@ -117,7 +109,7 @@ class PanelFigure:
             self._tips = tips
             made.add_tools(tips)
         if cursor is not None:
-            made.add_tools(CrosshairTool(overlay=cursor))
+            made.add_tools(models.CrosshairTool(overlay=cursor))
 
     def changes(self, panel: Panel, colour: str, dash: str, frame: bool) -> list[Change]:
         """What paints a panel; `colour` and `dash` of the present design's curves, nothing for a
@@ -261,18 +253,18 @@ def _is_own(curve: Curve) -> bool:
     return curve.colour == BLUE and curve.line == "-"
 
 
-def _source(columns: Sequence[str], name: str = "") -> ColumnDataSource:
-    return ColumnDataSource({column: [] for column in columns}, name=name or None)
+def _source(columns: Sequence[str], name: str = "") -> models.ColumnDataSource:
+    return models.ColumnDataSource({column: [] for column in columns}, name=name or None)
 
 
-def _rows(source: ColumnDataSource, rows: Any) -> Change:
+def _rows(source: models.ColumnDataSource, rows: Any) -> Change:
     """Rows as the columns of a source."""
     names, rows = list(source.data), list(rows)
     columns: list[Any] = [[row[i] for row in rows] for i in range(len(names))]
     return source, {"data": dict(zip(names, columns, strict=True))}
 
 
-def _ends(axis: Range1d, start: float, end: float) -> Change:
+def _ends(axis: models.Range1d, start: float, end: float) -> Change:
     return axis, {"start": start, "end": end, "reset_start": start, "reset_end": end}
 
 

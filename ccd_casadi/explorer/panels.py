@@ -1,7 +1,7 @@
 """What the explorer shows of a design: the panels that pages show, and four of its own."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,19 +41,17 @@ LOOKS = {
 
 @dataclass(frozen=True)
 class Drawn:
-    """A design with its curves (None: there are none), the loop as sampled if it was asked, and
-    the panels that show it by the name of their figure."""
+    """A design, and the panels that show it by the name of their figure; none without curves."""
 
     look: Look
-    curves: Curves | None
-    sampled: AsSampled | None = None
-    panels: Mapping[str, Panel] = field(default_factory=dict)
+    panels: Mapping[str, Panel]
 
 
 def drawn(look: Look, c: Curves | None, sampled: AsSampled | None) -> Drawn:
-    """The panels of a design; none of one without a controller."""
+    """The panels of a design (no curves: it has no controller), with the loop as sampled if it was
+    asked."""
     if c is None:
-        return Drawn(look, None, sampled)
+        return Drawn(look, {})
     certified, view = look.standing is not Standing.REFUSED, c.view
     S, KS, T = gain_panels([view], bounds=certified)
     if sampled is not None:
@@ -74,7 +72,7 @@ def drawn(look: Look, c: Curves | None, sampled: AsSampled | None) -> Drawn:
         "move": _over_time(c.move.time, 1e6 * c.move.error, "error (µm)",
                            Level(1e3 * c.move.duration, "end of the move", True)),
     }  # fmt: skip
-    return Drawn(look, c, sampled, panels)
+    return Drawn(look, panels)
 
 
 def _over_time(time: np.ndarray, values: np.ndarray, label: str, level: Level) -> Panel:

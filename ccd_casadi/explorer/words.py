@@ -7,12 +7,12 @@ import numpy as np
 
 from ccd_casadi.drawing.content import Lines, Modes
 from ccd_casadi.drawing.page import escape
-from ccd_casadi.drawing.paint import block_html, drawing_html
-from ccd_casadi.drawing.turntable import modes_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.explorer.curves import AsSampled, Curves
-from ccd_casadi.explorer.designs import Look, Standing
+from ccd_casadi.explorer.designs import Look
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
+from ccd_casadi.support.package_text import template
 from ccd_casadi.support.units import HZ, number, with_unit
 
 
@@ -24,45 +24,12 @@ def standing_html(
 
     `beside`: another design's name and its ω_b in Hz, which the bandwidth is compared with.
     """
-    f, on = look.figures, look.elements
-    standing = look.standing.value + (f": {look.reason}" if look.reason else "")
-    near = look.standing is Standing.NEAR
-    if not (on.exact or near or look.standing is Standing.REFUSED):
-        standing += f"; on a plant whose frequencies are the model's to {100.0 * on.error:.2g} %"
-    facts, answer = [], "– Hz"
-    if look.standing is not Standing.REFUSED:
-        c = f.certificate
-        same = "of that plant ≈" if near else "="
-        answer = f"{'≈ ' if near else ''}{number(look.bandwidth_hz, 4)} Hz"
-        if beside is not None and np.isfinite(beside[1]):
-            facts = [f"{look.bandwidth_hz - beside[1]:+.3g} Hz against {beside[0]}"]
-        facts += [
-            f"‖S‖∞ {same} {number(f.sensitivity_peak, 5)} at "
-            f"{number(f.sensitivity_peak_frequency / HZ, 4)} Hz",
-            *([] if near else [f"J = {number(look.objective, 6)}"]),
-            f"hardware cost {number(look.cost, 6)} {look.problem.cost_unit}".rstrip(),
-        ]
-        if look.kappa is None:
-            facts.append(
-                f"ω_S = {number(f.omega_S / HZ, 4)} Hz, ω_T = {number(f.omega_T / HZ, 4)} Hz"
-            )
-            facts.append(f"norm {c.norm:.6g} ≤ {c.norm_bound:.6g}")
-        else:
-            facts.append(f"at most {c.norm:.5g} of a bound on the corners of the plant set")
-        if look.active:
-            binding = ", ".join(look.active).replace("omega", "ω")
-            facts.append(f"binding: {binding}")
-    how = f"{look.how.value}; modes: {on.words}"
-    if curves is not None:
-        how = f"{survival_words(curves)}; {how}"
-    shown = (
-        f'<p class="{look.standing.name.lower()}"><b>{escape(standing)}</b></p>'
-        f'<p class="answer"><b>{escape(answer)}</b> bandwidth ω_b</p>'
-        f"<p>{escape(' · '.join(facts))}</p><p class=how>{escape(how)}</p>"
-    )
-    if sampled is not None:
-        shown += f"<p>{escape(sampled_words(sampled, look.problem.inner.S_max))}</p>"
-    return shown
+    known = beside is not None and np.isfinite(beside[1])
+    return template("explorer/assets/standing.html", number=number, HZ=HZ).render(
+        look=look, beside=beside if known else None,
+        survival="" if curves is None else survival_words(curves),
+        sampled="" if sampled is None else sampled_words(sampled, look.problem.inner.S_max),
+    )  # fmt: skip
 
 
 def survival_words(curves: Curves) -> str:
@@ -106,7 +73,7 @@ def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
         drawn = plant.drawing({"this design": look.theta, "the start": start}).drawing
         if isinstance(drawn, Lines):  # the first row alone: it is drawn while one drags
             drawn = replace(drawn, rows=drawn.rows[:1], heights=drawn.heights[:1])
-        return f'<div class="drawn">{drawing_html(drawn, "machine")}</div>'
+        return f'<div class="drawn">{block_html(drawn, "machine")}</div>'
     return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
 
 
@@ -117,5 +84,5 @@ def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
         return ""
     pairs = zip(problem.names, problem.units, theta, strict=True)
     shown = ", ".join(f"{name} = {with_unit(value, unit, 4)}" for name, unit, value in pairs)
-    modes = modes_html(Modes(plant.shapes(theta, SHOWN_MODES)))
+    modes = block_html(Modes(plant.shapes(theta, SHOWN_MODES)))
     return f"<p>modes of the last θ solved: {escape(shown)}</p>{modes}"

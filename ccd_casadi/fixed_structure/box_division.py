@@ -32,10 +32,9 @@ class Division:
 
 
 @dataclass(frozen=True)
-class _Enclosed:
-    """N boxes, their figures over bounds at most (M, N), and what moves the loop there."""
+class _Enclosed(Boxes):
+    """With their figures over bounds at most (M, N), and what moves the loop there."""
 
-    boxes: Boxes
     highest: Array
     spread: Array
 
@@ -45,15 +44,6 @@ class _Enclosed:
 
     def levels(self, names: Sequence[str]) -> dict[str, float]:
         return dict(zip(names, self.highest.max(axis=1, initial=0.0).tolist(), strict=True))
-
-    def only(self, chosen: np.ndarray) -> "_Enclosed":
-        boxes = self.boxes.only(chosen)
-        return _Enclosed(boxes, self.highest[:, chosen], self.spread[:, chosen])
-
-    def beside(self, other: "_Enclosed") -> "_Enclosed":
-        boxes = self.boxes.beside(other.boxes)
-        both = (self.highest, other.highest), (self.spread, other.spread)
-        return _Enclosed(boxes, *map(np.hstack, both))
 
 
 def divided(family: LoopFamily, box: Array, slack: float, share: int, enough: int) -> Division:
@@ -69,7 +59,8 @@ def divided(family: LoopFamily, box: Array, slack: float, share: int, enough: in
         if found.lowest[k, j] > 1.0 + slack:
             middle = tuple((0.5 * (part.low + part.high)[1:, j]).tolist())
             return Division({}, spent, (found.names[k], float(found.lowest[k, j]), middle))
-        here = _Enclosed(part, np.minimum(found.highest, known), found.spread)
+        highest = np.minimum(found.highest, known)
+        here = _Enclosed(part.chart, part.low, part.high, highest, found.spread)
         wide = here.worst > 1.0 + slack
         levels = raised(levels, here.only(~wide).levels(found.names))
         here = here.only(wide)
@@ -80,7 +71,7 @@ def divided(family: LoopFamily, box: Array, slack: float, share: int, enough: in
         order = np.argsort(-waiting.worst, kind="stable")
         first = min(AT_ONCE, max(count // 4, 1))
         worst, waiting = waiting.only(order[:first]), waiting.only(order[first:])
-        part, known = _halved(worst.boxes, worst.spread), np.tile(worst.highest, 2)
+        part, known = _halved(worst), np.tile(worst.highest, 2)
 
 
 def raised(levels: Mapping[str, float], others: Mapping[str, float]) -> dict[str, float]:
@@ -116,12 +107,12 @@ def _first(family: LoopFamily, box: Array) -> Boxes:
     return Boxes(chart, ends[..., 0].T, ends[..., 1].T)
 
 
-def _halved(boxes: Boxes, spread: Array) -> Boxes:
+def _halved(boxes: _Enclosed) -> Boxes:
     """Each box halved along the coordinate that moves its loop most."""
     width = boxes.high - boxes.low
     size = np.maximum(np.abs(boxes.low), np.abs(boxes.high))
     fine = width > 1e-13 * np.maximum(size, 1e-300)
-    score = np.where(fine, np.where(np.isfinite(spread), spread, width), -1.0)
+    score = np.where(fine, np.where(np.isfinite(boxes.spread), boxes.spread, width), -1.0)
     along = np.argmax(score, axis=0)
     rows = np.arange(len(along))
     a, b = boxes.low[along, rows], boxes.high[along, rows]

@@ -6,6 +6,7 @@ x = 1/ω, y = j above it; sampled x = cos(ωT/2), y = (2j/T) sin(ωT/2), z = e^{
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Self
 
 import numpy as np
 
@@ -35,14 +36,14 @@ class Boxes:
     low: Array
     high: Array
 
-    def only(self, chosen: np.ndarray) -> "Boxes":
+    def only(self, chosen: np.ndarray) -> Self:
         """Some of them, by mask or index."""
-        return Boxes(self.chart[chosen], self.low[:, chosen], self.high[:, chosen])
+        return type(self)(*(part[..., chosen] for part in vars(self).values()))
 
-    def beside(self, other: "Boxes") -> "Boxes":
+    def beside(self, other: Self) -> Self:
         """Both."""
-        pairs = ((self.low, other.low), (self.high, other.high))
-        return Boxes(np.append(self.chart, other.chart), *map(np.hstack, pairs))
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return type(self)(*map(np.hstack, pairs))
 
     def omega(self, unit: float, period: float | None) -> tuple[Array, Array]:
         """The ends of ω in rad/s."""

@@ -169,7 +169,8 @@ def judged(
         roots = [poles[i], np.linalg.eigvals(G[i].A), own, free[i].zeros(_size(free[i])), *zeros]
         grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner))
     grid, rows = padded(grids), np.arange(len(good))
-    table = LoopTable([free[i] for i in good], [G[i] for i in good], held, sampling, bounds)
+    table = LoopTable([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
+                      integrator)  # fmt: skip
     if len(free[0].C) > 1:
         grid = with_crossings(table, grid)
     values = table.at(rows, grid)
@@ -177,11 +178,11 @@ def judged(
     rest = low if integrator else table.at(rows, REST * grid[:, :1])
     tops = peaks(table, grid, values)
     loops = [loops[i] for i in good]
-    crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], integrator)
+    crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"])
     norm, confirmed = norms(loops, table.period, *tops["S"])
     channels: list[list[ChannelFigures]] = [[] for _ in good]
     for one in bounds.channels:
-        of_rows, certain = _rows(one, loops, table, grid, values, tops, integrator)
+        of_rows, certain = _rows(one, loops, table, grid, values, tops)
         for k, figures in enumerate(of_rows):
             channels[k].append(figures)
             if one.bandwidth_ratio > 1.0:
@@ -219,7 +220,6 @@ def _rows(
     grid: Array,
     values: dict[str, Array],
     tops: dict[str, tuple[Array, Array]],
-    integrator: bool,
 ) -> tuple[list[ChannelFigures], np.ndarray]:
     """The figures of one channel's row on every plant, and whether its peak is confirmed."""
     if not bounds.given:
@@ -227,7 +227,7 @@ def _rows(
     curve, u = f"S of {bounds.name}", np.array([bounds.output])
     rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
     norm, confirmed = norms(rows, table.period, *tops[curve])
-    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, bounds.output)
+    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], bounds.output)
     missing = np.full(len(grid), np.nan)
     weighted = tops.get(f"weighted KS of {bounds.name}", (missing, missing))[0]
     columns = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1).tolist()

@@ -5,13 +5,13 @@ Grids run through every pole and zero of plant, controller and closed loop. Loca
 all plants at once: no derivative is taken, as the synthesis does.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable
-from ccd_casadi.lti.grid import frequency_grid, root_flanks
+from ccd_casadi.lti.grid import frequency_grid, root_flanks, zoomed
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.support.arrays import Array
 
@@ -21,7 +21,6 @@ FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 
 APART = 1e-9  # relative: grid points that are closer count as one
 NEAR = 0.9  # of the height that counts: local maxima below it lie below it between points too
 FINER = 41  # points in such a maximum's bracket of a lesser singular value
-ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 SECTIONS = 17  # of a bracket in ten: to rounding
 
 
@@ -94,7 +93,7 @@ def peaks(
     def own(points: Array) -> Array:
         return np.asarray(np.stack(list(table.at(which, points).values()))[curve, rows])
 
-    where, peak = _zoomed(own, grid[which, at - 1], grid[which, at + 1])
+    where, peak = zoomed(own, grid[which, at - 1], grid[which, at + 1])
     for number, (value, frequency) in enumerate(tops.values()):
         mine = rows[curve == number]
         mine = mine[np.argsort(peak[mine])]  # of those of one plant the highest is written last
@@ -111,21 +110,8 @@ def _maxima(grid: Array, value: Array, least: Array) -> tuple[np.ndarray, np.nda
     return i, j + 1
 
 
-def _zoomed(function: Callable[[Array], Array], low: Array, high: Array) -> tuple[Array, Array]:
-    """Where N brackets that close in on a maximum end, and its value; `function` of (N, 11)."""
-    if not len(low):
-        return low, low
-    rows = np.arange(len(low))
-    for _ in range(ZOOMS):
-        points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
-        found = function(points)
-        i = np.argmax(found, axis=1)
-        low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
-    return points[rows, i], found[rows, i]
-
-
 def crossing_and_bandwidth(
-    table: LoopTable, grid: Array, S: Array, integrator: bool, row: Sequence[float] | None = None
+    table: LoopTable, grid: Array, S: Array, row: Sequence[float] | None = None
 ) -> tuple[Array, Array]:
     """The first ω with |S| = 1/√2 of every plant (NaN where there is none), and the largest ω_b
     that keeps the shape below it (0 there).
@@ -135,7 +121,7 @@ def crossing_and_bandwidth(
     # A peak between two points of the grid may pass -3 dB where both stay below.
     i, j = _maxima(grid, S, np.full(len(S), NEAR * HALF_POWER))
     i, j = i[S[i, j] <= HALF_POWER], j[S[i, j] <= HALF_POWER]
-    where, peak = _zoomed(lambda x: table.sensitivity(i, x, row), grid[i, j - 1], grid[i, j + 1])
+    where, peak = zoomed(lambda x: table.sensitivity(i, x, row), grid[i, j - 1], grid[i, j + 1])
     most = int(np.bincount(i).max(initial=0))
     more, heights = np.tile(grid[:, -1:], most), np.tile(S[:, -1:], most)
     place = np.arange(len(i)) - np.searchsorted(i, i)
@@ -155,7 +141,7 @@ def crossing_and_bandwidth(
         low, high = points[each, past], points[each, past + 1]
     crossing[good], bandwidth[good] = low, low
     if table.bounds.shape is not None:
-        bandwidth[good] = _within_shape(table, grid[good], S[good], good, low, integrator, row)
+        bandwidth[good] = _within_shape(table, grid[good], S[good], good, low, row)
     return crossing, bandwidth
 
 
@@ -165,7 +151,6 @@ def _within_shape(
     S: Array,
     which: np.ndarray,
     crossing: Array,
-    integrator: bool,
     row: Sequence[float] | None,
 ) -> Array:
     """The largest ω_b of plants `which` (P,) that keeps the shape below |S|.
@@ -178,7 +163,8 @@ def _within_shape(
     scale = bounds.shape * HALF_POWER
 
     def room(x: Array, S: Array) -> Array:
-        return np.asarray(scale * (x if integrator else np.maximum(x, bounds.omega_low)) / S)
+        counted = x if table.integrator else np.maximum(x, bounds.omega_low)
+        return np.asarray(scale * counted / S)
 
     short = bounds.shape_ends is ShapeEnd.CROSSING
     ends = crossing if short else grid[:, -1]
@@ -187,7 +173,7 @@ def _within_shape(
     value = np.concatenate([known, room(finer, table.sensitivity(which, finer, row))], axis=1)
     omega, value = _sorted(np.concatenate([grid, finer], axis=1), value)
     i, j = _maxima(omega, -value, -crossing / NEAR)
-    where, least = _zoomed(lambda x: -room(x, table.sensitivity(which[i], x, row)),
+    where, least = zoomed(lambda x: -room(x, table.sensitivity(which[i], x, row)),
                            omega[i, j - 1], np.minimum(omega[i, j + 1], ends[i]))  # fmt: skip
     dips = np.concatenate([i, np.tile(np.arange(len(which)), 2)])
     last = np.argmax(np.where(omega <= ends[:, None], omega, 0.0), axis=1)

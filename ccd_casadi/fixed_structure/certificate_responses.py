@@ -57,7 +57,7 @@ class Triangular:
 
 class LoopTable:
     """The loops of a set of plants: `free` and `G` of the plants without and with hold and delay,
-    K of the controller.
+    K of the controller, which may have an `integrator`.
     """
 
     def __init__(
@@ -67,11 +67,12 @@ class LoopTable:
         K: StateSpace,
         sampling: Sampling | None,
         bounds: Bounds,
+        integrator: bool = True,
     ) -> None:
         self.G, self.K = Triangular(G), Triangular([K])
         self.free = self.G if sampling is None else Triangular(free)
         self.period = None if sampling is None else sampling.period
-        self.bounds = bounds
+        self.bounds, self.integrator = bounds, integrator
 
     def at(self, which: np.ndarray, omega: Array) -> dict[str, Array]:
         """Every curve (N, k) of the plants `which` (N,) at ω (N, k) in rad/s."""

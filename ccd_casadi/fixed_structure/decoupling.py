@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -142,7 +141,7 @@ def channel_plant(plant: ScaledPlant, decoupling: Decoupling, number: int) -> Sc
 def _apart(coupled: bytes, states: int) -> tuple[int, np.ndarray]:
     """How many parts of A have no entry between each other, and which one each state is of."""
     pattern = np.frombuffer(coupled, bool).reshape(states, states)
-    count, group = connected_components(csr_array(pattern), directed=False)
+    count, group = scipy.sparse.csgraph.connected_components(pattern, directed=False)
     return int(count), group
 
 

@@ -20,6 +20,7 @@ from ccd_casadi.support.arrays import Array
 
 FIRST_RADIUS, LARGEST_RADIUS = 0.2, 1.5
 PENALTY = 20.0  # above the sum of multipliers: a per cent of a bound is worth so many of ω_b
+RESTORING = 400.0  # that of an end that is to be brought within its bounds
 PENALTIES = (20.0, 200.0, 2000.0)  # of a goal; the next one where a bound is left passed
 LEAST_RADIUS, LEAST_GAIN = 1e-7, 1e-9
 MOST = 200  # steps with one penalty
@@ -64,8 +65,10 @@ class LoopModel(Model[Assessment]):
         goal: Goal | None = None,
         reward: float = 1.0,
         floor: float = -np.inf,
+        restoring: bool = False,
     ) -> None:
         self.problem, self.goal, self.reward = problem, goal, reward
+        self.restoring = restoring
         # A step that fails is followed by one from the same place.
         self.all_rows = lru_cache(2)(
             lambda here: all_rows(problem, here.x[:-1], float(here.x[-1]), here.data)
@@ -131,16 +134,19 @@ def ascend(
     radius: float = FIRST_RADIUS,
     least_radius: float = 1e-6,
     least_gain: float = 1e-8,
-    penalty: float = PENALTY,
+    restoring: bool = False,
 ) -> Ascent:
-    """Climb to a larger ω_b from a start whose loops are stable; ends where steps do not help."""
-    model = LoopModel(problem)
+    """Climb to a larger ω_b from a start whose loops are stable; ends where steps do not help.
+
+    `restoring`: first of all within the bounds, whatever that costs of ω_b.
+    """
+    model = LoopModel(problem, restoring=restoring)
     begin = model.assessed(start.kappa, start.tau, start.assessment)
     assert begin is not None
     n = len(begin.x)
     end = minimise(
         model, begin, np.zeros((n, n)), Radius(radius, least_radius, LARGEST_RADIUS),
-        steps=iterations, penalty=penalty, least_gain=least_gain,
+        steps=iterations, penalty=RESTORING if restoring else PENALTY, least_gain=least_gain,
     )  # fmt: skip
     x = end.best.x
     point = Point(x[:-1], float(x[-1]), end.best.data)

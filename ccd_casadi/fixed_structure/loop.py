@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels
+from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels, in_units_of
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.lti.hold import Sampling, delayed, in_w, moments, transfer
@@ -217,9 +217,8 @@ def plant_set(
     omega_0, force = plants[0].omega_0, plants[0].force
     period = None if sampling is None else sampling.period * omega_0
     delay = 0.0 if sampling is None else sampling.delay * omega_0
-    found = tuple(
-        _loop_plant(plant, f"plant {i}", omega_0, force) for i, plant in enumerate(plants, 1)
-    )
+    alike = (in_units_of(plant, plants[0]) for plant in plants)
+    found = tuple(_loop_plant(plant, f"plant {i}") for i, plant in enumerate(alike, 1))
     # Shorter plants have residues of zero.
     most, (p, m) = max(len(one.poles) for one in found), found[0].system.D.shape
     poles = np.full((len(found), most), -1.0, complex)
@@ -262,20 +261,17 @@ def all_stable(poles: np.ndarray) -> np.ndarray:
         return np.asarray((poles.real < 0.0).all(-1))
 
 
-def _loop_plant(plant: ScaledPlant, name: str, omega_0: float, force: float) -> LoopPlant:
-    ratio, drive = plant.omega_0 / omega_0, plant.omega_0 / omega_0 * force / plant.force
-    A, B, C = ratio * plant.A, drive * plant.B, plant.C
-    poles, V = np.linalg.eig(A)
+def _loop_plant(plant: ScaledPlant, name: str) -> LoopPlant:
+    poles, V = np.linalg.eig(plant.A)
     if not (poles.real < 0.0).all():
         words = "is not stable; a suspension has to hold its rigid-body modes"
         raise PlantError(f"{name} {words}")
     W = np.linalg.inv(V)
-    b, c = W @ B, C @ V
-    system = strictly_proper(A, B, C)
+    b, c = W @ plant.B, plant.C @ V
+    system = strictly_proper(plant.A, plant.B, plant.C)
     direct = system.at(PROBES)
     modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (PROBES[:, None] - poles), b)
     if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
         words = "has poles that coincide and are coupled; move a damping ratio away from 1"
         raise PlantError(f"{name} {words}")
-    dA = W @ (ratio * plant.dA) @ V
-    return LoopPlant(system, V, W, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)
+    return LoopPlant(system, V, W, poles, b, c, W @ plant.dA @ V, W @ plant.dB, plant.dC @ V)

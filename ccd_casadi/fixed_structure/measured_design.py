@@ -12,6 +12,7 @@ Uᵀ G V first, and the search on the whole begins where these are stable togeth
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import cast
 
 import numpy as np
@@ -103,7 +104,7 @@ def design_on_data(
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent)
     best: MeasuredDesign | None = None
     for runner in finished(run_race(problem, np.array(pool), tell, workers)):
-        end = ascend(problem, runner.point, iterations=60, radius=1e-2, penalty=400.0)
+        end = ascend(problem, runner.point, iterations=60, radius=1e-2, restoring=True)
         spent += runner.evaluations + end.evaluations
         kappa = _more_integral(problem, end.point, given_up) if given_up else end.point.kappa
         design = _judged(problem, kappa, period, spent)
@@ -175,11 +176,7 @@ def _pool(problem: LineProblem, starts: int, rng: np.random.Generator) -> list[A
 
 def _some(problem: LineProblem, kappa: Array, most: int) -> list[Array]:
     """The first `most` that are stable."""
-    found: list[Array] = []
-    for one in kappa:
-        if len(found) < most and problem.stable(one):
-            found.append(one)
-    return found
+    return list(islice(filter(problem.stable, kappa), max(most, 0)))
 
 
 def _channels_stacked(

@@ -23,7 +23,6 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
-RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 Progress = Callable[[str], None]
 
@@ -188,7 +187,7 @@ class DesignSearch:
         optima = local_optima(problem, ends)
         for point in (runner.point for runner in ends):
             if point.assessment.violation > MARGIN:
-                again = ascend(problem, point, iterations=30, penalty=RESTORING, radius=0.02)
+                again = ascend(problem, point, iterations=30, restoring=True, radius=0.02)
                 evaluations += again.evaluations
                 point = again.point
             last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,

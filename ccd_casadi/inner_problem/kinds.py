@@ -37,7 +37,8 @@ RESIDUAL = 1e-3  # relative; above it the point is no stationary one and has no 
 
 
 class InnerKind(ABC):
-    """One kind of controller, for a problem.
+    """One kind of controller, for a problem; by default on the plant of the case alone, with S_max
+    and S_low.
 
     `slack`: relative, by how much its judge lets a bound be exceeded. `as_designed`: its
     controllers run as they are, without being reduced.
@@ -61,21 +62,22 @@ class InnerKind(ABC):
     def require_function(self) -> None:
         """Raise UserError where v(θ) is not yet one function of θ."""
 
-    @abstractmethod
     def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
         """The plants on which the controller's figures count, the model first."""
+        return [scaled_plant(self.problem, theta)]
 
-    @abstractmethod
     def bounds(self) -> Bounds:
         """The bounds on every plant, SI."""
+        inner = self.problem.inner
+        return Bounds(inner.S_max, inner.S_low, inner.omega_low)
 
-    @abstractmethod
     def common_shifts(self) -> tuple[float, float]:
         """The common resonance shifts, down and up, that its set holds at the model's damping."""
+        return 0.0, 0.0
 
-    @abstractmethod
     def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
         """The extreme factors of damping and of gain in its set."""
+        return (1.0,), (1.0,)
 
     @abstractmethod
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
@@ -103,13 +105,6 @@ class MixedSensitivity(InnerKind):
 
     def require_function(self) -> None:
         """It always is."""
-
-    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
-        return [scaled_plant(self.problem, theta)]
-
-    def bounds(self) -> Bounds:
-        inner = self.problem.inner
-        return Bounds(inner.S_max, inner.S_low, inner.omega_low)
 
     def common_shifts(self) -> tuple[float, float]:
         shift = 0.0 if self.problem.robust is None else self.problem.robust.shift
@@ -159,10 +154,8 @@ class FixedStructure(InnerKind):
 
     def common_shifts(self) -> tuple[float, float]:
         u = structured_of(self.problem).uncertainty
-        low, high = (
-            (1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) - 1.0 for s in (-1, 1)
-        )
-        return low, high
+        low, high = ((1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) for s in (-1, 1))
+        return low - 1.0, high - 1.0
 
     def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
         u = structured_of(self.problem).uncertainty
@@ -170,23 +163,18 @@ class FixedStructure(InnerKind):
 
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         """The shape, and weighted_level/|W| of KS (N/m) and T."""
-        problem, structured = self.problem, structured_of(self.problem)
-        level, shape = (
-            np.nan if value is None else value
-            for value in (structured.weighted_level, structured.shape)
-        )
+        inner, structured = self.problem.inner, structured_of(self.problem)
+        level, shape = (value or np.nan for value in (structured.weighted_level, structured.shape))
 
         def over(hz: Array) -> Array:
-            size = np.abs(problem.weights.responses(HZ * hz))
+            size = np.abs(self.problem.weights.responses(HZ * hz))
             below = hz <= bandwidth_hz
             rising = shape * hz / bandwidth_hz * 2.0**-0.5
             most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
-            holds = (below | (structured.shape_ends is ShapeEnd.S_MAX)) & (
-                most <= problem.inner.S_max
-            )
+            counts = below | (structured.shape_ends is ShapeEnd.S_MAX)
+            holds = counts & (most <= inner.S_max)
             return np.array([np.where(holds, most, np.nan), *(level / size[1:])])
 
-        inner = problem.inner
         words = ("its shape", "weighted_level/|W_KS|", "weighted_level/|W_T|")
         return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words,
                        structured.compliance_max, True)  # fmt: skip

@@ -69,7 +69,7 @@ class PlantSource:
             "source": digest,
             "options": options,
             **({"fixed": self.held} if self.fixed else {}),
-            **({"places": vars(self.places)} if self.places else {}),
+            **({"places": self.places.identity} if self.places else {}),
             **({"motion": repr(self.motion)} if self.motion else {}),
         }
 

@@ -84,12 +84,12 @@ class CoDesignProblem(NotebookHtml):
     weights: Weights
     inner: InnerBounds
     suspension: Suspension
-    method: str = "search"  # how the inner problem is solved: "search" or "sweep"
+    method: str = "search"
     robust: RobustSet | None = None
     controller: ControllerProblem = field(default_factory=MixedSensitivityProblem)
-    budget: ErrorBudget | None = None  # what moves the stage: judged, no part of a synthesis
-    cost_unit: str = ""  # of f(θ)
-    listed: tuple[tuple[str, tuple[float, ...]], ...] = ()  # parameters that are one of a few
+    budget: ErrorBudget | None = None
+    cost_unit: str = ""
+    listed: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
@@ -286,15 +286,6 @@ def true_design(
         raise ValueError("a synthesis needs one design plant: take one of design_choices(problem)")
     return evaluate(
         scaled_plant(problem, theta), problem.weights, problem.inner, (omega_S, omega_T)
-    )
-
-
-def frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[float, float]:
-    """ω_S, ω_T from their logarithms; exp(log(bound)) may miss the bound by a rounding error."""
-    inner = problem.inner
-    return (
-        float(np.clip(np.exp(x[-2]), *inner.omega_S)),
-        float(np.clip(np.exp(x[-1]), *inner.omega_T)),
     )
 
 

@@ -6,10 +6,12 @@ are synthesised and added until the interpolant has no better place to offer. A 
 solve then ends on the true functions, as after a sweep.
 """
 
+from functools import partial
+
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, refine
+from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, Point, evaluate, refine
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -31,7 +33,12 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> 
     width = bounds[:, 1] - bounds[:, 0]
     grids = [np.linspace(0.0, 1.0, n) for n in INITIAL]
     points = [np.array([a, b]) for a in grids[0] for b in grids[1]]
-    designs = [_design(plant, weights, problem, bounds, point) for point in points]
+    at = partial(evaluate, plant, weights, problem)
+
+    def design(point: Array) -> Sensitivities:
+        return at(problem.frequencies(bounds[:, 0] + point * width))
+
+    designs = [design(point) for point in points]
     fine = np.linspace(0.0, 1.0, FINE)
     for _ in range(ADDED):
         usable = [i for i, design in enumerate(designs) if design.figures.certified]
@@ -44,13 +51,13 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> 
         if new is None:
             break
         points.append(new)
-        designs.append(_design(plant, weights, problem, bounds, new))
+        designs.append(design(new))
     rows = [design.figures for design in designs]
     left = BUDGET - sum(row.certified for row in rows)
-    return refine(plant, weights, problem, rows, _starts(problem, rows), left)
+    return refine(at, problem, rows, _starts(problem, rows), left)
 
 
-def _starts(problem: InnerBounds, rows: list[DesignFigures]) -> list[tuple[float, float]]:
+def _starts(problem: InnerBounds, rows: list[DesignFigures]) -> list[Point]:
     """The best feasible design, else the best within 2 % of feasible, else the nearest to it."""
 
     def rank(row: DesignFigures) -> tuple[int, float]:
@@ -61,14 +68,6 @@ def _starts(problem: InnerBounds, rows: list[DesignFigures]) -> list[tuple[float
 
     chosen = min((row for row in rows if row.certified), key=rank, default=None)
     return [] if chosen is None else [(chosen.omega_S, chosen.omega_T)]
-
-
-def _design(
-    plant: ScaledPlant, weights: Weights, problem: InnerBounds, bounds: Array, point: Array
-) -> Sensitivities:
-    x = bounds[:, 0] + point * (bounds[:, 1] - bounds[:, 0])
-    omega = np.clip(np.exp(x), *np.array([problem.omega_S, problem.omega_T]).T)
-    return evaluate(plant, weights, problem, (float(omega[0]), float(omega[1])))
 
 
 def _slopes(design: Sensitivities, width: Array) -> Array:

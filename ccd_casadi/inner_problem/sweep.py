@@ -7,14 +7,15 @@ The feasible set can be disconnected. The paper's sweep covers the box; every lo
 the sweep, feasible or nearly so, then starts a local constrained solve with exact derivatives.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.optimize import minimize
 
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -28,6 +29,8 @@ MARGIN = 1e-9
 NEAR = 1e-3  # of ln ω: how near to an uncertified design a local solve looks for a better one
 STARTS = 6  # local solves after a sweep, at most
 ACTIVE = 1e-5  # relative distance within which a constraint counts as binding
+Point = tuple[float, float]  # ω_S, ω_T in rad/s
+At = Callable[[Point], Sensitivities]  # one certified synthesis with its derivatives
 LABELS = {
     "S_max": "peak of S",
     "S_low": "|S(j omega_low)|",
@@ -84,6 +87,11 @@ class InnerBounds:
             getattr(figures, name) <= bound for name, bound in self.bounds.values()
         )
 
+    def frequencies(self, x: Sequence[float] | Array) -> Point:
+        """From their logarithms, the last two of x; exp(log(bound)) may miss it by rounding."""
+        S, T = np.clip(np.exp(x[-2]), *self.omega_S), np.clip(np.exp(x[-1]), *self.omega_T)
+        return float(S), float(T)
+
     def axes(self) -> tuple[Array, Array]:
         """Logarithmic sweep grids of ω_S and ω_T."""
         return (
@@ -123,15 +131,15 @@ class InnerResult(NotebookHtml):
 def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> InnerResult:
     """The paper's sweep over the whole box, refined to the continuous optimum."""
     rows = sweep(plant, weights, *problem.axes(), **problem.synthesis_options)
-    return refine(plant, weights, problem, rows, sweep_starts(problem, rows))
+    at = partial(evaluate, plant, weights, problem)
+    return refine(at, problem, rows, sweep_starts(problem, rows))
 
 
 def refine(
-    plant: ScaledPlant,
-    weights: Weights,
+    at: At,
     problem: InnerBounds,
     rows: Sequence[DesignFigures],
-    starts: Iterable[tuple[float, float]],
+    starts: Iterable[Point],
     limit: int = 40,
 ) -> InnerResult:
     """Local constrained solves from `starts` (rad/s); the best feasible design of all wins.
@@ -141,7 +149,7 @@ def refine(
     tried = list(rows)
     best: Sensitivities | None = None
     for start in starts:
-        for step in local_solve(plant, weights, problem, start, limit):
+        for step in local_solve(at, problem, start, limit):
             tried.append(step.figures)
             if problem.feasible(step.figures) and (
                 best is None or step.figures.bandwidth > best.figures.bandwidth
@@ -151,7 +159,7 @@ def refine(
     for row in sorted(swept, key=lambda row: -row.bandwidth):
         if best is not None and best.figures.bandwidth >= row.bandwidth:
             break
-        other = evaluate(plant, weights, problem, (row.omega_S, row.omega_T))
+        other = at((row.omega_S, row.omega_T))
         tried.append(other.figures)
         if problem.feasible(other.figures):  # not where its derivatives are lost
             best = other
@@ -166,13 +174,13 @@ def refine(
 
 
 def evaluate(
-    plant: ScaledPlant, weights: Weights, problem: InnerBounds, point: tuple[float, float]
+    plant: ScaledPlant, weights: Weights, problem: InnerBounds, point: Point
 ) -> Sensitivities:
     """One certified synthesis with derivatives at (ω_S, ω_T) in rad/s."""
     return sensitivities(plant, weights.at(*point), **problem.synthesis_options)
 
 
-def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[tuple[float, float]]:
+def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[Point]:
     """Local maxima of ln ω_b - 3·violation over the sweep grid, best first.
 
     Designs a little outside the bounds count too: a feasible sliver may lie between grid points.
@@ -197,11 +205,7 @@ class _Uncertified(Exception):
 
 
 def local_solve(
-    plant: ScaledPlant,
-    weights: Weights,
-    problem: InnerBounds,
-    start: tuple[float, float],
-    limit: int = 40,
+    made_at: At, problem: InnerBounds, start: Point, limit: int = 40
 ) -> list[Sensitivities]:
     """Maximise ln ω_b from `start` by SLSQP over (ln ω_S, ln ω_T); every design on the way.
 
@@ -218,8 +222,7 @@ def local_solve(
         if key not in seen:
             if len(seen) >= limit:
                 raise _Uncertified
-            point = np.clip(np.exp(clipped), *np.array([problem.omega_S, problem.omega_T]).T)
-            seen[key] = evaluate(plant, weights, problem, (float(point[0]), float(point[1])))
+            seen[key] = made_at(problem.frequencies(clipped))
         if not seen[key].figures.certified:
             raise _Uncertified
         return seen[key]
@@ -227,7 +230,7 @@ def local_solve(
     def climbed(x: Array, low: Array, high: Array) -> bool:
         """Whether SLSQP ended without an uncertified design on the way."""
         try:
-            minimize(
+            scipy.optimize.minimize(
                 lambda x: -np.log(at(x).values[0]),
                 x,
                 jac=lambda x: -at(x).to_break_frequencies[0] / at(x).values[0],

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, scaled_plant, true_design
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.synthesis.closed_loop import recertified_in_si
@@ -75,7 +75,7 @@ class TrueQuantities(VectorCallback):
         x = np.asarray(x, float).ravel()
         key = x.tobytes()
         if key not in self.designs:
-            at = frequencies(self.problem, x)
+            at = self.problem.inner.frequencies(x)
             make = partial(true_design, self.problem, tuple(x[:-2]), *at)
             self.designs[key] = make() if self.kept is None else self.kept(x, make)
         return self.designs[key]

@@ -7,7 +7,7 @@ scaling of the discs is one. Outside only what `certificate` has shown counts.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from ccd_casadi.limitations.basis import Basis
 from ccd_casadi.limitations.certificate import rules_out
@@ -108,7 +108,7 @@ def pointwise(limits: Limits) -> float:
         return np.inf if not limits.period else float(np.exp(high))
     if slack(low) < 0.0:
         return float(np.exp(low))
-    found = brentq(slack, low, high, xtol=1e-4)
+    found = scipy.optimize.brentq(slack, low, high, xtol=1e-4)
     while slack(found) >= 0.0:
         found += 1e-3
     return float(np.exp(found))

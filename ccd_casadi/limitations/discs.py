@@ -11,7 +11,7 @@ the circles are those of r₀ with m_S/(1 - δ m_T) and m_T (1 + δ)/(1 - δ m_T
 """
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 
 from ccd_casadi.limitations.limits import FAITHFUL, Limits, Response
 from ccd_casadi.support.arrays import Array
@@ -49,7 +49,7 @@ def ratio(one: Response, other: Response, low: Array, high: Array) -> tuple[np.n
         return np.asarray(np.hypot(p.real, gap))
 
     for mine, yours in ((one.zeros, other.zeros), (one.poles, other.poles)):
-        rows, columns = linear_sum_assignment(np.abs(mine[:, None] - yours[None, :]))
+        rows, columns = scipy.optimize.linear_sum_assignment(np.abs(mine[:, None] - yours[None, :]))
         for a, b in zip(mine[rows], yours[columns], strict=True):
             slope += abs(a - b) / (near(a) * near(b))
         for p in (*np.delete(mine, rows), *np.delete(yours, columns)):

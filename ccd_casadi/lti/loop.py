@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, sensitivity, sigma_max
-from ccd_casadi.lti.grid import frequency_grid, root_flanks
+from ccd_casadi.lti.grid import frequency_grid, root_flanks, zoomed
 from ccd_casadi.lti.hold import Sampling, sampled, transfer, tustin
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.support.arrays import Array
@@ -20,7 +20,6 @@ from ccd_casadi.support.arrays import Array
 PER_DECADE = 60
 APART = 1e-7  # relative: closer points of the grid differ in gain by rounding alone
 NEAR = 0.9  # of the largest gain on the grid: local maxima below it lie below it between points too
-ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 
 
 @dataclass(frozen=True)
@@ -34,27 +33,19 @@ class Loop:
     controller: StateSpace
     sampling: Sampling | None = None
 
-    def plant_response(self, omega: Array) -> np.ndarray:
-        """G (k, p, m) at ω (k,) in rad/s, hold and delay in it."""
-        if self.sampling is None:
-            return self.plant.swept(omega)
-        if self.plant.modes is None:
-            return self.as_run[0].response(omega)
+    def responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G (k, p, m), hold and delay in it, and K (k, m, p) as they run, at ω (k,) in rad/s."""
+        G, K = self.as_run
+        if self.sampling is None or self.plant.modes is None:
+            return G.swept(omega), K.swept(omega)
         poles, drive, reading = self.plant.modes
         f, _ = transfer(poles, omega, self.sampling.period, self.sampling.delay)
-        return np.asarray((reading * f[:, None, :]) @ drive)
-
-    def controller_response(self, omega: Array) -> np.ndarray:
-        """K (k, m, p) at ω (k,) in rad/s."""
-        return self.as_run[1].swept(omega)
-
-    def responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G (k, p, m) and K (k, m, p) as they run, at ω (k,) in rad/s."""
-        return self.plant_response(omega), self.controller_response(omega)
+        return np.asarray((reading * f[:, None, :]) @ drive), K.swept(omega)
 
     def sensitivity(self, omega: Array) -> np.ndarray:
         """S = (I + GK)⁻¹ (k, p, p)."""
-        return sensitivity(self.plant_response(omega) @ self.controller_response(omega))
+        G, K = self.responses(omega)
+        return sensitivity(G @ K)
 
     @cached_property
     def closed(self) -> ClosedLoop:
@@ -101,19 +92,15 @@ class Loop:
     @cached_property
     def peak(self) -> float:
         """‖S‖∞ of a stable loop: every local maximum on the grid near the largest closed in on."""
+
+        def gain(omega: Array) -> Array:
+            return sigma_max(self.sensitivity(omega.ravel())).reshape(omega.shape)
+
         grid = self.grid()
-        S = sigma_max(self.sensitivity(grid))
-        top = float(S.max())
+        S = gain(grid)
         at = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
-        at = at[S[at] > NEAR * top]
-        low, high, rows = grid[at - 1], grid[at + 1], np.arange(len(at))
-        for _ in range(ZOOMS if len(at) else 0):
-            points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
-            found = sigma_max(self.sensitivity(points.ravel())).reshape(points.shape)
-            i = found.argmax(axis=1)
-            top = max(top, float(found.max()))
-            low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
-        return top
+        at = at[S[at] > NEAR * S.max()]
+        return float(max(S.max(), *zoomed(gain, grid[at - 1], grid[at + 1])[1]))
 
     @cached_property
     def as_run(self) -> tuple[StateSpace, StateSpace]:

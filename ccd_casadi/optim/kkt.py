@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from scipy.linalg import null_space
-from scipy.optimize import nnls
 
 from ccd_casadi.support.arrays import Array
 
@@ -132,7 +132,7 @@ def non_negative(rows: Array, goal: Array) -> tuple[Array, float]:
     """μ >= 0 (m,) that brings rowsᵀ μ nearest to `goal` (n,), and what is missing over ‖goal‖∞."""
     mu = np.zeros(len(rows))
     if len(rows):
-        mu = nnls(rows.T, goal, maxiter=100 * len(rows))[0]
+        mu = scipy.optimize.nnls(rows.T, goal, maxiter=100 * len(rows))[0]
     return mu, float(np.abs(goal - mu @ rows).max()) / max(float(np.abs(goal).max()), 1e-300)
 
 

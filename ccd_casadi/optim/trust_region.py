@@ -129,6 +129,7 @@ class Model(ABC, Generic[Data]):
     carried = False  # whether σ >= 0 falls away: f is the largest row
     corrected = False  # whether a trial that gains too little is corrected to second order
     growing = False  # whether the penalty grows with the multipliers
+    restoring = False  # whether the merit counts the whole penalty: the rows go before the goal
     # Whether a row that ends below its bound by little of what it moves counts with its curvature,
     # as it may bend over it. Searches over K alone end in better optima without.
     bending = False
@@ -259,7 +260,7 @@ def best_step(
         way, mu = found[0] - p, found[1]
         if model.growing:
             penalty = max(FADING * penalty, 2.0 * float(mu.sum()))
-        elif rows.curved:
+        elif rows.curved and not model.restoring:
             penalty = min(weight, TIMES * float(mu.sum() + unit))
         if turn == 0:
             straight = float(gains(way[None])[0])

@@ -4,6 +4,12 @@
 
 All act by the columns of Q after the quiet ones. They have length 1 and are normal to each other
 and to what quiet modes show at the points.
+
+Or they act as loads at reference points would, and read what moves there:
+
+    f = (V_ref V⁺)ᵀ u,   y_ref = V_ref V⁺ y,   V = [1, x, y, x y] at the points
+
+f are the least forces that do the work of the loads u on every motion V.
 """
 
 from collections.abc import Sequence
@@ -27,6 +33,24 @@ def in_axes(
     A, dA = W.T @ motions, dW.transpose(0, 2, 1) @ motions + W.T @ dmotions
     Q, dQ = (part[..., quiet:] for part in _orthonormal(A, dA))
     return W @ Q, dW @ Q + W @ dQ
+
+
+def at_reference(W: Array, dW: Array, nodes: Array, reference: Array) -> tuple[Array, Array]:
+    """Weights of nodes (N, m) combined to those of three or four points (p, 2), and the slopes.
+
+    V has as many columns as there are points. Raises PlantError where W does not tell them apart.
+    """
+    here, there = (
+        np.column_stack([np.ones(len(points)), points, points.prod(axis=1)])[:, : len(reference)]
+        for points in (nodes, reference)
+    )
+    V, dV = W.T @ here, dW.transpose(0, 2, 1) @ here
+    if np.linalg.cond(V / np.abs(here).max(axis=0)) > 1e6:
+        raise PlantError("places: forces or sensors are on one line; move one, or drop reference")
+    inverse, beyond = np.linalg.pinv(V), np.linalg.inv(V.T @ V) @ dV.transpose(0, 2, 1)
+    slope = beyond - beyond @ V @ inverse - inverse @ dV @ inverse
+    N, dN = there @ inverse, there @ slope
+    return W @ N.T, dW @ N.T + W @ dN.transpose(0, 2, 1)
 
 
 def followed_modes(

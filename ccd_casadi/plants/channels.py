@@ -12,7 +12,7 @@ combination of them, which are those of all of them where they can be diagonalis
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from ccd_casadi.support.arrays import Array
 
@@ -88,5 +88,5 @@ def _singular_vectors(residues: Array) -> tuple[Array, Array, Array]:
 
 def _components(linked: np.ndarray) -> list[np.ndarray]:
     """Connected components of a symmetric relation, each sorted, in order of their first."""
-    count, label = connected_components(linked, directed=False)
+    count, label = scipy.sparse.csgraph.connected_components(linked, directed=False)
     return [np.flatnonzero(label == i) for i in range(count)]

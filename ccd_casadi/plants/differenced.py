@@ -20,10 +20,7 @@ from ccd_casadi.plants.plant import (
     ModelFunction,
     Plant,
     build_plant,
-    check_keys,
-    check_shapes,
-    check_sizes,
-    checked_ratio,
+    model_parts,
     named_values,
 )
 from ccd_casadi.support.arrays import Array
@@ -81,25 +78,16 @@ class _Values:
     """What a model returns at one θ, as arrays when they are asked for; `scalars` are f and λ."""
 
     def __init__(self, result: Mapping[str, Any]) -> None:
-        check_keys(result)
-        self._result = result
-        constraints = dict(result.get("constraints", {}))
-        self.constraint_names = tuple(constraints)
-        scalars = {"hardware_cost": result["hardware_cost"], **constraints}
-        self.scalars = np.array([_number(key, value) for key, value in scalars.items()])
+        self._matrices, self._ratio, scalars = model_parts(result, ca.DM)
+        self.constraint_names = tuple(scalars)[1:]
+        self.scalars = np.array([float(value) for value in scalars.values()])
 
     @cached_property
     def system(self) -> Mechanics:
         """M, D, K, B, C, with derivatives to no parameter."""
-        result = self._result
-        sparse = [ca.DM(result[key]) for key in ("mass", "stiffness", "input", "output")]
-        check_sizes(sparse[0].shape[0], sparse[2].shape[1], sparse[3].shape[0])
-        M, K, B, C = (_array(matrix) for matrix in sparse)
-        D = _array(result["damping"]) if "damping" in result else np.zeros_like(M)
-        check_shapes(M, D, K, B, C)
-        ratio = checked_ratio(result.get("damping_ratio"))
+        M, D, K, B, C = (np.array(matrix, dtype=float) for matrix in self._matrices)
         none = tuple(np.zeros((0, *matrix.shape)) for matrix in (M, D, K, B, C))
-        return Mechanics(M, D, K, B, C, ratio, none)  # type: ignore[arg-type]
+        return Mechanics(M, D, K, B, C, self._ratio, none)  # type: ignore[arg-type]
 
 
 class DifferencedModel:
@@ -269,17 +257,6 @@ class DifferencedModel:
 
     def _call(self, theta: tuple[float, ...]) -> _Values:
         return _Values(self._model(dict(zip(self.names, theta, strict=True)), **self._options))
-
-
-def _number(key: str, value: Any) -> float:
-    found = ca.DM(value)
-    if found.shape != (1, 1):
-        raise PlantError(f"{key} is {found.shape}, not a scalar; return one number")
-    return float(found)
-
-
-def _array(value: Any) -> Array:
-    return np.array(ca.DM(value), dtype=float)
 
 
 def _derivative_weights(offsets: Array, at: float) -> Array:

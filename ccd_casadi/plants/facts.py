@@ -13,7 +13,7 @@ With |S| <= 1/√2 up to ω_b and <= M beyond, the share θ(ω_b) of the weight 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from ccd_casadi.kernels.frequency import prepare, responses
 from ccd_casadi.plants.modal import ModalPlant
@@ -144,4 +144,4 @@ def bandwidth_limit_hz(zero: Zero, S_max: float) -> float:
         return float((np.arctan((w - y) / x) + np.arctan((w + y) / x)) / np.pi - most)
 
     centre = np.log(zero.frequency_hz)
-    return float(np.exp(brentq(excess, centre - 30.0, centre + 30.0)))
+    return float(np.exp(scipy.optimize.brentq(excess, centre - 30.0, centre + 30.0)))

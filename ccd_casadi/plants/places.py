@@ -12,13 +12,13 @@ from itertools import combinations
 
 import casadi as ca
 import numpy as np
+import scipy
 from scipy.linalg import eigh
-from scipy.spatial import Delaunay
 
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
-from ccd_casadi.plants.axes import followed_modes, in_axes
+from ccd_casadi.plants.axes import at_reference, followed_modes, in_axes
 from ccd_casadi.plants.fixed import reparametrised
 from ccd_casadi.plants.modal import RIGID_RATIO
 from ccd_casadi.plants.nodes import NodeInterpolation, Position, Positions, names_in
@@ -26,6 +26,8 @@ from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
+
+ABSENT = 1e-12  # presence of an actuator that is not there: a root has a slope
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,11 @@ class Places:
     With `axes` all forces act, and all sensors read, together along the motions of a rigid body
     normal to the nodes, 1, x, y, in directions of length 1: as many inputs and outputs, however
     many actuators. `quiet` flexible modes, from 1 by frequency, are neither driven nor read by
-    them; each `damped` one is an axis of its own.
+    them; each `damped` one is an axis of its own. With `reference` points inputs are loads and
+    outputs displacements there, whatever the number of forces and sensors (`axes.at_reference`).
+
+    Of both, `present` names a θ from 0 to 1 for each actuator: its force counts by the root of
+    it (γ² of a mixed sensitivity is convex in it), its mass by itself. At most `choose` are there.
     """
 
     nodes: tuple[tuple[float, ...], ...]
@@ -50,11 +56,20 @@ class Places:
     axes: bool = False
     quiet: tuple[int, ...] = ()
     damped: tuple[int, ...] = ()
+    reference: tuple[tuple[float, ...], ...] = ()
+    present: tuple[str, ...] = ()
+    choose: int = 0
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """Its values; those that earlier stores do not know only where they are given."""
+        later = ("reference", "present", "choose")
+        return {key: value for key, value in vars(self).items() if value or key not in later}
 
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters that it takes, each once."""
-        return names_in((*self.actuators, *self.sensors))
+        return names_in((*self.actuators, *self.sensors, self.present))
 
 
 def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
@@ -71,11 +86,20 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
             words = f"has {len(point)} coordinates, a node {nodes.shape[1]}"
             raise PlantError(f"places: {list(point)} {words}; make them agree")
     axes = places.axes * (1 + nodes.shape[1] + len(places.damped))
-    least = min(len(places.actuators), len(places.sensors))
+    least = min(places.choose or len(places.actuators), len(places.sensors))
     if axes and least < axes + len(places.quiet):
         words = f"need {axes + len(places.quiet)} actuators and sensors or more"
         raise PlantError(f"places.axes, quiet and damped {words}; add some, or drop a mode")
-    between, own = NodeInterpolation(nodes), [list(names).index(name) for name in plant.names]
+    reference = len(places.reference)
+    if reference and (nodes.shape[1] != 2 or reference not in (3, 4) or least < reference):
+        words = "needs nodes in a plane, 3 or 4 points, and no fewer actuators and sensors"
+        raise PlantError(f"places.reference {words}")
+    between, order = NodeInterpolation(nodes), list(names).index
+    own, there = ([order(name) for name in part] for part in (plant.names, places.present))
+    given = len(there) == len(places.actuators) and places.choose and (axes or reference)
+    if there and not given:
+        words = "needs a name for each actuator, choose, and axes or a reference; add them"
+        raise PlantError(f"places.present {words}")
     points = Positions(places.actuators, names), Positions(places.sensors, names)
     for group in points if places.sensors else points[:1]:
         still, slack = ~group.slope.any(axis=2), 1e-9 * np.ptp(nodes, axis=0)
@@ -84,7 +108,7 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
             raise PlantError("places: a force or sensor is beyond the nodes; move it between them")
 
     def of(evaluate: Evaluate) -> PlacedMechanics:
-        return PlacedMechanics(evaluate, places, between, *points, own)
+        return PlacedMechanics(evaluate, places, between, *points, own, there)
 
     def below(theta: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(theta[i]) for i in own)
@@ -98,30 +122,31 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
             f"predicted to {100.0 * error:.2g} % of a mode's largest displacement at worst",
         )
 
-    whole = of(plant.evaluate)
+    evaluate = of(plant.evaluate)
     x = ca.MX.sym("theta", len(names))
     f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
-    rules = _rules(whole, x)
+    rules = _rules(evaluate, x)
     return reparametrised(
         plant,
         of,
         below,
         names=tuple(names),
         constraint_names=(*plant.constraint_names, *rules),
-        evaluate=whole,
+        evaluate=evaluate,
         hardware=ca.Function("hardware", [x], [f, ca.vertcat(lam, *rules.values())]),
-        outputs=axes or len(places.sensors) or plant.outputs,
-        inputs=axes or len(places.actuators),
+        outputs=axes or reference or len(places.sensors) or plant.outputs,
+        inputs=axes or reference or len(places.actuators),
         notes=notes,
-        domain=_domain(plant, whole, len(names)),
-        shapes=whole.shapes if nodes.shape[1] == 2 else None,
-        drawing=whole.drawing if nodes.shape[1] < 3 else None,
+        domain=_domain(plant, evaluate, len(names)),
+        shapes=evaluate.shapes if nodes.shape[1] == 2 else None,
+        drawing=evaluate.drawing if nodes.shape[1] < 3 else None,
     )
 
 
 @dataclass(frozen=True)
 class PlacedMechanics:
-    """θ -> Mechanics; `evaluate` takes the parameters `own` of it, the points are moved by all."""
+    """θ -> Mechanics; `evaluate` takes the parameters `own` of it, the points are moved by all;
+    `there` are those that say which actuators are."""
 
     evaluate: Evaluate
     places: Places
@@ -129,6 +154,7 @@ class PlacedMechanics:
     actuators: Positions
     sensors: Positions
     own: list[int]
+    there: list[int]
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         values = np.asarray(theta, float)
@@ -147,7 +173,10 @@ class PlacedMechanics:
         (W, dW), (R, dR) = (
             self.between.weights(points, values) for points in (self.actuators, self.sensors)
         )
-        dW, dR = dW[:count], dR[:count]
+        root = np.sqrt(np.maximum(values[self.there], ABSENT)) if self.there else 1.0
+        W, dW, dR = W * root, dW[:count] * root, dR[:count]
+        for i, k in enumerate(self.there if count else ()):
+            dW[k, :, i] += 0.5 * W[:, i] / max(values[k], ABSENT)
         M = below.M
         for w, dw, kg in ((W, dW, places.actuator_mass), (R, dR, places.sensor_mass)):
             F = B0 @ w
@@ -162,6 +191,10 @@ class PlacedMechanics:
             dmotions = np.insert(moved, [quiet] * rigid.shape[1], 0.0, axis=2)
             W, dW = in_axes(W, dW, motions, dmotions, quiet)
             R, dR = in_axes(R, dR, motions, dmotions, quiet)
+        if places.reference:
+            at = np.array(places.reference)
+            W, dW = at_reference(W, dW, self.between.nodes, at)
+            R, dR = at_reference(R, dR, self.between.nodes, at)
         C = below.C
         if places.sensors:
             C, dC = (B0 @ R).T, (dB0 @ R + B0 @ dR).transpose(0, 2, 1)
@@ -172,7 +205,7 @@ class PlacedMechanics:
         omega, modes = _flexible(self(theta))
         nodes = self.between.nodes
         moved = modes.T @ self.evaluate(tuple(float(theta[i]) for i in self.own)).B
-        corners = Delaunay(nodes).simplices[:, [0, 1, 2, 2]]
+        corners = scipy.spatial.Delaunay(nodes).simplices[:, [0, 1, 2, 2]]
         flat = np.zeros((len(nodes), 3))
         found = [
             ModeShape(flat + row[:, None] * [0.0, 0.0, 1.0], float(w) / HZ, (i + 1,))
@@ -185,9 +218,11 @@ class PlacedMechanics:
         panels, rows = [], []
         for title, theta in thetas.items():
             values = np.asarray(theta, float)
+            forces = self.actuators.at(values)
+            forces = forces[values[self.there] > 0.5] if self.there else forces
             curves = [_dots(self.between.nodes, "node", GREY, ".")]
             kinds = (("sensor", self.sensors.at(values), GREEN, "o"),
-                     ("force", self.actuators.at(values), ORANGE, "x"))  # fmt: skip
+                     ("force", forces, ORANGE, "x"))  # fmt: skip
             for label, at, colour, marker in kinds:
                 curves += [_dots(at, label, colour, marker)] if len(at) else []
                 rows += [(title, label, *(1e3 * p for p in point)) for point in at]
@@ -209,7 +244,7 @@ def _flexible(system: Mechanics) -> tuple[Array, Array]:
 
 
 def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
-    """λ by name: least distances, where θ moves them."""
+    """λ by name: least distances, where θ moves them, and how many are there."""
     found: dict[frozenset[Position], tuple[str, ca.MX]] = {}  # a force and its sensor are one place
     for word, points, group in (("actuators", of.places.actuators, of.actuators),
                                 ("sensors", of.places.sensors, of.sensors)):  # fmt: skip
@@ -220,7 +255,10 @@ def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
                 away = ca.DM(group.constant[i] - group.constant[j]) + ca.DM(slope) @ theta
                 lam = 1.0 - ca.sumsqr(away) / of.places.apart**2
                 found.setdefault(frozenset((points[i], points[j])), (name, lam))
-    return dict(found.values())
+    rules = dict(found.values())
+    if of.there:
+        rules["actuators chosen"] = ca.sum1(theta[of.there]) / of.places.choose - 1.0
+    return rules
 
 
 def _domain(plant: Plant, of: PlacedMechanics, count: int) -> tuple[Array, Array]:
@@ -233,6 +271,7 @@ def _domain(plant: Plant, of: PlacedMechanics, count: int) -> tuple[Array, Array
         for point, axis, k in np.argwhere(points.slope):
             least, most = sorted(points.slope[point, axis, k] * end[axis] for end in ends)
             low[k], high[k] = max(low[k], least), min(high[k], most)
+    low[of.there], high[of.there] = 0.0, 1.0
     return low, high
 
 

@@ -153,33 +153,49 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     except KeyError as error:
         words = f"the plant model needs a theta that the case lacks: {error}"
         raise PlantError(f"{words}; the case has {', '.join(names)}") from None
-    check_keys(result)
-    M, K, B, C = (ca.SX(result[key]) for key in ("mass", "stiffness", "input", "output"))
-    n = M.shape[0]
-    check_sizes(n, B.shape[1], C.shape[0])
-    D = ca.SX(result["damping"]) if "damping" in result else ca.SX.zeros(n, n)
-    check_shapes(M, D, K, B, C)
-    damping_ratio = checked_ratio(result.get("damping_ratio"))
-    constraints = dict(result.get("constraints", {}))
-    scalars = {"hardware_cost": result["hardware_cost"], **constraints}
-    for key, value in scalars.items():
-        if ca.SX(value).shape != (1, 1):
-            raise PlantError(f"{key} is {ca.SX(value).shape}, not a scalar; return one number")
-    lam = ca.vertcat(*constraints.values()) if constraints else ca.SX(0, 1)
-    dense = [ca.densify(matrix) for matrix in (M, D, K, B, C)]
+    found, damping_ratio, scalars = model_parts(result, ca.SX)
+    f, *constraints = scalars.values()
+    lam = ca.vertcat(*constraints) if constraints else ca.SX(0, 1)
+    dense = [ca.densify(matrix) for matrix in found]
     slopes = [ca.densify(ca.jacobian(ca.vec(matrix), theta)) for matrix in dense]
     matrices = ca.Function("matrices", [theta], dense + slopes)
     return Plant(
         names=tuple(names),
-        constraint_names=tuple(constraints),
+        constraint_names=tuple(scalars)[1:],
         evaluate=FromExpressions(matrices, damping_ratio),
-        hardware=ca.Function("hardware", [theta], [result["hardware_cost"], lam]),
-        outputs=C.shape[0],
-        inputs=B.shape[1],
+        hardware=ca.Function("hardware", [theta], [f, lam]),
+        outputs=found[4].shape[0],
+        inputs=found[3].shape[1],
     )
 
 
-def check_keys(result: Mapping[str, Any]) -> None:
+def model_parts(
+    result: Mapping[str, Any], kind: Any
+) -> tuple[tuple[Any, ...], float | None, dict[str, Any]]:
+    """M, D, K, B, C as matrices of CasADi's `kind`, the damping ratio, and f and λ by name, of what
+    a model returns. Raises PlantError where that is no plant."""
+    _check_keys(result)
+    M, K, B, C = (kind(result[key]) for key in ("mass", "stiffness", "input", "output"))
+    n = M.shape[0]
+    for key, size in {"mass": n, "input": B.shape[1], "output": C.shape[0]}.items():
+        if size > LARGEST[key]:
+            words = f"at most {LARGEST[key]} are taken; reduce it to what matters (its first modes)"
+            raise PlantError(f"{key} has {size} rows or columns, of which {words}")
+    D = kind(result["damping"]) if "damping" in result else kind.zeros(n, n)
+    _check_shapes(M, D, K, B, C)
+    ratio = result.get("damping_ratio")
+    if ratio is not None and not 0.0 < float(ratio) < 1.0:
+        words = "give a number between 0 and 1, both exclusive, such as 0.01"
+        raise PlantError(f"damping_ratio is {ratio}; {words}")
+    given = {"hardware_cost": result["hardware_cost"], **result.get("constraints", {})}
+    scalars = {key: kind(value) for key, value in given.items()}
+    for key, value in scalars.items():
+        if value.shape != (1, 1):
+            raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
+    return (M, D, K, B, C), None if ratio is None else float(ratio), scalars
+
+
+def _check_keys(result: Mapping[str, Any]) -> None:
     """Raise PlantError unless a model's result has the keys of a plant and no others."""
     missing = [key for key in _REQUIRED if key not in result]
     if missing:
@@ -191,15 +207,7 @@ def check_keys(result: Mapping[str, Any]) -> None:
         raise PlantError("the plant model must return either damping or damping_ratio; give one")
 
 
-def check_sizes(states: int, inputs: int, outputs: int) -> None:
-    """Raise PlantError where a plant is too large to be meant."""
-    for key, size in {"mass": states, "input": inputs, "output": outputs}.items():
-        if size > LARGEST[key]:
-            words = f"at most {LARGEST[key]} are taken; reduce it to what matters (its first modes)"
-            raise PlantError(f"{key} has {size} rows or columns, of which {words}")
-
-
-def check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
+def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
     """Raise PlantError unless M, D, K are (n, n), B (n, m) and C (p, n)."""
     n = M.shape[0]
     for key, matrix in {"mass": M, "stiffness": K, "damping": D}.items():
@@ -212,14 +220,6 @@ def check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
             remedy = "transpose it" if matrix.shape[1 - side] == n else f"make it {n} on that side"
             words = f"{key} is {matrix.shape}; expected {form}, as mass is {M.shape}"
             raise PlantError(f"{words}: {remedy}")
-
-
-def checked_ratio(ratio: Any) -> float | None:
-    """A model's damping_ratio as a number, or None. Raises PlantError outside (0, 1)."""
-    if ratio is not None and not 0.0 < float(ratio) < 1.0:
-        words = "give a number between 0 and 1, both exclusive, such as 0.01"
-        raise PlantError(f"damping_ratio is {ratio}; {words}")
-    return None if ratio is None else float(ratio)
 
 
 def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True) -> Mechanics:

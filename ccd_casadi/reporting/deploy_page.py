@@ -143,8 +143,7 @@ def _rates(found: Deployment) -> c.Words:
 
 def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     if item.designed is not None:
-        words = f"Channel {item.channel.name}: {item.chosen.order} states, as designed."
-        return (c.Words(words),)
+        return (_of(item, f"{item.chosen.order} states, as designed."),)
     head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
     rows = tuple(
         (row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
@@ -153,11 +152,18 @@ def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
         for row in item.rows for f in [row.figures]
     )  # fmt: skip
     words = (
-        f"Channel {item.channel.name}: {item.chosen.order} of {item.rows[0].order} states are "
-        f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
+        f"{item.chosen.order} of {item.rows[0].order} states are enough "
+        f"({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
         f"above twice its bound; {item.strict.order} keep S_max itself."
     )
-    return c.Words(words), c.Table(head, rows)
+    return _of(item, words), c.Table(head, rows)
+
+
+def _of(item: ChannelOrders, words: str) -> c.Words:
+    """Words about a channel, which is named where there are several."""
+    alone = item.channel.name == "all"
+    words = f"{words[0].upper()}{words[1:]}" if alone else f"Channel {item.channel.name}: {words}"
+    return c.Words(words)
 
 
 def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
@@ -167,22 +173,19 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
         return (c.Words(words),)
     if item.designed is not None:
         structure, kappa = item.designed
-        words = (
-            f"Channel {item.channel.name}: gain {with_unit(gain_of(kappa), 'N/m', 4)}; the "
-            "sections as they were designed."
-        )
-        return c.Words(words), structured_table(section_words(structure, kappa))
+        words = f"gain {with_unit(gain_of(kappa), 'N/m', 4)}; the sections as they were designed."
+        return _of(item, words), structured_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), number(s.depth_db, 4)) for s in found.sections
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
-        f"Channel {item.channel.name}: gain {with_unit(found.gain, 'N/m', 4)} at s = 0, "
+        f"gain {with_unit(found.gain, 'N/m', 4)} at s = 0, "
         f"{with_unit(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at "
         "s = 0. A negative ζ, or a negative frequency of a single root, is in the right half plane."
     )
-    return c.Words(words), c.Table(head, rows)
+    return _of(item, words), c.Table(head, rows)
 
 
 def _root(root: Root | None) -> tuple[str, str]:

@@ -119,6 +119,7 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
 def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fact]:
     """Quantity, value, remark: the design, its loop, its proof and what it cost."""
     r, inner, certificate = result, problem.inner, result["certificate"]
+    passed = "passed" if certificate["passed"] else "FAILED"
     proof = "all closed-loop poles stable" if certificate["stable"] else "UNSTABLE"
     ranges = [
         f"range {number(a / HZ)} to {number(b / HZ)} Hz" for a, b in (inner.omega_S, inner.omega_T)
@@ -137,11 +138,7 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
         *sensitivity_facts(problem, r),
         *_compliance(problem, r),
         *loop_facts(r),
-        (
-            "Certificate",
-            "passed" if certificate["passed"] else "FAILED",
-            f"{proof} ({poles}); {norm}",
-        ),
+        ("Certificate", passed, f"{proof} ({poles}); {norm}"),
         *_robust(r),
         *_without_suspension(r),
         *_references(r),

@@ -13,11 +13,9 @@ from ccd_casadi.support.units import number
 MOST = 12  # designs that are drawn
 
 
-def front_walk(run: FinishedRun, front: Front) -> tuple[Steps, ...]:
+def front_walk(run: FinishedRun, front: Front) -> tuple[Steps]:
     """From the lightest to the fastest."""
     problem, points = run.problem, front.points
-    if len(points) == 1:  # the run's own
-        return ()
     chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
     shown = [points[i] for i in chosen]
     drawn = (Lines(((_machine(problem, p), None),), "A design of the front") for p in shown)

@@ -45,14 +45,16 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     )  # fmt: skip
     v = problem.figure
     own = v.factor * float(run.result.get(f"{v.entry}_of_set", bandwidth_of(run)))
-    drawn = front_figure(problem, front, (cost, own, "this run's design"))
-    answers = [c.Words(text) for text in response_sentences(responses)]
+    if len(front.points) == 1:
+        walk: tuple[c.Block, ...] = (c.Words(_caption(front)), _table(problem, front))
+    else:
+        drawn = front_figure(problem, front, (cost, own, "this run's design"))
+        walk = (drawn, *front_walk(run, front))
+    changes: list[c.Block] = [c.Words(text) for text in response_sentences(responses)]
+    changes.append(table_responses(problem, responses))
     chapters = (
-        c.Chapter(f"Weight against {v.words}", (drawn, *front_walk(run, front))),
-        c.Chapter(
-            "What each parameter of the case would change",
-            (*answers, table_responses(problem, responses)),
-        ),
+        c.Chapter(f"Weight against {v.words}", walk),
+        c.Chapter("What each parameter of the case would change", tuple(changes)),
         c.Chapter("What limits the bandwidth", _limits(run, rule)),
     )
     return c.Page(head, chapters, index)

@@ -13,7 +13,7 @@ from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, number
+from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
@@ -155,10 +155,12 @@ def figure_gains(
 
 def compliance_panel(view: LoopView) -> Panel:
     """|GS| of the model in a band of all plants, with its bound in m/N where there is one."""
-    curves, bands = of_plants(view.hz, 1e6 * view.sizes[3])
-    most = 1e6 * (view.bounded.compliance_max or 0.0)
-    levels = (Level(most, f"compliance_max {most:g} µm/N", colour=GREY),) if most else ()
-    label = f"{view.named('GS')} (µm/N)"
+    most = view.bounded.compliance_max
+    unit, factor = display_unit("m", float(view.sizes[3].max()) if most is None else most)
+    curves, bands = of_plants(view.hz, factor * view.sizes[3])
+    words = f"compliance_max {with_unit(most or 0.0, 'm')}/N"
+    levels = () if most is None else (Level(factor * most, words, colour=GREY),)
+    label = f"{view.named('GS')} ({unit}/N)"
     return over_hz(label, curves, view.ends, levels=levels, bands=bands)
 
 

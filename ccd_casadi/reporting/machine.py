@@ -3,20 +3,19 @@
 Pictures are inline SVG of their own, without a script. Words in them take the page's colour.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ccd_casadi.drawing import svg
 from ccd_casadi.drawing.content import Figure, Modes, Picture, Table
-from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.turntable import REACH
 from ccd_casadi.plants.facts import modes_of
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.package_text import template
 from ccd_casadi.support.units import HZ, number
 
 # in a page's own theme, where it has one
@@ -28,8 +27,7 @@ SMALL = 1e-9  # share of the largest entry below which there is no spring
 MOST_NODES = 12
 SHOWN_MODES = 3
 SHOWN = 6  # of those to turn
-STEP, MIDDLE, ROW = 150.0, 78.0, 46.0  # between masses, height of their row, of a mode's row
-SIDE = 86.0  # of the reference mass's block
+STEP, SIDE = 150.0, 86.0  # between masses, and of the reference mass's block
 
 
 @dataclass(frozen=True)
@@ -72,67 +70,19 @@ def lumped_svg(found: Lumped, modal: ModalPlant, reference: float) -> str:
 
     `reference` in kg has the block of full size, alike at every θ.
     """
-    n = len(found.masses)
-    at = [STEP * (i + 0.75) for i in range(n)]
     side = SIDE * np.sqrt(np.abs(found.masses) / reference)
-    parts = [_spring(at, side, *spring) for spring in found.springs]
-    for i, (x, s) in enumerate(zip(at, side, strict=True)):
-        corner = f'x="{x - s / 2:.1f}" y="{MIDDLE - s / 2:.1f}" width="{s:.1f}" height="{s:.1f}"'
-        parts.append(f'<rect {corner} rx="3" fill="{BLUE}" fill-opacity=".28" stroke="{BLUE}"/>')
-        parts.append(_text(x, MIDDLE + 4, f"{number(float(found.masses[i]), 4)} kg"))
-        if i in found.driven:
-            parts.append(_arrow(x - s / 2 - 34, x - s / 2 - 2, MIDDLE, ORANGE))
-            parts.append(_text(x - s / 2 - 20, MIDDLE - 8, "u"))
-        if i in found.measured:
-            parts.append(_arrow(x, x + 26, MIDDLE - s / 2 - 8, GREEN))
-            parts.append(_text(x + 33, MIDDLE - s / 2 - 4, "y"))
     flexible = np.flatnonzero(~modal.rigid)[:SHOWN_MODES]
-    for row, mode in enumerate(flexible):
-        y = 2.0 * MIDDLE + ROW * (row + 0.5)
-        shape = modal.modes[:, mode] / np.abs(modal.modes[:, mode]).max()
-        for x, move in zip(at, shape, strict=True):
-            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{BLUE}"/>')
-            parts.append(_arrow(x, x + 46.0 * move, y, BLUE))
-        words = f"mode {row + 1}: {number(modal.natural[mode] / HZ, 4)} Hz"
-        parts.append(_text(6.0, y - 12, words, "start"))
-    high, wide = 2.0 * MIDDLE + ROW * len(flexible), STEP * (n + 0.5)
-    return (
-        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="masses and springs" '
-        f'style="width:100%;max-width:{1.4 * wide:.0f}px" font-size="12">{"".join(parts)}</svg>'
+    shapes = (modal.modes / np.abs(modal.modes).max(axis=0)).T[flexible]
+    words = (
+        f"mode {i}: {number(hz, 4)} Hz" for i, hz in enumerate(modal.natural[flexible] / HZ, 1)
     )
-
-
-def _spring(at: Sequence[float], side: Array, i: int, j: int, stiffness: float) -> str:
-    """A zigzag between neighbours, an arc between others, a zigzag to the left to the ground."""
-    words = f"{number(1e-6 * stiffness, 3)} N/µm"
-    look = f'fill="none" stroke="{GREEN}" stroke-width="1.6"'
-    if j > i + 1:
-        x0, x1, top = at[i], at[j], MIDDLE - SIDE / 2 - 4
-        arc = f'<path d="M{x0:.1f} {top}Q{(x0 + x1) / 2:.1f} -20 {x1:.1f} {top}" {look}/>'
-        return arc + _text((x0 + x1) / 2, 20, words)
-    low = MIDDLE + 14.0
-    if j < 0:
-        x0, x1 = at[i] - side[i] / 2 - 40.0, at[i] - side[i] / 2
-    else:
-        x0, x1 = at[i] + side[i] / 2, at[j] - side[j] / 2
-    turns = np.linspace(x0, x1, 12)
-    heights = low + np.array([0, 0, *([7, -7] * 4), 0, 0])
-    d = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(turns, heights, strict=True))
-    wall = f'<path d="M{x0:.1f} {low - 14}v28" {look}/>' if j < 0 else ""
-    return f'<path d="{d}" {look}/>{wall}' + _text((x0 + x1) / 2, MIDDLE + SIDE / 2 + 15, words)
-
-
-def _arrow(x0: float, x1: float, y: float, colour: str) -> str:
-    tip = min(6.0, abs(x1 - x0)) * np.sign(x1 - x0)
-    return (
-        f'<path d="M{x0:.1f} {y:.1f}L{x1:.1f} {y:.1f}m{-tip:.1f} -4L{x1:.1f} {y:.1f}l{-tip:.1f} 4" '
-        f'stroke="{colour}" stroke-width="2" fill="none"/>'
-    )
-
-
-def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
-    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
-    return f'<text {place} fill="currentColor">{escape(words)}</text>'
+    return template("drawing/assets/lumped.svg").render(
+        wide=STEP * (len(side) + 0.5), at=STEP * (np.arange(len(side)) + 0.75), side=side,
+        masses=[f"{number(float(mass), 4)} kg" for mass in found.masses],
+        springs=[(i, j, f"{number(1e-6 * k, 3)} N/µm") for i, j, k in found.springs],
+        driven=found.driven, measured=found.measured, modes=list(zip(words, shapes, strict=True)),
+        blue=BLUE, green=GREEN, orange=ORANGE,
+    )  # fmt: skip
 
 
 def lumped_machine(

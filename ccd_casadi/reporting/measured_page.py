@@ -112,7 +112,7 @@ def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
              f"; between lines at most {number(answer['sensitivity_peak_between_lines'])}")),
         ("|S| at ω_low", number(answer["sensitivity_low"]),
          f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
-        ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} µm/N", "the largest |GS|"),
+        ("Compliance", f"{with_unit(answer['compliance_max'], 'm', 4)}/N", "the largest |GS|"),
         *loop_facts(answer),
         ("Largest |KS|", with_unit(answer["KS_max"], "N/m", 4), ""),
     ]  # fmt: skip

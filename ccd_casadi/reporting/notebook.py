@@ -5,6 +5,8 @@ from functools import singledispatch
 from itertools import count
 from typing import Any
 
+from markupsafe import Markup
+
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
@@ -12,7 +14,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
 from ccd_casadi.drawing.page import CSS
-from ccd_casadi.drawing.paint import block_html, head_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -22,15 +24,11 @@ from ccd_casadi.reporting.facts import conclusion, theta_axes, theta_table
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.package_text import template
+from ccd_casadi.support.units import HZ, number, with_unit
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
-_OWN = """
---ink: #1a1a1a; --soft: #5a5a5a; --line: #dcdcdc; background: #fff; color: var(--ink);
-max-width: 900px; padding: 8px 14px; font: 14px/1.5 system-ui, sans-serif;
-"""
-_SMALL = "h1 { font-size: 17px; } .lead { font-size: 14px; } th, td { white-space: normal; }"
 _figures = count()  # ids in an SVG are the whole notebook's
 
 
@@ -41,12 +39,8 @@ def html_of(item: object) -> str:
 
 
 def _cell(*parts: Head | Block) -> str:
-    body = "\n".join(
-        head_html(part) if isinstance(part, Head) else block_html(part, f"nb{next(_figures)}")
-        for part in parts
-    )
-    # the page's own rules, nested: `h1` is `.ccd h1` in here
-    return f'<div class="ccd"><style>.ccd {{{_OWN}{CSS}{_SMALL}}}</style>\n{body}\n</div>'
+    body = Markup("\n").join(block_html(part, f"nb{next(_figures)}") for part in parts)
+    return template("drawing/assets/cell.html").render(css=CSS, body=body)
 
 
 @html_of.register
@@ -81,7 +75,7 @@ def _(item: CoDesignProblem) -> str:
         (f"|S| at {number(inner.omega_low / HZ)} Hz", f"≤ {inner.S_low:g}", ""),
     ]
     if inner.compliance_max is not None:
-        facts.append(("Compliance |GS|", f"≤ {1e6 * inner.compliance_max:g} µm/N", ""))
+        facts.append(("Compliance |GS|", f"≤ {with_unit(inner.compliance_max, 'm')}/N", ""))
     facts.append(("Controller", *kind_of(item).described()))
     if item.robust is not None:
         shifts = f"resonances ±{100.0 * item.robust.shift:g} %"

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 
 from ccd_casadi.drawing.content import Area, Curve, Mark, Panel
 from ccd_casadi.drawing.lines import BOTTOM, LEFT, RIGHT, TOP
@@ -71,5 +71,5 @@ def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:
     if values.shape[1] > 1:
         for i in range(1, len(values)):
             away = np.abs(values[i - 1][:, None] - values[i][None, :])
-            values[i] = values[i][linear_sum_assignment(away)[1]]
+            values[i] = values[i][scipy.optimize.linear_sum_assignment(away)[1]]
     return np.where(np.abs(values) <= far, values, np.nan)

@@ -83,10 +83,7 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
     words += [_moved(found, i) for i in range(len(found.moves))]
     if run.sampling is not None:
         step = f"{1e6 * run.sampling.period:.5g} µs"
-        words.append(
-            f"A controller in discrete time, a step every {step}, hold and "
-            "delay exact at the instants; the structured singular value is of continuous ones."
-        )
+        words.append(f"The loop is sampled every {step}; hold and delay are exact at the instants.")
     return words
 
 

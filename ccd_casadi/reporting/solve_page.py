@@ -219,12 +219,9 @@ def _history(
     heading = "Prediction against truth"
     outcome, result = solution.outcome, solution.result
     if not outcome.iterates:
-        words = "There are no rounds to show: " + (
-            "IPOPT worked on the true quantities, nothing was predicted."
-            if result["formulation"] == "direct"
-            else (result["reason"] or "none was run.")
-        )
-        return c.Chapter(heading, (c.Words(words),))
+        direct = result["formulation"] == "direct"
+        why = "every step used true values" if direct else result["reason"] or "none was run"
+        return c.Chapter(heading, (c.Words(f"There are no rounds to show: {why}."),))
     blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
         lifted=len(outcome.surrogates) > 1,

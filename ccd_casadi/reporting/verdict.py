@@ -7,7 +7,7 @@ from typing import Any
 
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import Head, VerdictLine
-from ccd_casadi.drawing.paint import head_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.support.terminal import columns, wrapped
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
@@ -76,7 +76,10 @@ def head_of(
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
     """The head of a page that is about the run itself: badge and verdict are the run's."""
     good = result["status"] == "verified"
-    reason = head_words(result) if good else str(result.get("reason") or "")
+    failed = [line for line in lines_of(result) if line.state == State.FAILED]
+    below = "; ".join(f"{line.name}: {line.words}" for line in failed)
+    why = str(result.get("reason") or "").replace(f" ({below})", "")
+    reason = head_words(result) if good else why
     reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
     status = STATUS.get(result["status"], "not verified")
     return head_of(title, good, status, reason, meta, lead, result)
@@ -85,7 +88,7 @@ def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Hea
 def with_verdict_of(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
     """A page with the decision and the verdict as they are now; of the run's own (`whole`) the
     badge too."""
-    source = head_html(run_head("", result, "", ""))
+    source = block_html(run_head("", result, "", ""))
     for place in (DECISION, TABLE, *([BADGE] if whole else [])):
         old, new = place.search(text), place.search(source)
         if old is not None and new is not None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
@@ -166,5 +166,5 @@ def search(
         begin = max(found, key=lambda item: item[1].badness)[0]
         options = {"maxfev": SEARCH, "xatol": 1e-4, "fatol": 1e-6}
         bounds = list(zip(low, high, strict=True))
-        minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options=options)
+        scipy.optimize.minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options=options)
     return max((item for _, item in found), key=lambda item: item.badness)

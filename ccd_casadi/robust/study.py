@@ -13,7 +13,7 @@ from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
@@ -97,8 +97,9 @@ def robustness(
 
 
 def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
-    system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
+    system, loop = system_of(run), run.loop_on(run.plant.plant_si())  # as it runs
     sampled, modal = loop.sampling is not None, modal_plant(system, run.problem.suspension)
+    free, profile = modal_plant(system, Suspension(0.0, 0.0)), setpoint(d.limits)
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
     view = loop_view([loop], bounded, bandwidth_hz=omega_b / HZ)
@@ -122,26 +123,21 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
         tolerances=tolerances(run, d.tolerance, d.samples, seed, workers),
         structured=None if sampled else structured_bound(run.plant, modal, run.controller, hz),
         setpoint=profile,
-        moves=_moves(run, profile, d),
+        moves=_moves(loop, free, profile, d, omega_b / HZ),
     )
 
 
-def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[Move, ...]:
+def _moves(
+    loop: Loop, free: ModalPlant, profile: Setpoint, demands: Demands, bandwidth_hz: float
+) -> tuple[Move, ...]:
     """On the plant with free rigid bodies, or on the suspended one where that is not stable."""
-    modal = modal_plant(system_of(run), Suspension(0.0, 0.0))
-    ahead = mass_feedforward(modal, demands.axis)
-    loop = loop_of(run)
+    ahead = mass_feedforward(free, demands.axis)
     found = moves(
-        [loop], [replace(loop, plant=modal.state_space)],
+        [loop], [replace(loop, plant=free.state_space)],
         (None,) if ahead is None else (None, ahead), profile, axis=demands.axis,
-        window=demands.window, bandwidth_hz=run.figures.bandwidth / HZ,
+        window=demands.window, bandwidth_hz=bandwidth_hz,
     )  # fmt: skip
     return tuple(made for (made,) in found)
-
-
-def loop_of(run: FinishedRun) -> Loop:
-    """The run's loop on its plant, as it runs."""
-    return run.loop_on(run.plant.plant_si())
 
 
 def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from ccd_casadi.inner_problem.objective import objective, violated
-from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.neighbours import from_controller, from_neighbour, promising_starts
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, problem_hash, sample_key
@@ -254,4 +254,4 @@ class Sampler:
         return sample.bandwidth if meets else np.nan
 
     def _design_key(self, x: tuple[float, ...]) -> str:
-        return sample_key(self.hash, x[:-2], *frequencies(self.problem, x))
+        return sample_key(self.hash, x[:-2], *self.problem.inner.frequencies(x))

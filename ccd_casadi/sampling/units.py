@@ -10,7 +10,7 @@ import numpy as np
 
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import bandwidth_gradient
-from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, true_design, true_inner
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design, true_inner
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult
@@ -113,7 +113,7 @@ def design_unit(
     samples = []
     for key, x in points:
         began = perf_counter()
-        design = true_design(problem, x[:-2], *frequencies(problem, x))
+        design = true_design(problem, x[:-2], *problem.inner.frequencies(x))
         samples.append(sample_of(key, x[:-2], design.figures, perf_counter() - began, design))
     return samples, None
 

@@ -8,11 +8,14 @@ expected to gain (Jones, Schonlau and Welch 1998)
     z = (J_best - w1 f(θ) - w2 m(θ)) / (|w2| s(θ)),
 
 and rounds of which each gains at most half of the last gain 2 max EI in all. Expected of a full
-solve are the hardware cost and bandwidth of designs with w1 f + w2 m <= J_best + δ,
+solve are the cost f and bandwidth m ± δ/|w2| of designs with w1 f + w2 m <= J_best + δ,
 
     δ = 2 max EI + |w2| |v(θ_n) - m(θ_n)|,   θ_n the surrogate's last optimum, where v is known.
 
-No bound: a region without samples may be better, and so may another structured controller at a θ.
+A structured controller is the best of climbs from what is known near by; at both ends a multi-start
+search asks whether there is a better one, which the samples around learn from then.
+
+No bound: a region without samples may be better.
 """
 
 from collections.abc import Mapping
@@ -26,6 +29,7 @@ from scipy.special import ndtr
 from ccd_casadi.cases.case import Case
 from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
+from ccd_casadi.codesign.outer_structured import multistart_at
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -55,7 +59,7 @@ class Outlook:
 
     `left`: δ as bandwidth at equal hardware cost; `theta`: the next true design, the surrogate's
     optimum with its bandwidth `predicted`, or that of the largest EI (NaN); `costs`, `values`: the
-    least and the largest f and m of designs within δ of the best. Bandwidths are in rad/s.
+    least and the largest f and v of designs within δ of the best. Bandwidths are in rad/s.
     """
 
     best: InnerSample
@@ -87,13 +91,21 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     first = [hardware.theta] if slow and apart < BESIDE else [hardware.theta, problem.start]
     known = sampler.values(np.array(first), "first designs")
     known += sampler.values(looks[: LOOKS_SLOW * len(lower)] if slow else looks, "global check")
-    missed = 0.0
+    missed, searched = 0.0, set[tuple[float, ...]]()
     for rounds_left in reversed(range(ROUNDS + 1)):
         known = sampler.latest(known)
         ahead = outlook(problem, known, missed, seed)
         settled = ahead.left <= (SETTLED_SLOW if slow else SETTLED) * ahead.best.bandwidth
         if settled or not rounds_left:
-            break
+            ends = {end.theta: end for end in (known[0], ahead.best) if end.kappa}
+            found = {at: multistart_at(sampler, ends[at]) for at in ends if at not in searched}
+            better = [at for at in found if found[at].feasible and found[at].value > ends[at].value]
+            for at in better:
+                sampler.value_from(at, found[at].design.kappa.tolist())
+            if not (better and rounds_left):
+                break
+            missed, searched = 0.0, searched | ends.keys()
+            continue
         known += sampler.values(ahead.theta, "the best expected")
         missed = float(np.fmax(0.0, abs(known[-1].value - ahead.predicted)))
     if not np.isfinite(objective_of(problem, ahead.best)):
@@ -160,6 +172,7 @@ def outlook(
     as_good = allowed & (gap >= -left * abs(problem.w2))
     as_good[1] = True  # the best itself
     ends = [np.quantile(each[as_good], (0.0, 1.0)) for each in (costs[0], mean)]
+    ends[1] += (-left, left)
     if new[0]:
         return Outlook(best, left, expected, float(mean[0]), *ends)
     return Outlook(best, left, cloud[gains.argmax()], np.nan, *ends)

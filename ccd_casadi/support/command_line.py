@@ -5,6 +5,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
+from functools import wraps
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from ccd_casadi.support.worker_process import WorkerLost
 
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
+Body = Callable[[argparse.Namespace], ExitCode]  # what a command does with its options
+Option = Callable[[argparse.ArgumentParser], object]  # adds one
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
 
 
@@ -78,16 +81,40 @@ def run_parser(
     return result
 
 
-def add_scheduler(arguments: argparse.ArgumentParser) -> None:
-    """Add --scheduler, for commands that sample."""
-    arguments.add_argument(
-        "--scheduler", metavar="ADDRESS",
-        help="sample on the Dask cluster at tcp://host:port; --workers then has no effect",
-    )  # fmt: skip
+def option(*names: str, **how: Any) -> Option:
+    """An option of a command, as argparse takes it."""
+    return lambda arguments: arguments.add_argument(*names, **how)
+
+
+SCHEDULER = option(
+    "--scheduler", metavar="ADDRESS",
+    help="sample on the Dask cluster at tcp://host:port; --workers then has no effect",
+)  # fmt: skip
+
+
+def command(
+    name: str, description: str, *options: Option, needs: Sequence[str],
+    make: Callable[..., argparse.ArgumentParser] = parser, **how: Any,
+) -> Callable[[Body], Callable[..., int]]:  # fmt: skip
+    """Makes the entry point of a command, which takes words and gives an exit code, of what it does
+    with its options; `make` and `how` give the parser that `options` are added to, `needs` as in
+    `run`."""
+
+    def entry_of(body: Body) -> Callable[..., int]:
+        @wraps(body)
+        def main(argv: Sequence[str] | None = None) -> int:
+            arguments = make(name, description, **how)
+            for add in options:
+                add(arguments)
+            return run(body, arguments, argv, needs=needs)
+
+        return main
+
+    return entry_of
 
 
 def run(
-    main: Callable[[argparse.Namespace], ExitCode],
+    main: Body,
     arguments: argparse.ArgumentParser,
     argv: Sequence[str] | None = None,
     *,

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,12 @@ def json_text(value: Any) -> str:
 
 
 def json_values(value: Any) -> Any:
-    """Plain JSON values: tuples to lists, NumPy scalars to numbers, what is not finite to None."""
+    """Plain JSON values: dataclasses to objects, tuples and arrays to lists, NumPy scalars to
+    numbers, what is not finite to None."""
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
     if isinstance(value, dict):
         return {str(key): json_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -114,7 +114,7 @@ def real(
 positive = real(strict=True)
 
 
-def add_break_frequencies(arguments: argparse.ArgumentParser, words: str) -> None:
+def add_break_frequencies(words: str, arguments: argparse.ArgumentParser) -> None:
     """Add --omega-s-hz and --omega-t-hz, which `break_frequencies` reads."""
     for name in ("S", "T"):
         arguments.add_argument(

@@ -44,17 +44,17 @@ def recertified_in_si(plant: ScaledPlant, design: Design, omega_low: float) -> D
 
     What is certified in a synthesis is the controller in the plant's own units. Where the loop
     hangs on digits that doubles do not have (a plant of gain 10¹², for instance), the controller
-    that a user gets is another one: it is certified again as it is given away.
+    that a user gets is another one: it is certified again, to its bound, as it is given away.
     """
     if not design.figures.certified:
         return design
-    gamma = design.figures.gamma * (1.0 + ROUNDING)
+    bound = design.figures.certificate.norm_bound * (1.0 + ROUNDING)  # the γ reached is a grid's
     rng = np.random.default_rng(0)  # the way to SI and back alone may change no digit at all
     K = design.controller
     rounded = StateSpace(
         *(X * (1.0 + EPS * rng.choice([-1.0, 1.0], X.shape)) for X in (K.A, K.B, K.C, K.D))
     )
-    again = measure(plant, rounded, design.weights, gamma=gamma, omega_low=omega_low)
+    again = measure(plant, rounded, design.weights, gamma=bound, omega_low=omega_low)
     if again.certified and abs(again.bandwidth / design.figures.bandwidth - 1.0) <= ROUNDING:
         return design
     return replace(design, figures=replace(design.figures, outcome=Outcome.LOST_IN_ROUNDING))

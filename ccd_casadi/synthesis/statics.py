@@ -16,7 +16,7 @@ from ccd_casadi.lti.grid import refine_peak
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ, with_unit
+from ccd_casadi.support.units import HZ, display_unit, with_unit
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
@@ -37,11 +37,6 @@ class Statics:
     low_hz: float
 
     @property
-    def integrates(self) -> bool:
-        """Whether the controller has a pole at rest."""
-        return bool(np.isinf(self.stiffness))
-
-    @property
     def differentiates(self) -> bool:
         """Whether the controller is almost a differentiator."""
         return self.share < DIFFERENTIATOR
@@ -50,7 +45,7 @@ class Statics:
     def words(self) -> str:
         """One or two sentences."""
         low = f"1 N at {self.low_hz:.3g} Hz moves it {with_unit(self.low, 'm')}"
-        if self.integrates:
+        if np.isinf(self.stiffness):  # a pole at rest
             return f"The controller integrates: a constant force does not move the stage; {low}."
         found = (
             f"Static stiffness K(0) = {with_unit(self.stiffness, 'N/m')}: a constant force of 1 N "
@@ -99,7 +94,8 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
     >>> compliance_words(64e-3, 59e-3, 5.5e-3, 1.0)
     '64 mm/N at most, 5.5 mm/N at 1 Hz, 59 mm/N at rest'
     """
-    unit, factor = ("mm/N", 1e3) if most >= 1e-3 else ("um/N", 1e6)
+    metres, factor = display_unit("m", most)
+    unit = f"{metres.replace('µ', 'u')}/N"  # as the terminal prints it
     rest = f"{factor * at_rest:.4g} {unit} at rest" if at_rest else "none at rest (an integrator)"
     at_low = f"{factor * low:.4g} {unit} at {low_hz:.3g} Hz"
     return f"{factor * most:.4g} {unit} at most, {at_low}, {rest}"

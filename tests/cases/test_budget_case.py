@@ -15,7 +15,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.design_entries import budget_entry, budget_lines
-from ccd_casadi.drawing.paint import blocks_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.budget_chapter import budget_chapter
 from ccd_casadi.support.json_files import json_values
@@ -122,7 +122,7 @@ def test_the_budget_of_a_design_in_result_terminal_and_page(tmp_path: Path) -> N
     assert "cables has" in line
     (section,) = budget_chapter(problem, (55.0, 55.0), made.controller)
     for name in ("cables", "amplifier", "floor motion", "sensor noise", "setpoint", "together"):
-        assert name in blocks_html(section.body, "s")
+        assert name in block_html(section, "1")
     none = replace(problem, budget=None)
     assert budget_entry(none, (55.0, 55.0), made.controller) == {}
     assert budget_chapter(none, (55.0, 55.0), made.controller) == []

@@ -8,8 +8,15 @@ from typing import Any
 
 import pytest
 
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.run_files import write_run
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.errors import UserError
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def edited(folder: Path, name: str, change: Callable[[dict[str, Any]], object]) -> None:
@@ -73,3 +80,22 @@ def test_a_damaged_file_is_named(
 def test_a_folder_that_is_none(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not a folder"):
         read_run(tmp_path / "nothing")
+
+
+def test_a_run_folder_needs_no_other_file(tmp_path: Path) -> None:
+    """For who gets the folder alone: the plant's code and the options of other plants are in it."""
+    own = Path(shutil.copytree(EXAMPLES / "two_axes", tmp_path / "own"))
+    with (own / "case.toml").open("a") as file:
+        file.write('\n[robust]\nplants = ["plants/off_centre.toml"]\n')
+    case = load_case(own / "case.toml")
+    known = problem_of(case).identity()
+    (tmp_path / "run").mkdir()
+    solution = Solution({"formulation": "direct"}, FormulationResult(), None)
+    write_run(tmp_path / "run", case, solution)
+    shutil.rmtree(own)
+    there = load_case(shutil.move(tmp_path / "run", tmp_path / "sent") / "case.toml")
+    assert there.robust.plants == ({"offset": 0.02},)
+    assert problem_of(there).identity() == known
+    (tmp_path / "sent" / "plant.py").unlink()
+    with pytest.raises(UserError, match=r"plant\.function: there is no"):
+        load_case(there.path)

@@ -8,8 +8,8 @@ from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.direct import Direct, TrueDesign
-from ccd_casadi.codesign.kkt import kkt_certificate
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.kkt import TrueDesign
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.inner_problem.objective import ACTIVE, MET, binding, constraint_shares, violated
@@ -83,10 +83,10 @@ def test_an_optimum_is_the_same_in_every_unit(in_unit) -> None:
         assert "least mass" in solution.verified.active
         assert "least mass" in kkt.active
         assert kkt.primal <= MET
-        assert TrueDesign(case, x, TrueQuantities(case).at(x)).acceptable
+        assert TrueDesign(TrueQuantities(case), x).acceptable
         mu = kkt.multipliers["least mass"] * unit
         ends.append((*solution.verified.theta, mu))
-        again = kkt_certificate(case, x, TrueQuantities(case).at(x))
+        again = TrueDesign(TrueQuantities(case), x).kkt
         assert again.stationarity <= 1e-6
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-5)
     np.testing.assert_allclose(ends[2], ends[1], rtol=1e-5)

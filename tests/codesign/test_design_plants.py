@@ -7,7 +7,7 @@ import pytest
 from helpers import problem
 
 from ccd_casadi.codesign.design_plants import remedies, search_words, widen
-from ccd_casadi.codesign.direct import TrueDesign
+from ccd_casadi.codesign.kkt import TrueDesign
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import best_choice, design_choices, true_design, true_inner
 from ccd_casadi.inner_problem.sweep import missed_bounds, missed_by, shortfall
@@ -54,12 +54,12 @@ def test_a_range_is_reached_from_the_plant_alone(tmp_path) -> None:  # type: ign
     x = np.array([*THETA, np.log(f.omega_S), np.log(f.omega_T)])
     with SampleStore(tmp_path / "s.sqlite") as store, Workers(1, 60.0) as pool:
         sampler = Sampler(case, store, pool)
-        assert not TrueDesign(case, x, sampler.truth.at(x)).acceptable
+        assert not TrueDesign(sampler.truth, x).acceptable
         reached, share = widen(sampler, x)
         assert 0.0 < share <= 1.0
         held = replace(case, robust=OPEN.scaled(share) if case.robust else None)
         held = replace(held, robust=replace(held.robust, design_shift=-0.02 * share))
-        assert TrueDesign(held, reached, Sampler(held, store, pool).truth.at(reached)).acceptable
+        assert TrueDesign(Sampler(held, store, pool).truth, reached).acceptable
 
 
 @pytest.mark.parametrize("share", [2e-1, 1e-3, 1e-6, 1e-9, 1e-12])

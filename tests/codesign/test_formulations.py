@@ -121,7 +121,7 @@ def test_the_command_says_what_is_slow(
         formulation=more[1] if more else None,
     )  # fmt: skip
     with pytest.raises(Asked):
-        command.command(options)
+        command.main.__wrapped__(options)
     error = capsys.readouterr().err
     assert said in error
     assert ("slow" in error) == bool(said)

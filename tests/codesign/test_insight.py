@@ -55,7 +55,7 @@ def truth_of(tmp_path: Path) -> Iterator[Callable[[CoDesignProblem], Sampler]]:
 
 
 def optimum(sampler: Sampler, start: Array) -> Array:
-    return polish(sampler, start).x
+    return polish(sampler.truth, start).x
 
 
 def bowl_start(problem: CoDesignProblem, theta: tuple[float, float]) -> Array:

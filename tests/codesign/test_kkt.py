@@ -8,7 +8,7 @@ from helpers import HZ, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.kkt import kkt_certificate
+from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer_problem import OuterSolution, lifted_program, solve_program
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -30,7 +30,7 @@ def solved(case: CoDesignProblem, start: np.ndarray) -> tuple[OuterSolution, Tru
 
 
 def certified(case: CoDesignProblem, quantities: TrueQuantities, x) -> KktCertificate:
-    return kkt_certificate(case, x, quantities.at(x), quantities.at)
+    return kkt_certificate(TrueDesign(quantities, x), second=True)
 
 
 def test_optimum_of_the_true_problem_is_certified() -> None:

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.linalg import null_space
 from test_kkt import MODEL, point
 
-from ccd_casadi.codesign.direct import TrueDesign, polish
-from ccd_casadi.codesign.kkt import NEAR, active_at, kkt_certificate, newton_step
+from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.kkt import NEAR, TrueDesign, active_at, newton_step
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -31,10 +31,10 @@ def inside_the_box(tmp_path_factory):
     case = problem(source=source, w1=10.0)
     with SampleStore(folder / "samples.sqlite") as store:
         sampler = Sampler(case, store, Workers(1))
-        x = polish(sampler, point(62.0, 62.0, 600.0, 60.0)).x
+        x = polish(sampler.truth, point(62.0, 62.0, 600.0, 60.0)).x
         quantities = TrueQuantities(case)
-        here = active_at(case, x, quantities.at(x))
-        mu = kkt_certificate(case, x, quantities.at(x)).multipliers
+        here = active_at(TrueDesign(quantities, x))
+        mu = TrueDesign(quantities, x).kkt.multipliers
         strong = here.rows[[mu[name] > 0.0 for name in here.labels]]
         free = null_space(strong)[:, 0]
         yield case, sampler, x, free
@@ -54,9 +54,9 @@ def distance(optimum: Optimum, x: Array) -> float:
 
 def test_the_polish_ends_where_nothing_is_left(inside_the_box) -> None:
     case, _, x, _ = inside_the_box
-    design = TrueQuantities(case).at(x)
-    assert TrueDesign(case, x, design).acceptable
-    assert kkt_certificate(case, x, design).stationarity < 1e-8
+    here = TrueDesign(TrueQuantities(case), x)
+    assert here.acceptable
+    assert here.kkt.stationarity < 1e-8
 
 
 @few(max_examples=12)
@@ -66,7 +66,7 @@ def test_a_step_ends_nearer_by_the_square(inside_the_box, power: float, sign: fl
     size = 10.0**power
     x = away(inside_the_box, sign * size)
     quantities = TrueQuantities(case)
-    end = newton_step(case, quantities, x, kkt_certificate(case, x, quantities.at(x)))
+    end = newton_step(TrueDesign(quantities, x))
     assert end is not None
     # met: 0.6 of the square, and 4e-10 by the rounding of gradients
     assert distance(inside_the_box, end) < 3.0 * size**2 + 5e-9
@@ -80,12 +80,12 @@ def test_a_polish_from_near_by_finds_the_same_design(
 ) -> None:
     case, sampler, x, _ = inside_the_box
     start = away(inside_the_box, sign * 10.0**power)
-    found = polish(sampler, start)
+    found = polish(sampler.truth, start)
     end = found.x
     assert found.acceptable
     assert found.kkt.stationarity < 1e-8
     assert distance(inside_the_box, end) < 1e-8
-    J = TrueDesign(case, x, TrueQuantities(case).at(x)).objective
+    J = TrueDesign(TrueQuantities(case), x).objective
     assert found.objective == pytest.approx(J, rel=1e-8)
 
 
@@ -93,4 +93,4 @@ def test_a_step_past_the_basin_is_none(inside_the_box) -> None:
     case = inside_the_box[0]
     x = away(inside_the_box, 20.0 * NEAR)
     quantities = TrueQuantities(case)
-    assert newton_step(case, quantities, x, kkt_certificate(case, x, quantities.at(x))) is None
+    assert newton_step(TrueDesign(quantities, x)) is None

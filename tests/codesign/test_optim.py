@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from test_kinks import pieces
 
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
+from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim import pieces as of_pieces
 from ccd_casadi.optim import quadratic
@@ -114,8 +114,8 @@ def test_a_failed_programme_is_no_optimum_on_kinks(failing, count: int) -> None:
     quantities = TrueQuantities(case)
     start = np.array([60.0, 66.0, *np.log([500.0 * HZ, 45.0 * HZ])])
     failing(count)
-    end = descend(case, quantities, start, steps=40)
-    assert kkt_certificate(case, end, quantities.at(end)).stationarity <= SMOOTH
+    end = descend(quantities, start, steps=40)
+    assert TrueDesign(quantities, end).kkt.stationarity <= SMOOTH
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign import peak_constraints
-from ccd_casadi.codesign.direct import TrueDesign
 from ccd_casadi.codesign.global_check import global_check
 from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.kkt import TrueDesign
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.inner_problem import true_function
@@ -92,8 +92,8 @@ def test_a_descent_synthesises_every_design_once(
     case = problem(robust=robust)
     quantities = TrueQuantities(case)
     start = at((62.0, 64.0, 500.0, 45.0))
-    end = descend(case, quantities, start)
-    J = [TrueDesign(case, x, quantities.at(x)).objective for x in (start, end)]
+    end = descend(quantities, start)
+    J = [TrueDesign(quantities, x).objective for x in (start, end)]
     assert J[1] < J[0]
     assert len(calls) == len(quantities.designs)
 

@@ -16,17 +16,17 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.direct import TrueDesign
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import BASIN, descend
-from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
+from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import REACH, Survival, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.drawing.paint import verdict_html
+from ccd_casadi.drawing.content import Verdict
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -129,7 +129,7 @@ def test_a_differentiator_is_said_to_be_one() -> None:
 def test_a_prediction_at_its_own_sample_counts_without_it() -> None:
     """D6: 6e-12 at a training sample that the others miss by 2 % is no support."""
     hollow = v.predicted(
-        error=6e-12, tolerance=1e-3, left_out=0.022, left_out_size=1.56, sigmas=3.5
+        error=6e-12, tolerance=1e-3, value=HZ * 1.56 / 0.022, left_out=(1.56, 3.5)
     )
     assert hollow.state is v.State.WARNED
     assert "1.6 Hz" in hollow.words
@@ -238,22 +238,22 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
     figures = inner.optimum.figures
     start = np.array([*theta, np.log(figures.omega_S), np.log(figures.omega_T)])
     quantities = TrueQuantities(case)
-    end = descend(case, quantities, start)
+    end = descend(quantities, start)
     lower, upper = lifted_bounds(case)
     assert (end >= lower).all()
     assert (end <= upper).all()
-    found = quantities.at(end)
-    assert TrueDesign(case, end, found).acceptable
-    assert kkt_certificate(case, end, found).stationarity <= SMOOTH
-    J = TrueDesign(case, end, found).objective
-    assert TrueDesign(case, start, quantities.at(start)).objective > J
+    found = TrueDesign(quantities, end)
+    assert found.acceptable
+    assert found.kkt.stationarity <= SMOOTH
+    J = found.objective
+    assert TrueDesign(quantities, start).objective > J
     assert len(quantities.designs) < 40
     # another that knows this end stops near it, and goes on past one that is worse than it is
     again, past = TrueQuantities(case), TrueQuantities(case)
-    near = descend(case, again, start, ended=[(end, J)])
+    near = descend(again, start, ended=[(end, J)])
     assert np.abs((near - end) / (upper - lower)).max() <= BASIN
     assert len(again.designs) < len(quantities.designs)
-    through = descend(case, past, start, ended=[(end, J + 1e9)])
+    through = descend(past, start, ended=[(end, J + 1e9)])
     np.testing.assert_array_equal(through, end)
 
 
@@ -274,12 +274,12 @@ def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:
     quantities = TrueQuantities(case)
     ends = []
     for share in ((0.37, 0.66, 0.15, 0.89, 1.0, 1.0), (0.2, 0.6, 0.5, 0.5, 1.0, 1.0)):
-        end = descend(case, quantities, lower + (upper - lower) * np.array(share))
-        kkt = kkt_certificate(case, end, quantities.at(end))
-        assert TrueDesign(case, end, quantities.at(end)).acceptable
-        assert any(name.startswith("-3 dB") for name in kkt.active)
-        assert kkt.stationarity <= KKT_LEVEL
-        ends.append(TrueDesign(case, end, quantities.at(end)).objective)
+        end = descend(quantities, lower + (upper - lower) * np.array(share))
+        found = TrueDesign(quantities, end)
+        assert found.acceptable
+        assert any(name.startswith("-3 dB") for name in found.kkt.active)
+        assert found.kkt.stationarity <= KKT_LEVEL
+        ends.append(found.objective)
     assert ends[0] == pytest.approx(ends[1], rel=1e-5)
 
 
@@ -305,7 +305,7 @@ def result_of(**states: str) -> dict:
 def test_every_place_shows_the_same_lines() -> None:
     result = result_of(survives="warned", deployable="unknown")
     terminal = "\n".join(shown.terminal_lines(result))
-    page = verdict_html(shown.lines_of(result))
+    page = block_html(Verdict(shown.lines_of(result)))
     for name in shown.LINES:
         assert f"{name} words" in terminal
         assert f"{name} words" in page
@@ -319,4 +319,4 @@ def test_every_place_shows_the_same_lines() -> None:
 @pytest.mark.parametrize("damage", [{}, {"verdict": 3}, {"verdict": {"optimal": {"state": "?"}}}])
 def test_a_run_without_a_verdict_shows_none(damage: dict) -> None:
     assert shown.lines_of(damage) == ()
-    assert verdict_html(shown.lines_of(damage)) == ""
+    assert block_html(Verdict(shown.lines_of(damage))) == ""

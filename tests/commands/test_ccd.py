@@ -60,7 +60,7 @@ def test_an_option_in_the_help_is_read(word: str, monkeypatch: pytest.MonkeyPatc
         asked.append(arguments)
         return 0
 
-    monkeypatch.setattr(module, "run", note)
+    monkeypatch.setattr("ccd_casadi.support.command_line.run", note)
     module.main([])
     told = {action.dest for action in asked[0]._actions if action.help != argparse.SUPPRESS} - {
         "help",

@@ -15,7 +15,7 @@ from scipy import signal
 
 from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.codesign import outer as outer_room
-from ccd_casadi.codesign.design_entries import controller_dict, figures_dict
+from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.nested import Nested
@@ -23,7 +23,6 @@ from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.run import OUTERS, solve
 from ccd_casadi.codesign.verdict import State, VerdictLine, search_evidence
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.fixed_structure import Bounds
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem
 from ccd_casadi.inner_problem.kinds import KINDS, InnerKind
 from ccd_casadi.inner_problem.objective import violated
@@ -88,19 +87,6 @@ class ByRule(InnerKind):
     def require_function(self) -> None:
         """It is one function of θ."""
 
-    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
-        return [scaled_plant(self.problem, theta)]
-
-    def bounds(self) -> Bounds:
-        inner = self.problem.inner
-        return Bounds(inner.S_max, inner.S_low, inner.omega_low)
-
-    def common_shifts(self) -> tuple[float, float]:
-        return 0.0, 0.0
-
-    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
-        return (1.0,), (1.0,)
-
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         raise AssertionError("no page is drawn here")
 
@@ -146,12 +132,6 @@ class VerifiedRule(Verified):
 
     def evidence(self, predicted: float) -> dict[str, Any]:
         return {"surrogate_bandwidth_hz": predicted / HZ}
-
-    def checks(self) -> dict[str, bool]:
-        return {}
-
-    def controller_entry(self) -> dict[str, Any]:
-        return controller_dict(self.made)
 
     def certified_line(self) -> VerdictLine:
         state = State.PASSED if self.feasible else State.FAILED

@@ -26,6 +26,7 @@ from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import machine_html, move_words, standing_html, survival_words
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.plants.places import Places
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.reporting.bode import loop_panels
 from ccd_casadi.reporting.landscape import read_truths
@@ -284,6 +285,35 @@ def test_a_saved_case_is_the_one_on_the_sliders(session):
     case = load_case(first)
     assert knobs_of(case) == knobs
     assert problem_of(case) == session.problems.at(knobs)
+
+
+def test_a_place_that_is_dragged_moves_what_it_names():
+    """A mirrored coordinate the other way, a diagonal by the mean, what is held not at all."""
+    pytest.importorskip("bokeh")
+    from ccd_casadi.explorer.places_figure import PlacesFigure, moves
+
+    nodes = tuple((x, y) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.0, 0.1))
+    places = Places(nodes, (("-a", "b"), ("r", "r"), (0.0, 0.05)))
+    theta, found = np.array([2.0, 0.04, 0.03]), []
+    problem = problem_of(load_case(CASE))
+    assert not moves(problem)
+    source = replace(problem.source, places=places, fixed=(("b", 0.06, "m"),))
+    problem = replace(problem, source=source, names=("t", "a", "r"))
+    assert moves(problem)
+    made = PlacesFigure(problem, found.append)
+    source, shown = made.marks(theta)
+    x, y = np.array(shown["data"]["x"]), np.array(shown["data"]["y"])
+    assert np.allclose([x, y], [[-40.0, 30.0, 0.0], [60.0, 30.0, 50.0]])
+    moves = (
+        (0, (-5.0, 3.0), (0.0, 5e-3, 0.0)),
+        (1, (2.0, 4.0), (0.0, 0.0, 3e-3)),
+        (2, (9.0, 0.0), (0.0,) * 3),
+    )
+    for i, (dx, dy), expected in moves:
+        source.data = shown["data"] | {"x": x + dx * np.eye(3)[i], "y": y + dy * np.eye(3)[i]}
+        assert found[-1] - theta == pytest.approx(expected, abs=1e-12)
+    source.data = {name: column[1:] for name, column in shown["data"].items()}
+    assert found[-1] == pytest.approx(theta)
 
 
 def test_masses_and_springs_are_read_from_the_matrices(session, searched_look):

@@ -234,6 +234,8 @@ def test_unverified_result_says_why() -> None:
     assert "✕ not verified" in text
     assert "Failed: prediction" in text
     assert "UNVERIFIED" in text
+    assert "prediction and truth differ by" in solution.result["reason"]
+    assert text.count("prediction and truth differ by") == 1  # in its line alone
 
 
 def test_hostile_names_and_units_are_escaped() -> None:

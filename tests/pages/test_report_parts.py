@@ -22,10 +22,8 @@ from ccd_casadi.drawing.content import (
     ThetaPath,
     Words,
 )
-from ccd_casadi.drawing.lines import figure_lines
 from ccd_casadi.drawing.maps import figure_landscape
-from ccd_casadi.drawing.page import table_html
-from ccd_casadi.drawing.paint import page_html
+from ccd_casadi.drawing.paint import block_html, page_html
 from ccd_casadi.report import main as report_command
 
 
@@ -35,7 +33,7 @@ def test_figures_are_deterministic_and_keep_the_callers_style() -> None:
     before = dict(matplotlib.rcParams)
     x = np.linspace(1.0, 10.0, 5)
     panel = Panel("time (s)", "cost ($a$ & <b>) (–)", (Curve(x, x**2, "J"),), log_y=True)
-    drawn = [figure_lines(Lines(((panel,),), "<t>"), "k") for _ in range(2)]
+    drawn = [block_html(Lines(((panel,),), "<t>"), "k") for _ in range(2)]
     assert drawn[0] == drawn[1]
     assert "cost ($a$ &amp; &lt;b&gt;)" in drawn[0]
     assert 'aria-label="&lt;t&gt;: cost' in drawn[0]
@@ -58,7 +56,7 @@ def test_landscape_takes_several_paths_and_unknown_letters() -> None:
 
 
 def test_tables_round_and_escape() -> None:
-    html = table_html(Table(("<a>", "n"), (("&", 1.0 / 3.0), ("x", float("nan")))))
+    html = block_html(Table(("<a>", "n"), (("&", 1.0 / 3.0), ("x", float("nan")))))
     Document(html)
     assert "&lt;a&gt;" in html
     assert "&amp;" in html

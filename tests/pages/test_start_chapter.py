@@ -10,7 +10,7 @@ from helpers import problem
 
 from ccd_casadi.drawing.content import Chapter, Figure
 from ccd_casadi.drawing.numbers import tables_of
-from ccd_casadi.drawing.paint import blocks_html
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.reporting.start import start_chapter
 from ccd_casadi.support.units import HZ
@@ -29,7 +29,7 @@ def best_at(case: CoDesignProblem, theta: tuple[float, ...]) -> SimpleNamespace:
 
 
 def html(chapter: Chapter) -> str:
-    return blocks_html(chapter.body, "s")
+    return block_html(chapter, "1")
 
 
 def test_both_sides_are_the_true_inner_problems() -> None:

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -120,6 +121,60 @@ def test_axes_leave_quiet_modes_alone_and_have_slopes(at: tuple[float, float], s
         compare_slopes(plant, theta)
 
 
+CORNERS = ((0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2), (0.3, -0.2))
+
+
+@few(20)
+@given(inside, st.integers(0, 99), st.sampled_from([3, 4]))
+def test_loads_at_reference_points_move_the_body_as_there_and_have_slopes(
+    at: tuple[float, float], seed: int, count: int
+) -> None:
+    """By the least forces that do it; of three points without twist."""
+    corners = CORNERS[:count]
+    places = Places(GRID, SIX, SIX[1:], 0.4, 0.1, reference=corners)
+    free = placed(beam_of_nodes(seed), replace(places, reference=()), ("x", "k", "y"))
+    plant = placed(beam_of_nodes(seed), places, ("x", "k", "y"))
+    theta = np.array([at[0], 1.3, at[1]])
+    system, apart = mechanics(plant, theta), mechanics(free, theta)
+    assert (plant.inputs, plant.outputs, system.B.shape) == (count, count, (7, count))
+    there = np.array([[1.0, *p] for p in corners]).T
+    assert system.B[:3] == pytest.approx(there, abs=1e-9)
+    assert system.C[:, :3] == pytest.approx(there.T, abs=1e-9)
+    forces = np.linalg.lstsq(apart.B, system.B, rcond=None)[0]
+    motions = apart.B[:3].T
+    if count == 4:
+        motions = np.column_stack([motions, motions[:, 1] * motions[:, 2]])
+        corner = np.prod(there[1:], axis=0)
+        assert motions[:, 3] @ forces == pytest.approx(corner, abs=1e-9)
+    assert motions @ np.linalg.lstsq(motions, forces, rcond=None)[0] == pytest.approx(forces)
+    compare_slopes(plant, theta)
+
+
+@few(20)
+@given(inside, st.integers(0, 99), st.sampled_from([{"axes": True}, {"reference": CORNERS}]))
+def test_an_actuator_that_is_not_there_is_as_if_never_given(
+    at: tuple[float, float], seed: int, how: dict[str, Any]
+) -> None:
+    """Its mass too; in part it has slopes; more than are to be chosen break a rule."""
+    flags = tuple(f"p{i}" for i in range(6))
+    whole = Places(GRID, SIX, SIX, 0.4, 0.1, present=flags, choose=4, **how)
+    some = replace(whole, actuators=tuple(SIX[i] for i in (0, 2, 3, 5)), present=(), choose=0)
+    plant = placed(beam_of_nodes(seed), whole, ("x", "k", "y", *flags))
+    four = placed(beam_of_nodes(seed), some, ("x", "k", "y"))
+    theta = np.array([at[0], 1.3, at[1]])
+    x, y = np.array([at, (0.05, -at[1]), SIX[3], SIX[5]]).T
+    assume(np.linalg.cond(np.stack([1.0 + 0.0 * x, x / 0.3, y / 0.2, x * y / 0.06])) < 100.0)
+    chosen = mechanics(plant, np.append(theta, [1, 0, 1, 1, 0, 1]))
+    expected = mechanics(four, theta)
+    for part in "MKBC":
+        there = getattr(expected, part)
+        assert getattr(chosen, part) == pytest.approx(there, abs=1e-7 * np.abs(there).max()), part
+    parts = np.append(theta, [0.7, 0.4, 0.9, 0.5, 0.6, 0.8])
+    compare_slopes(plant, parts)
+    assert plant.constraint_names[-1] == "actuators chosen"
+    assert constraint_values(plant, parts)[-1] == pytest.approx(3.9 / 4.0 - 1.0)
+
+
 @few(20)
 @given(inside, st.floats(0.0, 2.0))
 def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
@@ -147,6 +202,9 @@ def test_what_does_not_match_is_one_sentence() -> None:
         (Places(GRID, (("x",),)), "has 1 coordinates, a node 2"),
         (Places(GRID, (("x", 0.21),)), "beyond the nodes"),
         (Places(line, POINTS), "on one line"),
+        (Places(GRID, POINTS, POINTS, reference=CORNERS), "no fewer actuators and sensors"),
+        (Places(GRID, POINTS, POINTS, reference=CORNERS[:2]), "3 or 4 points"),
+        (Places(GRID, POINTS, POINTS, axes=True, present=("k",), choose=3), "for each actuator"),
     ):
         with pytest.raises(PlantError, match=words):
             placed(plant, places, ("k", "x", "y"))

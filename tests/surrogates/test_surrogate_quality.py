@@ -132,7 +132,7 @@ def test_a_run_holds_its_quality(two_mass_run: Path) -> None:
     assert quality["recommendation"]
     text = (two_mass_run / "report.html").read_text()
     assert re.search(r"<h2>Can the surrogate be trusted\?</h2>", text)
-    assert quality["recommendation"].replace("'", "&#x27;") in text
+    assert quality["recommendation"].replace("'", "&#39;") in text
 
 
 def test_auto_takes_the_kernel_that_predicts_left_out_samples_best() -> None:

@@ -57,6 +57,8 @@ def test_what_is_measured_in_si_is_what_was_synthesised(made: tuple[ScaledPlant,
 def test_a_design_that_its_numbers_carry_is_handed_out_as_it_is(made) -> None:  # type: ignore[no-untyped-def]
     plant, design = made
     assert recertified_in_si(plant, design, OMEGA_LOW) is design
+    read_low = replace(design.figures, gamma=(1.0 - 1e-5) * design.figures.gamma)
+    assert recertified_in_si(plant, replace(design, figures=read_low), OMEGA_LOW).figures.certified
     failed = replace(design, figures=replace(design.figures, outcome=Outcome.NORM_EXCEEDED))
     assert recertified_in_si(plant, failed, OMEGA_LOW) is failed
 
@@ -70,7 +72,8 @@ def test_a_design_with_other_figures_in_si_is_lost(made, factor: float) -> None:
     lost = recertified_in_si(plant, replace(design, figures=off), OMEGA_LOW)
     assert lost.figures.outcome is Outcome.LOST_IN_ROUNDING
     assert not lost.figures.certified
-    off = replace(figures, gamma=(1.0 - 1e-5) * figures.gamma)
+    tighter = replace(figures.certificate, norm_bound=(1.0 - 1e-5) * figures.certificate.norm)
+    off = replace(figures, certificate=tighter)
     lost = recertified_in_si(plant, replace(design, figures=off), OMEGA_LOW)
     assert lost.figures.outcome is Outcome.LOST_IN_ROUNDING
 

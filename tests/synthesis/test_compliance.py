@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import HZ, problem
 
-from ccd_casadi.codesign.kkt import first_order
+from ccd_casadi.codesign.kkt import TrueDesign, first_order
 from ccd_casadi.codesign.outer_problem import lifted_program
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.kinds import bandwidth_gradient
@@ -111,7 +111,7 @@ def test_it_is_a_constraint_of_the_outer_problem() -> None:
     x = np.array([*THETA, *np.log(POINT)])
     design = quantities.at(x)
     assert program.g.shape[0] == 3
-    here = first_order(case, x, design)
+    here = first_order(TrueDesign(quantities, x))
     row = here.names.index("compliance_max")
     assert here.g[row] == pytest.approx(np.log(design.figures.compliance / 2.7e-5))
     assert np.isfinite(here.jacobian[row]).all()

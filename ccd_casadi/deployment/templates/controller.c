@@ -1,16 +1,20 @@
 #include "controller.h"
 
 /* The sizes of A's diagonal blocks, and the blocks row by row. */
-static const int blocks[] = $blocks;
-static const double A[] = $A;
+static const int blocks[] = {{ '{' ~ blocks|join(', ') ~ '}' }};
+static const double A[] = {{ initialiser(A) }};
 /* Row by row: states x errors, forces x states, forces x errors. */
-static const double B[] = $B;
-static const double C[] = $C;
-static const double D[] = $D;
-$L/* State of a start: states x (errors, then forces). */
-static const double X[] = $X;
+static const double B[] = {{ initialiser(B) }};
+static const double C[] = {{ initialiser(C) }};
+static const double D[] = {{ initialiser(D) }};
+{% if L is not none %}
+/* Back-calculation: states x forces. */
+static const double L[] = {{ initialiser(L) }};
+{% endif %}
+/* State of a start: states x (errors, then forces). */
+static const double X[] = {{ initialiser(X) }};
 /* Feedforward: derivatives x forces x references. */
-static const double F[] = $F;
+static const double F[] = {{ initialiser(F) }};
 
 void controller_reset(controller_state *state)
 {
@@ -57,8 +61,11 @@ void controller_step(controller_state *state, const double e[CONTROLLER_ERRORS],
 void controller_step_forward(controller_state *state, const double e[CONTROLLER_ERRORS],
                              const double f[CONTROLLER_FORCES], double u[CONTROLLER_FORCES])
 {
-    double next[$room];
-$cut_declared    const double *a = A;
+    double next[{{ room }}];
+{% if limit is not none %}
+    double cut[CONTROLLER_FORCES];
+{% endif %}
+    const double *a = A;
     int i, j, block, start = 0;
 
     for (i = 0; i < CONTROLLER_FORCES; i++) {
@@ -68,7 +75,15 @@ $cut_declared    const double *a = A;
         for (j = 0; j < CONTROLLER_ERRORS; j++)
             sum += D[i * CONTROLLER_ERRORS + j] * e[j];
         sum += f[i];
-$clip        u[i] = sum;
+{% if limit is not none %}
+        cut[i] = sum;
+        if (sum > {{ limit }})
+            sum = {{ limit }};
+        if (sum < -{{ limit }})
+            sum = -{{ limit }};
+        cut[i] = sum - cut[i];
+{% endif %}
+        u[i] = sum;
     }
     for (block = 0; start < CONTROLLER_STATES; block++) {
         const int end = start + blocks[block];
@@ -78,7 +93,11 @@ $clip        u[i] = sum;
                 sum += *a++ * state->x[j];
             for (j = 0; j < CONTROLLER_ERRORS; j++)
                 sum += B[i * CONTROLLER_ERRORS + j] * e[j];
-$cut_used            next[i] = sum;
+{% if L is not none %}
+            for (j = 0; j < CONTROLLER_FORCES; j++)
+                sum += L[i * CONTROLLER_FORCES + j] * cut[j];
+{% endif %}
+            next[i] = sum;
         }
         start = end;
     }

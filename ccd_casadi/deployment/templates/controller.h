@@ -1,10 +1,10 @@
-/* H-infinity controller of $title, made by ccd-casadi.
+/* H-infinity controller of {{ title }}, made by ccd-casadi.
  *
- *     v[k] = C x[k] + D e[k] + f[k],   u[k] = $limits
- *     x[k+1] = A x[k] + B e[k]$back
+ *     v[k] = C x[k] + D e[k] + f[k],   u[k] = v[k]{{ '' if limit is none else ' within +-' ~ limit ~ ' N' }}
+ *     x[k+1] = A x[k] + B e[k]{{ '' if L is none else ' + L (u[k] - v[k])' }}
  *
- * Call controller_step once every $period s ($rate Hz). It was $verified with
- * $delay s from reading y to the new u at the actuator, and a zero-order hold.
+ * Call controller_step once every {{ period }} s ({{ rate }} Hz). It was {{ "verified" if verified else "NOT verified" }} with
+ * {{ delay }} s from reading y to the new u at the actuator, and a zero-order hold.
  *   e: e[i] = r[i] - y[i] in m, i = 0 .. CONTROLLER_ERRORS - 1
  *   u: u[i] in N, i = 0 .. CONTROLLER_FORCES - 1
  * Compile with -ffp-contract=off where results have to be the same on every machine.
@@ -12,13 +12,13 @@
 #ifndef CONTROLLER_H
 #define CONTROLLER_H
 
-#define CONTROLLER_ERRORS $p
-#define CONTROLLER_FORCES $m
-#define CONTROLLER_STATES $n
-#define CONTROLLER_PERIOD $period
+#define CONTROLLER_ERRORS {{ p }}
+#define CONTROLLER_FORCES {{ m }}
+#define CONTROLLER_STATES {{ n }}
+#define CONTROLLER_PERIOD {{ period }}
 
 typedef struct {
-    double x[$room];
+    double x[{{ room }}];
 } controller_state;
 
 /* Put the controller to rest. */
@@ -37,7 +37,7 @@ void controller_step_forward(controller_state *state, const double e[CONTROLLER_
                              const double f[CONTROLLER_FORCES], double u[CONTROLLER_FORCES]);
 
 /* Feedforward of one reference: its position and four derivatives r[0] .. r[4], axis from 0.
- * The forces are those that the plant needs $ahead s later, when they act. */
+ * The forces are those that the plant needs {{ ahead }} s later, when they act. */
 void controller_forward(int axis, const double r[5], double f[CONTROLLER_FORCES]);
 
 #endif

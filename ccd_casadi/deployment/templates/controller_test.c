@@ -1,19 +1,19 @@
 /* Compares the controller with the forces that the Python difference equation gave.
  *
- *     $compile
- *     ./controller_test        exit 0 where all forces agree to $tolerance of the largest
+ *     {{ compile }}
+ *     ./controller_test        exit 0 where all forces agree to {{ tolerance }} of the largest
  *     ./controller_test -      reads errors from stdin, writes forces to stdout, a line a sample
  */
 #include <stdio.h>
 
 #include "controller.h"
 
-#define SAMPLES $samples
+#define SAMPLES {{ samples }}
 
-static const double errors[] = $errors;
-static const double forwards[] = $forwards;
-static const double first[] = $first; /* forces that were there before */
-static const double forces[] = $forces;
+static const double errors[] = {{ initialiser(errors) }};
+static const double forwards[] = {{ initialiser(forwards) }};
+static const double first[] = {{ initialiser(first) }}; /* forces that were there before */
+static const double forces[] = {{ initialiser(forces) }};
 
 static double size(double value)
 {
@@ -58,5 +58,5 @@ int main(int count, char **words)
         }
     }
     printf("largest force %g N, largest difference %g N\n", largest, worst);
-    return worst <= $tolerance * largest ? 0 : 1;
+    return worst <= {{ tolerance }} * largest ? 0 : 1;
 }

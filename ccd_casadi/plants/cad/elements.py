@@ -69,26 +69,11 @@ class Body:
 
     def matrices(self) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
         """K (3N, 3N) in N/m and M (3N, 3N) in kg."""
-        fem = require("skfem", "cad")
-
-        @fem.BilinearForm
-        def product(u: Any, v: Any, w: Any) -> Any:
-            return u.grad[w.i] * v.grad[w.j]
-
-        @fem.BilinearForm
-        def inertia(u: Any, v: Any, w: Any) -> Any:
-            return u * v
-
-        stiff, inert = self._bases
-        return self._assembled(
-            lambda i, j: product.assemble(stiff, i=i, j=j), inertia.assemble(inert)
-        )
+        return self._assembled(lambda u, v, w: u.grad[w.i] * v.grad[w.j], lambda u, v, w: u * v)
 
     def slopes(self, velocity: Array) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
         """K' and M' where the points move with `velocity` (n, 3)."""
-        fem = require("skfem", "cad")
 
-        @fem.BilinearForm
         def product(u: Any, v: Any, w: Any) -> Any:
             dV = w.velocity.grad  # k, i: ∂_i V_k
             change = (dV[0, 0] + dV[1, 1] + dV[2, 2]) * u.grad[w.i] * v.grad[w.j]
@@ -97,17 +82,11 @@ class Body:
                 change -= u.grad[w.i] * dV[k, w.j] * v.grad[k]
             return change
 
-        @fem.BilinearForm
         def inertia(u: Any, v: Any, w: Any) -> Any:
             dV = w.velocity.grad
             return (dV[0, 0] + dV[1, 1] + dV[2, 2]) * u * v
 
-        stiff, inert = self._bases
-        field = self._field(stiff, velocity)
-        return self._assembled(
-            lambda i, j: product.assemble(stiff, i=i, j=j, velocity=field),
-            inertia.assemble(inert, velocity=self._field(inert, velocity)),
-        )
+        return self._assembled(product, inertia, velocity)
 
     def on(self, triangles: np.ndarray) -> np.ndarray:
         """(m,) numbers of the nodes on element faces (f, 3)."""
@@ -151,15 +130,25 @@ class Body:
         linear = basis.with_element(fem.ElementVector(fem.ElementTetP1()))
         return linear.interpolate(velocity.ravel())
 
-    def _assembled(self, product: Any, inertia: Any) -> tuple[sparse.csc_matrix, ...]:
+    def _assembled(
+        self, product: Any, inertia: Any, velocity: Array | None = None
+    ) -> tuple[sparse.csc_matrix, ...]:
         """Of P_ij = ∫ ∂_i u ∂_j v: block (j, i) is λ P_ij + μ (P_ij ᵀ + δ_ij Σ_k P_kk)."""
-        first, shear = self.material.lame
-        half = {(i, j): product(i, j) for i in AXES for j in AXES if i <= j}
+        fem = require("skfem", "cad")
+        (first, shear), (stiff, inert) = self.material.lame, self._bases
+        of_stiff, of_inert = (
+            {} if velocity is None else {"velocity": self._field(basis, velocity)}
+            for basis in (stiff, inert)
+        )
+        form = fem.BilinearForm(product)
+        half = {(i, j): form.assemble(stiff, i=i, j=j, **of_stiff)
+                for i in AXES for j in AXES if i <= j}  # fmt: skip
         P = half | {(j, i): item.T for (i, j), item in half.items()}
         trace = shear * sum(P[k, k] for k in AXES)
         blocks = [
             [first * P[i, j] + shear * P[j, i] + (trace if i == j else 0.0 * trace) for i in AXES]
             for j in AXES
         ]
-        mass = sparse.block_diag([self.material.density * inertia] * 3, format="csc")
+        lump = self.material.density * fem.BilinearForm(inertia).assemble(inert, **of_inert)
+        mass = sparse.block_diag([lump] * 3, format="csc")
         return sparse.bmat(blocks, format="csc"), mass

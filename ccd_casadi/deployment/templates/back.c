@@ -1,2 +1,0 @@
-/* Back-calculation: states x forces. */
-static const double L[] = $L;

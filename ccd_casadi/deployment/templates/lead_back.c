@@ -1,2 +1,0 @@
-            for (j = 0; j < CONTROLLER_FORCES; j++)
-                sum += L[i * CONTROLLER_FORCES + j] * cut[j];
