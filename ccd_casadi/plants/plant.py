@@ -148,9 +148,11 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     try:
         result = model({name: theta[i] for i, name in enumerate(names)}, **options)
     except TypeError as error:
-        raise PlantError(f"the plant model does not take its options: {error}") from error
+        words = f"the plant model does not take its options: {error}"
+        raise PlantError(f"{words}; correct [plant] or a file of robust.plants") from error
     except KeyError as error:
-        raise PlantError(f"the plant model needs a theta that the case lacks: {error}") from None
+        words = f"the plant model needs a theta that the case lacks: {error}"
+        raise PlantError(f"{words}; the case has {', '.join(names)}") from None
     found, damping_ratio, scalars = model_parts(result, ca.SX)
     f, *constraints = scalars.values()
     lam = ca.vertcat(*constraints) if constraints else ca.SX(0, 1)
