@@ -202,6 +202,7 @@ def structured_answer(
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
         raise UserError(words)
     begin_at, progress, workers = options.begin_at, options.progress, options.workers
+    workers.begin(with_worst_plant.__module__)  # they start while the plants are made
     head = head_of(problem, theta)
     asked = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
     if begin_at is not None:

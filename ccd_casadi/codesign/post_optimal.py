@@ -116,7 +116,7 @@ def structured_responses(
     Of an error or a move time those to the bounds on the loop, and how ω_b moves, are not known.
 
     How θ and ω_b move is given where the bounds on θ and λ alone determine θ (a vertex); elsewhere
-    it takes second derivatives of ω_b*, which are not known. At a kink of ω_b* the multipliers μ
+    it takes second derivatives of v(θ), which are not known. At a kink of it the multipliers μ
     are those of θ and controller together.
     """
     lower, upper = box(problem)

@@ -58,6 +58,7 @@ class LoopModel(Model[Assessment]):
     """The bounds of a set of loops as rows over x = (κ, τ); `goal` gives v(κ) and its gradient."""
 
     corrected = True
+    programmes = 6  # a loop costs no more than as many: the best of a step is not worth twice that
 
     def __init__(
         self,
@@ -65,10 +66,8 @@ class LoopModel(Model[Assessment]):
         goal: Goal | None = None,
         reward: float = 1.0,
         floor: float = -np.inf,
-        restoring: bool = False,
     ) -> None:
         self.problem, self.goal, self.reward = problem, goal, reward
-        self.restoring = restoring
         # A step that fails is followed by one from the same place.
         self.all_rows = lru_cache(2)(
             lambda here: all_rows(problem, here.x[:-1], float(here.x[-1]), here.data)
@@ -136,11 +135,10 @@ def ascend(
     least_gain: float = 1e-8,
     restoring: bool = False,
 ) -> Ascent:
-    """Climb to a larger ω_b from a start whose loops are stable; ends where steps do not help.
-
-    `restoring`: first of all within the bounds, whatever that costs of ω_b.
-    """
-    model = LoopModel(problem, restoring=restoring)
+    """Climb to a larger ω_b, or with `restoring` within the bounds first, from a start whose loops
+    are stable; ends where steps do not help."""
+    model = LoopModel(problem)
+    model.restoring = restoring
     begin = model.assessed(start.kappa, start.tau, start.assessment)
     assert begin is not None
     n = len(begin.x)

@@ -17,13 +17,13 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import FIRST_RADIUS, PENALTY, Ascent, Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.process_pool import Pool, results
 
-ROUNDS, STEPS = 27, 15  # at most, steps of each
-HALVINGS = (0, 2, 6)  # rounds after which the better half goes on
+ROUNDS, STEPS = 81, 5  # at most, steps of each: what has ended or merged costs no more
+HALVINGS = (2, 8, 20)  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
-OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
+OVERTAKING = 12.0  # times the gain of its last round: what a search behind may still catch up
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
 MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
@@ -86,11 +86,12 @@ def run_race(
         if not running or (alone and not last):
             break
         others = [runner for runner in field if not runner.running]
-        field = others + _climbed(problem, running, workers or Workers(1))
+        field = others + _climbed(problem, running, workers)
         field = _merged(sorted(field, key=lambda runner: -runner.merit))
         field = _going_on(field, turn)
-        lead = field[0].point
-        going = sum(runner.running for runner in field)
+        lead, going = field[0].point, sum(runner.running for runner in field)
+        if going == len(running):
+            continue
         over = lead.assessment.violation
         kept = f"bounds exceeded by {100.0 * over:.1g} %" if over > WITHIN else "within every bound"
         best = f"{np.exp(lead.tau) * scale:.2f} Hz, {kept}"
@@ -141,9 +142,8 @@ def finished(runners: Sequence[Runner]) -> list[Runner]:
 
 def distinct(runners: Sequence[Runner], count: int) -> list[Array]:
     """κ of the best `count` ends of unequal bandwidth, those outside the bounds last."""
-    ordered = sorted(finished(runners), key=lambda runner: -runner.merit)
     found: list[Runner] = []
-    for runner in ordered:
+    for runner in finished(runners):
         if all(abs(runner.point.tau - other.point.tau) > SAME for other in found):
             found.append(runner)
     return [runner.point.kappa for runner in found[:count]]
@@ -165,10 +165,10 @@ def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOpt
     return tuple(found)
 
 
-def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool) -> list[Runner]:
+def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool | None) -> list[Runner]:
     """All of them some steps further, in their order."""
-    tasks = [(i, problem, r.point, r.radius) for i, r in enumerate(running)]
-    ends = dict(workers.map_unordered(_climb, tasks))
+    tasks = {i: (problem, r.point, r.radius) for i, r in enumerate(running)}
+    ends = dict(results(workers, _climb, tasks))
     found = []
     for i, runner in enumerate(running):
         end = ends[i]
@@ -179,9 +179,8 @@ def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool) -> 
     return found
 
 
-def _climb(task: tuple[int, LoopProblem, Point, float]) -> tuple[int, Ascent]:
-    index, problem, point, radius = task
-    return index, ascend(problem, point, iterations=STEPS, radius=radius)
+def _climb(problem: LoopProblem, point: Point, radius: float) -> Ascent:
+    return ascend(problem, point, iterations=STEPS, radius=radius)
 
 
 def _merged(field: Sequence[Runner]) -> list[Runner]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
+from scipy.optimize import brentq
 
 from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
 from ccd_casadi.lti.closed_loop import sigma_max
@@ -95,6 +95,4 @@ def _bandwidth(S: StateSpace, over_w: StateSpace) -> float:
         return np.nan
     first = int(np.argmax(above))
     excess = lambda omega: float(sigma_max(S.response(np.array([omega])))[0] - HALF_POWER)  # noqa: E731
-    return float(
-        scipy.optimize.brentq(excess, ends[first - 1], ends[first], (), 1e-12 * ends[first], 1e-14)
-    )
+    return float(brentq(excess, ends[first - 1], ends[first], (), 1e-12 * ends[first], 1e-14))
