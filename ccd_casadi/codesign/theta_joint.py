@@ -25,7 +25,7 @@ from ccd_casadi.codesign.joint_model import (
 )
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
 from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
     nearby,
     structured_of,
@@ -87,7 +87,7 @@ def joint_search(
             final = APART + (LOOKS + 1) * turn + LOOKS
             looks = range(final - LOOKS, final)
             asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
-            best, problem = nearly_finished(asked, models, best), asked.problem
+            best, problem = nearly_finished(asked, known, best), asked.problem
             del make, models
             gc.collect()  # with which the bases go
             best, near = finished(asked, best)
@@ -157,15 +157,25 @@ def on_worse_plants(
     return sampler, best, J
 
 
-def nearly_finished(sampler: Sampler, models: Sequence[Evaluate], start: JointPoint) -> JointPoint:
-    """The joint optimum near by on the plants as these models know them."""
-    problem, best = sampler.problem, start
+def nearly_finished(
+    sampler: Sampler, known: Sequence[tuple[float, ...]], start: JointPoint
+) -> JointPoint:
+    """The joint optimum near by on the plants from what is known at some θ, of which it is one or
+    near one in the end."""
+    problem, best, known = sampler.problem, start, list(known)
+    if plant_of(problem).nearby is None:
+        return start
+    width = np.subtract(problem.upper, problem.lower)
     for _ in range(ENDINGS):
+        models = nearby(problem, known, best.theta)
         make = partial(proposed, problem, models, best, REACH, bent=True)
-        key = (*best.theta, best.bandwidth, REACH)
+        key = (*best.theta, best.bandwidth, REACH, len(known))
         found = sampler.cached("nearly finished", key, Proposal, make)
         best = found.end
-        if found.gain <= KEPT * abs(problem.w2 * best.bandwidth):
+        away = np.abs(np.subtract(known, best.theta) / width).max(axis=1).min()
+        if away > CLOSE:
+            known = [*(known if len(known) < KNOWN else ()), best.theta]
+        elif found.gain <= KEPT * abs(problem.w2 * best.bandwidth):
             break
     return best
 
