@@ -8,7 +8,8 @@ falls into those up to the lower and those from the upper one; where all are on 
 combination is the best of the part. A search begins at the nearest optimum that is known. The first
 combination whose bound is the least of all is the best one, and what is left is cut: bounds are
 optima that were found, so what is cut is no better as far as those hold. A search that beats its
-bound shows by how much bounds may be wrong: all others are lowered by twice as much.
+bound shows by how much bounds may be wrong: all others are lowered by twice as much, and searches
+begin at what it has found.
 
 Source: Land and Doig, Econometrica 28 (1960).
 """
@@ -140,9 +141,12 @@ def best_of_lists(
         J = found.result.get("objective", np.inf)
         node = Node(part.lists, found.result["status"], J, _made_of(problem, found.result))
         nodes[tuple(part.lists.values())] = node
-        known += [found] if np.isfinite(J) else []
         gained = part.bound - J if node.status != "not_verified" else 0.0
-        if gained > _same(problem, found) or (part.found and -gained > _same(problem, found)):
+        same = _same(problem, found)
+        if gained > same:  # as little as that bound are other ends the least of their parts
+            known.clear()
+        known += [found] if np.isfinite(J) else []
+        if gained > same or (part.found and -gained > same):
             lower = 2.0 * max(gained, 0.0)
             open_ = [replace(other, bound=other.bound - lower, found=None) for other in open_]
         if whole and judge is not None and part.found is None and np.isfinite(J):

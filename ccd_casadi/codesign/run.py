@@ -149,17 +149,12 @@ def require_solvable(problem: CoDesignProblem) -> None:
         raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
 
 
-# What searches over lists of values near by, for the kinds that know how.
-LISTED: dict[type[ControllerProblem], type[ListedStructured]] = {
-    StructuredProblem: ListedStructured
-}
-
-
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
     """A co-design with parameters from lists: local searches near by where its kind knows how."""
-    near_by = LISTED.get(type(sampler.problem.controller))
-    if near_by is not None:
-        of = near_by(formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x))
+    if isinstance(sampler.problem.controller, StructuredProblem):
+        of = ListedStructured(
+            formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x)
+        )
         return best_of_lists(sampler, of.search, of.search, of.judge)
     quick = replace(formulation, box_points=0)  # a bound needs no look at the box
     return best_of_lists(

@@ -1,9 +1,10 @@
 """Searches over lists of values with a controller of fixed structure, each near another's end.
 
-All take local steps on the true function. The first begins with a full multi-start search, every
-other one at the nearest θ and controller that are known; where that finds no design a few starts
-are tried at the θ themselves: a part is not empty for that. What is found so is good for its J; the
-best combination is then designed as any other case, from that controller.
+All take local steps: of θ and controller together where J counts the bandwidth, else on the true
+function. The first begins with a full multi-start search, every other one at the nearest θ and
+controller that are known; where that finds no design a few starts are tried at the θ themselves: a
+part is not empty for that. What is found so is good for its J; the best combination is then
+designed as any other case, from that controller.
 """
 
 from collections.abc import Callable
@@ -21,11 +22,13 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
-from ccd_casadi.codesign.outer_structured import StructuredOuter
+from ccd_casadi.codesign.outer_structured import StructuredOuter, printer
 from ccd_casadi.codesign.outer_theta import FAR, SETTLED, pieces_from
+from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
@@ -65,11 +68,13 @@ class ListedStructured:
         forbidden = unmet_constraint(problem, self.formulation.starts, self.seed)
         if forbidden:
             return _nothing(forbidden)
-        return self._anew(sampler) if near is None else self._near(sampler, near)
+        found = self._anew(sampler) if near is None else self._near(sampler, near)
+        if found.problem is not None:
+            self.scenarios = structured_of(found.problem).scenarios
+        return found
 
     def _anew(self, sampler: Sampler) -> Solution:
         outer = StructuredOuter(sampler).prepared(self.seed)
-        self.scenarios = structured_of(outer.problem).scenarios
         found = _climbed(outer.sampler, np.array(sampler.problem.start))
         for theta in design("sobol", *box(sampler.problem), self.formulation.starts, self.seed):
             allowed = _allowed(sampler.problem, theta)
@@ -78,8 +83,7 @@ class ListedStructured:
         return found
 
     def _near(self, sampler: Sampler, near: Solution) -> Solution:
-        problem = sampler.problem
-        known = _start(near)
+        problem, known = sampler.problem, _start(near)
         values = known.source.held | dict(zip(known.names, known.start, strict=True))
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
@@ -97,9 +101,15 @@ class ListedStructured:
 
 
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
-    """From θ to the least J near by."""
-    problem = sampler.problem
-    best = pieces_from(sampler, sampler.values(theta, "near by")[0], SETTLED, FAR)
+    """From θ to the least J near by; by steps along the truth where the joint search breaks λ."""
+    best = first = sampler.values(theta, "near by")[0]
+    asked = sampler
+    if sampler.problem.figure is BANDWIDTH:
+        tell = printer("near by", sampler.quiet)
+        asked, best, _ = joint_search(sampler, theta, tell, ends=())
+    if best.theta == first.theta or violated(asked.problem, best.theta):  # it lost λ
+        asked, best = sampler, pieces_from(sampler, first, SETTLED, FAR)
+    problem = asked.problem
     J = objective_of(problem, best)
     if not np.isfinite(J):
         return _nothing(best.shortfall)

@@ -1,86 +1,53 @@
 """The best θ and controller in one search, where it is the plants that cost: finite elements, say.
 
-At the best θ so far the matrices of every plant of the set are known with their slopes. On plants
-of first order, M + ∂M Δθ and so forth, within a reach of |Δz| (z is θ in shares of its box),
-
-    min w1 f(z) + w2 e^τ ω₀,   c(κ, τ; z) <= 0,  λ(z) <= 0      over z, κ and τ = ln ω_b/ω₀
-
-is one search by `optim.trust_region`: the rows are those of `local_search`, with slopes to z. At
-its end the plants are made anew and the controller adapts to them in a few steps; J there tells how
-far the first order may reach. Where no more is promised the conditions of optimality hold for the
-true plants too, as values and slopes are exact in the middle.
+The plants of the set around the best θ so far are known by a reduced basis, or by their matrices to
+first order, within a reach of |Δz| (z is θ in shares of its box). On these θ, the controller and
+ω_b are searched at once (`joint_model`). At the end the plants are made anew and the controller
+adapts to them in a few steps; J there tells how far such knowledge may reach. Where no more is
+promised the conditions of optimality hold for the true plants too, as values and slopes are exact
+in the middle.
 """
 
 import gc
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import Any
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.decoupling import in_units_of
-from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
-from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
-from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.codesign.joint_model import (
+    SETTLED,
+    STEPS,
+    JointModel,
+    JointPoint,
+    Proposal,
+    proposed,
+)
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
-from ccd_casadi.inner_problem.objective import hardware_at, objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
-    bounds_of,
     nearby,
-    structure_of,
     structured_of,
     uncertain_plant,
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import violations
-from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
-from ccd_casadi.plants.plant import Evaluate, hardware_cost, to_first_order
+from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 
-REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
+REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the models count
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
 LOOKS, APART = 5, 200  # for worse plants before an end, each elsewhere in the box; numbered from
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
-PENALTY = (
-    6.0  # a few times the sum of multipliers: less, and a violation of second order counts less
-)
-STEPS, ADAPTING = 60, 15  # of a search, and of the controller alone at its end
-FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
-LEAST_GAIN = 1e-7  # of w2 ω_b
-LAST, FADED = 12, 0.15  # trials that gain less of all that was gained: made anew, plants tell more
-SETTLED = 3e-4  # of J: less is not worth another set of plants
-CLOSE = 0.02  # of the box: the reach of last searches, on plants known near and to first order
+CLOSE = 0.02  # of the box: the reach of last searches, on plants to first order
 ENDINGS, KEPT = 12, 2e-6  # of these; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
-INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
-FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
-
-
-@dataclass(frozen=True)
-class JointPoint:
-    """θ, κ (SI) and ω_b in rad/s, which may exceed the bounds a little."""
-
-    theta: tuple[float, ...]
-    kappa: tuple[float, ...]
-    bandwidth: float
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """The end of a search and by how much J falls there, on the plants to first order."""
-
-    end: JointPoint
-    gain: float
 
 
 def joint_search(
@@ -120,7 +87,10 @@ def joint_search(
             final = APART + (LOOKS + 1) * turn + LOOKS
             looks = range(final - LOOKS, final)
             asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
-            best, near, problem = *finished(asked, models, best), asked.problem
+            best, problem = nearly_finished(asked, models, best), asked.problem
+            del make, models
+            gc.collect()  # with which the bases go
+            best, near = finished(asked, best)
             own = uncertain_plant(problem, best.theta)
             kappa, omega_b = np.array(best.kappa), best.bandwidth
             scenarios = violations(problem, own, kappa, omega_b, final, tell)[1]
@@ -131,8 +101,7 @@ def joint_search(
             known = [best.theta]
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
-        del make, models  # the basis is large: it grows and need not stay,
-        gc.collect()  # nor in the circles of searches before
+        gc.collect()  # bases are large, and searches before hold theirs in circles
         models = nearby(problem, known, found.end.theta)
         end, there = JointModel(problem, models, found.end, reach).adapted()
         gained = J - there
@@ -142,7 +111,8 @@ def joint_search(
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
-    best = best if settled or ends is not None else finished(asked, models, best)[0]
+    if not (settled or ends is not None):
+        best = finished(asked, best)[0]
     if best.theta == first.theta and asked is sampler:
         return sampler, first, settled
     last = asked.value_from(best.theta, best.kappa)
@@ -187,23 +157,29 @@ def on_worse_plants(
     return sampler, best, J
 
 
-def finished(
-    sampler: Sampler, models: Sequence[Evaluate], start: JointPoint
-) -> tuple[JointPoint, bool]:
-    """The joint optimum near by, on plants known near it and then on the plants themselves to first
-    order: so near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it;
-    and whether it is that near, or was."""
-
-    def ended(models: Sequence[Evaluate], at: JointPoint, reach: float) -> Proposal:
-        make = partial(proposed, problem, models, at, reach, LAST_GAIN)
-        return sampler.cached("finished", (*at.theta, at.bandwidth, reach), Proposal, make)
-
-    problem, reach = sampler.problem, CLOSE
-    best = ended(models, start, CLOSE).end
-    models = nearby(problem, (), best.theta)
-    best, J = first = JointModel(problem, models, best, reach).adapted()
+def nearly_finished(sampler: Sampler, models: Sequence[Evaluate], start: JointPoint) -> JointPoint:
+    """The joint optimum near by on the plants as these models know them."""
+    problem, best = sampler.problem, start
     for _ in range(ENDINGS):
-        found = ended(models, best, reach)
+        make = partial(proposed, problem, models, best, REACH, bent=True)
+        key = (*best.theta, best.bandwidth, REACH)
+        found = sampler.cached("nearly finished", key, Proposal, make)
+        best = found.end
+        if found.gain <= KEPT * abs(problem.w2 * best.bandwidth):
+            break
+    return best
+
+
+def finished(sampler: Sampler, start: JointPoint) -> tuple[JointPoint, bool]:
+    """The joint optimum near by, on the plants to first order around one place after the other: so
+    near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether
+    it is that near, or was."""
+    problem, reach = sampler.problem, CLOSE
+    models = nearby(problem, (), start.theta)
+    best, J = first = JointModel(problem, models, start, reach).adapted()
+    for _ in range(ENDINGS):
+        make = partial(proposed, problem, models, best, reach, LAST_GAIN)
+        found = sampler.cached("finished", (*best.theta, best.bandwidth, reach), Proposal, make)
         if found.gain <= KEPT * abs(J):
             return best, True
         others = nearby(problem, (), found.end.theta)
@@ -232,169 +208,3 @@ def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Arr
         there = replace(here, theta=tuple(theta.tolist()))
         found.append(JointModel(problem, models, there, 0.0).adapted(STEPS)[1])
     return np.array(found[1:]) - found[0]
-
-
-def proposed(
-    problem: CoDesignProblem,
-    models: Sequence[Evaluate],
-    at: JointPoint,
-    reach: float,
-    least_gain: float = LEAST_GAIN,
-) -> Proposal:
-    """The end of one search around a place, on the plants of these models."""
-    model = JointModel(problem, models, at, reach)
-    start = model.at(model.start)
-    if start is None:
-        return Proposal(at, 0.0)
-    if least_gain == LEAST_GAIN:
-        model.enough = SETTLED * abs(start.value)
-    n, radius = len(start.x), Radius(min(FIRST, reach), NARROWEST, WIDEST)
-    end = minimise(
-        model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=least_gain
-    ).best
-    gain = start.value - end.value - PENALTY * end.violation
-    return Proposal(model.place(end.x), model.unit * float(gain))
-
-
-class JointModel(Model[tuple[LoopProblem, Assessment]]):
-    """J over its `unit`, w2 ω_b in the middle, on the plants to first order around a place; over
-    x = (z, κ, τ), with the loops at x."""
-
-    corrected = bending = True
-    enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
-
-    def __init__(
-        self, problem: CoDesignProblem, models: Sequence[Evaluate], place: JointPoint, reach: float
-    ) -> None:
-        self.problem, self.models, self.middle = problem, models, np.array(place.theta)
-        structured = structured_of(problem)
-        known = [(option, np.array(point)) for option, point in structured.scenarios]
-        lower, upper = box(problem)
-        self.lower, self.width = lower, upper - lower
-        uncertain = self.uncertain((self.middle - lower) / self.width)
-        self.scenarios = known or uncertain.corners()
-        self.first = uncertain.plants(self.scenarios[:1])[0]
-        self.unit = -problem.w2 * place.bandwidth
-        middle = (self.middle - lower) / self.width
-        loops = self.first_loops = self.loops(middle)
-        self.merits: list[float] = []  # before every trial
-        # A step that fails is followed by one from the same place.
-        self.loops_beside = lru_cache(1)(self._loops_beside)
-        self.all_rows = lru_cache(2)(
-            lambda here: all_rows(here.data[0], *self.parts(here.x)[1:], here.data[1])
-        )
-        self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
-        kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
-        self.start = np.concatenate([middle, kappa, [self.tau]])
-        low, high = np.maximum(middle - reach, 0.0), np.minimum(middle + reach, 1.0)
-        self.low = np.concatenate([low, loops.box[0], [-np.inf]])
-        self.high = np.concatenate([high, loops.box[1], [np.inf]])
-
-    def place(self, x: Array) -> JointPoint:
-        """That of x."""
-        z, kappa, tau = self.parts(x)
-        loops = self.first_loops
-        kappa = loops.structure.in_units(kappa, loops.plants.omega_0, loops.plants.force)
-        theta = np.clip(self.theta(z), *box(self.problem))
-        omega_b = float(np.exp(tau) * loops.plants.omega_0)
-        return JointPoint(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
-
-    def adapted(self, steps: int = ADAPTING) -> tuple[JointPoint, float]:
-        """The middle after a few steps of the controller alone, and J there with what is left of a
-        violation; infinite where a loop is unstable."""
-        z, kappa, tau = self.parts(self.start)
-        found = assess(self.first_loops, kappa, tau)
-        if not found.stable:
-            return self.place(self.start), np.inf
-        point = ascend(self.first_loops, Point(kappa, tau, found), iterations=steps,
-                       radius=FIRST).point  # fmt: skip
-        x = np.concatenate([z, point.kappa, [point.tau]])
-        unmet = float(hardware_at(self.problem, self.middle).constraints.max(initial=0.0))
-        worth = np.exp(point.tau - self.tau)
-        worth -= PENALTY * max(point.assessment.violation, unmet)
-        cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.middle)
-        return self.place(x), float(cost - self.unit * worth)
-
-    def theta(self, z: Array) -> Array:
-        """θ of its shares."""
-        return np.asarray(self.lower + self.width * z)
-
-    def parts(self, x: Array) -> tuple[Array, Array, float]:
-        """z, κ and τ."""
-        count = len(self.middle)
-        return x[:count], x[count:-1], float(x[-1])
-
-    def uncertain(self, z: Array, beside: Array | None = None) -> UncertainPlant:
-        """The plant at z, or beside z to first order."""
-        theta = tuple(self.theta(z).tolist())
-        known = [model(theta) for model in self.models]
-        if beside is not None:
-            known = [to_first_order(one, self.width * beside) for one in known]
-            theta = tuple(self.theta(z + beside).tolist())
-        return uncertain_plant(self.problem, theta, known)
-
-    def loops(self, z: Array, beside: Array | None = None) -> LoopProblem:
-        """Those of the set there, in the units of its first plant in the middle."""
-        share = self.width[:, None, None]
-        plants = [
-            replace(plant, dA=share * plant.dA, dB=share * plant.dB, dC=share * plant.dC)
-            for plant in self.uncertain(z, beside).plants(self.scenarios)
-        ]
-        structured = structured_of(self.problem)
-        return problem_for(
-            [in_units_of(plant, self.first) for plant in plants], structure_of(self.problem),
-            bounds_of(self.problem), structured.sampling, structured.frequencies,
-        )  # fmt: skip
-
-    def _loops_beside(self, z: tuple[float, ...]) -> list[LoopProblem]:
-        return [self.loops(np.array(z), BESIDE * unit) for unit in np.eye(len(z))]
-
-    def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
-        """With every loop stable, and masses that are positive to first order."""
-        x = np.clip(x, self.low, self.high)
-        z, kappa, tau = self.parts(x)
-        try:
-            problem = self.loops(z)
-        except np.linalg.LinAlgError:  # placed masses move so far that M + ∂M Δθ is indefinite
-            return None
-        found = assess(problem, kappa, tau)
-        if not found.stable:
-            return None
-        own, worth = hardware_at(self.problem, self.theta(z)), float(np.exp(tau - self.tau))
-        cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.theta(z))
-        slope = np.concatenate([own.cost_gradient / self.unit, np.zeros(len(kappa)), [-worth]])
-        violation = max(found.violation, float((own.constraints + INSIDE).max(initial=0.0)))
-        return Iterate(x, cost / self.unit - worth, slope, violation, (problem, found))
-
-    def ended(self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]) -> bool:
-        """Where the last trials gain little of what all have."""
-        self.merits.append(here.value + PENALTY * here.violation)
-        gained = self.merits[0] - self.merits[-1]
-        late = self.merits[-LAST:][0] - self.merits[-1]
-        return len(self.merits) > LAST and gained > self.enough and late < FADED * gained
-
-    def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
-        """Peaks, the grid near them, and λ."""
-        z, kappa, tau = self.parts(here.x)
-        problem, assessment = here.data
-        assert assessment.peaks is not None
-        found, count, peaks = self.all_rows(here), len(z), len(assessment.peaks.v)
-        steep = np.abs(found.to_kappa).sum(1) + np.abs(found.to_tau)
-        kept = np.flatnonzero(found.value + FAR * radius * np.maximum(steep, 1.0) > 0.0)
-        found = found.only(kept)
-        slopes = np.column_stack([to_theta(problem, kappa, found), found.to_kappa, found.to_tau])
-        own = hardware_at(self.problem, self.theta(z))
-        of_z = np.pad(own.slopes, ((0, 0), (0, len(here.x) - count)))
-
-        def second(index: np.ndarray) -> Array:
-            chosen = found.only(index)
-            try:
-                beside = self.loops_beside(tuple(z.tolist()))
-            except np.linalg.LinAlgError:  # as in `at`: no curvature is known at the edge
-                return np.zeros((len(chosen.value), len(here.x), len(here.x)))
-            return hessians(problem, kappa, tau, chosen, beside)
-
-        return Rows(
-            np.concatenate([found.value, own.constraints + INSIDE]), np.vstack([slopes, of_z]),
-            hessians=second, curved=int((kept < peaks).sum()),
-        )  # fmt: skip

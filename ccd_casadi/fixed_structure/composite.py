@@ -6,8 +6,9 @@ are the channels' moduli. Plants whose channels are coupled are bounded as a who
 ω_b, a channel's own bandwidth is in proportion.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -27,6 +28,10 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.threads import side_by_side
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 NOT_THERE = -1.0  # a pole that stands for none
 ALIKE = 1e-9  # relative: responses of channels that are one problem
@@ -151,6 +156,26 @@ def composite_problem(
     return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
 
 
+def on_plants(
+    problem: LoopProblem, plants: Sequence[ScaledPlant], sampling: Sampling | None
+) -> LoopProblem:
+    """The same problem on plants that are moved a little: as many, in its units, that fall apart
+    and are alike where its own are. None of this is checked."""
+    if not isinstance(problem, CompositeProblem):
+        return replace(problem, plants=plant_set(plants, sampling))
+    decoupling, parts = problem.structure.decoupling, []
+    for part in problem.parts:
+        members, channel = [plants[i] for i in part.members], part.channel
+        if channel is None:
+            moved = plant_set(members, sampling, decoupling)
+        else:
+            moved = plant_set(
+                [channel_plant(one, decoupling, channel) for one in members], sampling
+            )
+        parts.append(replace(part, problem=replace(part.problem, plants=moved)))
+    return replace(problem, plants=parts[0].problem.plants, parts=tuple(parts))
+
+
 def box_of(
     structure: Structure | ChannelStructure,
     poles: np.ndarray,
@@ -168,14 +193,19 @@ def box_of(
     return structure.bounds(span, (1e-6, 1e6))
 
 
+def _by_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
+    """[function(part), ...], side by side; that of the coupled plants, the last, takes longest."""
+    return side_by_side(function, parts[::-1])[::-1]
+
+
 @assess.register
 def _(
     problem: CompositeProblem, kappa: Array, tau: float, *, each: bool = False, **depths: float
 ) -> Assessment:
-    found = [
-        assess(part.problem, kappa[part.place], tau + part.lead, each=each, **depths)
-        for part in problem.parts
-    ]
+    def assessed(part: Part) -> Assessment:
+        return assess(part.problem, kappa[part.place], tau + part.lead, each=each, **depths)
+
+    found = _by_parts(assessed, problem.parts)
     widest = sum(one.poles.shape[1] for one in found)
     poles = np.full((problem.count, widest), NOT_THERE, complex)
     at = 0
@@ -218,10 +248,14 @@ def _(
 
 @to_theta.register
 def _(problem: CompositeProblem, kappa: Array, constraints: Constraints) -> Array:
-    count = problem.plants.plants[0].dA.shape[0]
-    out = np.zeros((len(constraints.v), count))
-    for part, at, own in problem.split(constraints):
-        out[at] = to_theta(part.problem, kappa[part.place], own)
+    def sloped(split: tuple[Part, np.ndarray, Constraints]) -> Array:
+        part, _, own = split
+        return to_theta(part.problem, kappa[part.place], own)
+
+    out = np.zeros((len(constraints.v), problem.plants.plants[0].dA.shape[0]))
+    splits = problem.split(constraints)
+    for (_, at, _), found in zip(splits, _by_parts(sloped, splits), strict=True):
+        out[at] = found
     return out
 
 
@@ -234,13 +268,19 @@ def _(
     beside: Sequence[CompositeProblem] = (),
 ) -> Array:
     k, n = len(beside), len(kappa)
-    out = np.zeros((len(rows.v), k + n + 1, k + n + 1))
-    for number, (part, at, own) in enumerate(problem.split(rows)):
+
+    def bent(numbered: tuple[int, tuple[Part, np.ndarray, Constraints]]) -> Array:
+        number, (part, _, own) = numbered
         place = np.concatenate([np.arange(k), k + part.place, [k + n]])
         spread = np.asarray(np.arange(k + n + 1) == place[:, None], float)
         near = [other.parts[number].problem for other in beside]
         inner = hessians(part.problem, kappa[part.place], tau + part.lead, own, near)
-        out[at] = spread.T @ inner @ spread
+        return np.asarray(spread.T @ inner @ spread)
+
+    out, splits = np.zeros((len(rows.v), k + n + 1, k + n + 1)), problem.split(rows)
+    found = _by_parts(bent, list(enumerate(splits)))
+    for (_, at, _), own in zip(splits, found, strict=True):
+        out[at] = own
     return out
 
 

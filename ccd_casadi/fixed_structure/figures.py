@@ -29,6 +29,7 @@ from ccd_casadi.fixed_structure.peak_search import (
 )
 from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.kernels.loop_rows import levels, rows
+from ccd_casadi.kernels.plant_slopes import form_slopes
 from ccd_casadi.support.arrays import Array
 
 # ln of the share of its bound under which a peak is none of ours: of several channels above that
@@ -112,18 +113,13 @@ def evaluate_rows(
 @singledispatch
 def to_theta(problem: LoopProblem, kappa: Array, constraints: Constraints) -> Array:
     """∂c/∂θ (M, n_θ) at fixed κ and τ."""
-    plants, v = problem.plants, constraints.v
-    out = np.zeros((len(v), plants.plants[0].dA.shape[0]))
+    slopes, v, which = problem.plants.slopes, constraints.v, problem.plants_of(constraints)
     *_, x, y, right = evaluate_rows(problem, kappa, 0.0, constraints.curve, constraints.plant, v)
-    which = problem.plants_of(constraints)
-    for i in np.unique(which):
-        own = np.flatnonzero(which == i)
-        out[own] = plants.form_to_theta(int(i), v[own], x[own], y[own]).real
-        own = own[constraints.curve[own] == LoopCurve.GS]
-        if len(own):
-            free = plants.form_to_theta(int(i), v[own], -x[own], right[own], free=True)
-            out[own] += free.real
-    return out
+    out = form_slopes(slopes, which, v, x, y, False)
+    free = constraints.curve == LoopCurve.GS
+    if free.any():
+        out[free] += form_slopes(slopes, which[free], v[free], -x[free], right[free], True)
+    return np.asarray(out)
 
 
 @singledispatch

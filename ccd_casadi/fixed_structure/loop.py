@@ -23,8 +23,8 @@ import numpy as np
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels, in_units_of
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels import modes
-from ccd_casadi.lti.hold import Sampling, delayed, in_w, moments, transfer
+from ccd_casadi.kernels import modes, plant_slopes
+from ccd_casadi.lti.hold import Sampling, delayed, in_w, moment_slopes, moments
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -151,37 +151,28 @@ class PlantSet:
         G, slope = (found[:, i].reshape(*v.shape, *found.shape[2:]) for i in (0, 1))
         return G, slope
 
-    def form_to_theta(
-        self, which: int, v: Array, left: np.ndarray, right: np.ndarray, *, free: bool = False
-    ) -> np.ndarray:
-        """∂(x G y)/∂θ (k, n_θ) of one plant at jv with rows x (k, p) and columns y (k, m).
-
-        `free` of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d,
-        whatever the sampling.
-
-        x (dC f(A) B + C f(A) dB + C V (f[p_i, p_j] ∘ V⁻¹dA V) V⁻¹B) y   (Daleckii and Krein)
-
-        with f[p_i, p_j] = (f(p_i) - f(p_j))/(p_i - p_j), f'(p_i) where these are one.
-        """
-        plant = self.plants[which]
-        p = plant.poles
-        omega = self.frequency(np.asarray(v, float))
-        period = None if free else self.period
-        f = transfer(p, omega, period, self.delay)[0]
-        gap = p[:, None] - p[None, :]
-        near = np.abs(gap) <= CLOSE * np.maximum(np.abs(p)[:, None], np.abs(p)[None, :])
-        c, b = left @ plant.reading, right @ plant.drive.T
-        apart = np.where(near, 0.0, plant.dA) / np.where(near, 1.0, gap)
-        i, j = np.nonzero(near)
-        between = transfer(0.5 * (p[i] + p[j]), omega, period, self.delay)[1]
-        pairs = [
-            (left[:, :, None] * (f * b)[:, None, :], plant.dC),
-            ((c * f)[:, :, None] * right[:, None, :], plant.dB),
-        ]
-        found = sum(np.tensordot(x, d, ((1, 2), (1, 2))) for x, d in pairs)
-        found += (c[:, i] * between * b[:, j]) @ plant.dA[:, i, j].T
-        found += np.einsum("ki,tik->kt", c * f, apart @ b.T)
-        return np.asarray(found - np.einsum("kj,tjk->kt", f * b, apart.transpose(0, 2, 1) @ c.T))
+    @cached_property
+    def slopes(self) -> plant_slopes.PlantSlopes:
+        """What the kernels need for derivatives to θ; the shorter plants with zeros."""
+        (P, n), (p, m), count = self.poles.shape, self.residues.shape[2:], len(self.plants[0].dA)
+        C, B = np.zeros((P, p, n), complex), np.zeros((P, n, m), complex)
+        dA, dB = np.zeros((P, n, n, count), complex), np.zeros((P, n, m, count), complex)
+        dC = np.zeros((P, p, n, count), complex)
+        for i, plant in enumerate(self.plants):
+            k = len(plant.poles)
+            C[i, :, :k], B[i, :k] = plant.reading, plant.drive
+            dA[i, :k, :k], dB[i, :k] = np.moveaxis(plant.dA, 0, -1), np.moveaxis(plant.dB, 0, -1)
+            dC[i, :, :k] = np.moveaxis(plant.dC, 0, -1)
+        gap, size = self.poles[:, :, None] - self.poles[:, None, :], np.abs(self.poles)
+        near = np.abs(gap) <= CLOSE * np.maximum(size[:, :, None], size[:, None, :])
+        gaps = np.where(near, 0.0, 1.0 / np.where(near, 1.0, gap))
+        terms, d = np.stack([self.poles] * 6, axis=-1), 0.0
+        if self.period is not None:
+            T, (d, late, early) = self.period, moments(self.poles, self.period, self.delay)
+            steeper = moment_slopes(self.poles, T, self.delay)
+            terms[..., 1:] = np.stack([late, early, np.exp(self.poles * T), *steeper], axis=-1)
+        parts = np.stack([dA.real, dA.imag], axis=3)
+        return plant_slopes.PlantSlopes(terms, C, B, gaps, parts, dB, dC, self.period or 0.0, d)
 
 
 def plant_set(

@@ -81,7 +81,7 @@ def compile_part(part: str) -> None:
 
 
 def _compile_rows(curvature: bool) -> None:
-    from ccd_casadi.kernels import loop_curvature, loop_point, loop_rows, modes
+    from ccd_casadi.kernels import loop_curvature, loop_point, loop_rows, modes, plant_slopes
     from ccd_casadi.kernels.limits import Limit
 
     one, first, square = np.ones(1), np.zeros(1, np.int64), np.eye(1)
@@ -92,6 +92,10 @@ def _compile_rows(curvature: bool) -> None:
     if curvature:
         modes.responses(plants, first, one)
         loop_curvature.second(first, first, first, one, loop)
+        side, four = np.ones((1, 1, 1), complex), np.ones((1, 1, 1, 1), complex)
+        terms, apart = plants.terms[..., [0] * 6], four.real[..., None]
+        slopes = plant_slopes.PlantSlopes(terms, side, side, side, apart, four, four, 0.0, 0.0)
+        plant_slopes.form_slopes(slopes, first, one, side[0], side[0], False)
     else:
         loop_rows.levels(first[None], first, square, loop, 0.0)
         loop_rows.rows(first, first, first, one, loop)
@@ -156,7 +160,8 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    for name in ("design", "gradients", "loop_curvature", "loop_rows"):  # with them all the others
+    names = ("design", "gradients", "loop_curvature", "loop_rows", "plant_slopes")
+    for name in names:  # with them all the others
         import_module(f"{PACKAGE}.{name}")
     found = {}
     for name, module in list(sys.modules.items()):

@@ -8,7 +8,7 @@ from numba import njit
 from numba.core import event
 
 # without an entry for C callbacks, which nobody calls: a tenth less to compile
-compiled = njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)
+compiled = njit(cache=True, error_model="numpy", no_cfunc_wrapper=True, nogil=True)
 PACKAGE = __name__.rpartition(".")[0]
 
 

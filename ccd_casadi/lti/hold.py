@@ -52,28 +52,12 @@ def delay_parts(period: float, delay: float) -> tuple[int, float]:
     return whole, max(delay - whole * period, 0.0)
 
 
-def transfer(
-    p: np.ndarray, omega: Array, period: float | None, delay: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """f(p) and f'(p), (len(ω), len(p)), with which the plant's response is C f(A) B."""
+def transfer(p: np.ndarray, omega: Array, period: float, delay: float) -> np.ndarray:
+    """f(p), (len(ω), len(p)), with which the plant's response is C f(A) B."""
     s = 1j * omega[:, None]
-    if period is None:
-        f = 1.0 / (s - p)
-        return f, f * f
-    T = period
-    d, late, early = moments(p, T, delay)
-    rest = delay_parts(T, delay)[1]
-    h = T - rest
-    z = np.exp(s * T)
-    lam = np.exp(p * T)
-    gap = lam * np.expm1((s - p) * T)
-    d_late = (h * np.exp(p * h) - late) / p
-    phi = np.expm1(p * rest) / p
-    d_early = h * early + np.exp(p * h) * (rest * np.exp(p * rest) - phi) / p
-    top = late + early / z
-    shift = np.exp(-s * T * d)
-    f = top / gap
-    return f * shift, ((d_late + d_early / z) / gap + f * T * lam / gap) * shift
+    d, late, early = moments(p, period, delay)
+    gap = np.exp(p * period) * np.expm1((s - p) * period)
+    return (late + early * np.exp(-s * period)) / gap * np.exp(-s * period * d)
 
 
 def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, np.ndarray]:
@@ -83,6 +67,16 @@ def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, n
     late = np.expm1(p * h) / p
     early = np.exp(p * h) * np.expm1(p * rest) / p
     return float(d), late, early
+
+
+def moment_slopes(p: np.ndarray, T: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of `moments` to p."""
+    _, late, early = moments(p, T, delay)
+    rest = delay_parts(T, delay)[1]
+    h = T - rest
+    d_late = (h * np.exp(p * h) - late) / p
+    d_early = h * early + np.exp(p * h) * (rest * np.exp(p * rest) - np.expm1(p * rest) / p) / p
+    return d_late, d_early
 
 
 def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:

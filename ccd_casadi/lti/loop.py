@@ -39,7 +39,7 @@ class Loop:
         if self.sampling is None or self.plant.modes is None:
             return G.swept(omega), K.swept(omega)
         poles, drive, reading = self.plant.modes
-        f, _ = transfer(poles, omega, self.sampling.period, self.sampling.delay)
+        f = transfer(poles, omega, self.sampling.period, self.sampling.delay)
         return np.asarray((reading * f[:, None, :]) @ drive), K.swept(omega)
 
     def sensitivity(self, omega: Array) -> np.ndarray:

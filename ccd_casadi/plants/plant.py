@@ -148,9 +148,11 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     try:
         result = model({name: theta[i] for i, name in enumerate(names)}, **options)
     except TypeError as error:
-        raise PlantError(f"the plant model does not take its options: {error}") from error
+        words = f"the plant model does not take its options: {error}"
+        raise PlantError(f"{words}; correct [plant] or a file of robust.plants") from error
     except KeyError as error:
-        raise PlantError(f"the plant model needs a theta that the case lacks: {error}") from None
+        words = f"the plant model needs a theta that the case lacks: {error}"
+        raise PlantError(f"{words}; the case has {', '.join(names)}") from None
     found, damping_ratio, scalars = model_parts(result, ca.SX)
     f, *constraints = scalars.values()
     lam = ca.vertcat(*constraints) if constraints else ca.SX(0, 1)
@@ -252,7 +254,11 @@ def nearby_model(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[
     """θ -> Mechanics from what is known: the plant's own way, or to first order around `here`."""
     if plant.nearby is not None and known:
         return plant.nearby(known)
-    system = mechanics(plant, here)
+    return first_order(mechanics(plant, here), here)
+
+
+def first_order(system: Mechanics, here: Sequence[float]) -> Evaluate:
+    """θ -> Mechanics around `here`."""
     return lambda theta: to_first_order(system, np.array(theta) - np.array(here))
 
 

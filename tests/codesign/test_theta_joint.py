@@ -1,6 +1,7 @@
 """θ and controller in one search, on plants to first order in θ."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,22 +11,22 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
+from ccd_casadi.codesign.joint_model import PENALTY, JointModel, JointPoint, proposed
 from ccd_casadi.codesign.outer import Place
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.theta_joint import (
-    JointModel,
-    JointPoint,
-    joint_search,
-    objectives_beside,
-    proposed,
-)
-from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
+from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
+from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
-from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.objective import hardware_at, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_plant_set import nearby, uncertain_plant, with_structured
+from ccd_casadi.inner_problem.structured_plant_set import (
+    nearby,
+    structure_of,
+    uncertain_plant,
+    with_structured,
+)
 from ccd_casadi.inner_problem.structured_search import with_range
-from ccd_casadi.plants.plant import mechanics, to_first_order
+from ccd_casadi.plants.plant import Evaluate, Mechanics, mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
@@ -57,21 +58,39 @@ def test_what_the_first_order_leaves_out_is_of_second_order() -> None:
     assert missed(0.5) <= 0.3 * missed(1.0) + 1e-12
 
 
-@pytest.mark.parametrize("direction", range(3))
+def curved(system: Mechanics, middle: tuple[float, ...]) -> Evaluate:
+    """What moves with θ as a parabola does, with its slopes."""
+
+    def at(theta: Sequence[float]) -> Mechanics:
+        way = np.array(theta) - middle
+        rates = (1.0 + 0.6 * way)[:, None, None]
+        moved = to_first_order(system, way + 0.3 * way**2)
+        return replace(moved, derivatives=tuple(rates * d for d in system.derivatives))
+
+    return at
+
+
+@pytest.mark.parametrize(("direction", "bent"), [(0, False), (1, False), (2, False), (3, True)])
 def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
-    direction: int,
+    direction: int, bent: bool
 ) -> None:
     """Of peaks that move, along random directions, the frequency of each found anew."""
     omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
     problem, theta = built(), (60.0, 60.0)
     at = JointPoint(theta, stored, omega)
-    model = JointModel(problem, nearby(problem, [theta], theta), at, 0.1)
+    models = nearby(problem, [theta], theta)
+    if bent:
+        models = (curved(mechanics(plant_of(problem), theta), theta),)
+    model = JointModel(problem, models, at, 0.1)
+    model.bent = bent
     family, start = model.loops, model.start
     z, kappa, tau = model.parts(start)
     loops = family(z)
     here = assess(loops, kappa, tau).peaks
     assert here is not None
-    others = [family(z + BESIDE * unit) for unit in np.eye(2)]
+    middle = model.at(start)
+    assert middle is not None
+    others = model.loops_beside(middle)
     chosen = here.only(here.value > -0.3)
     H = hessians(loops, kappa, tau, chosen, others)
     assert np.abs(H).max(axis=(1, 2)).min() > 0.0
@@ -146,6 +165,21 @@ def test_a_local_solve_takes_joint_steps_and_stops_where_another_has_ended(tmp_p
         beyond = outer.local_solve(near, better)
         assert beyond is not None
         assert beyond.objective < again.objective
+
+
+def test_breaking_a_constraint_costs_more_than_the_hardware_that_it_saves() -> None:
+    """J falls along a constraint's slope by less than the penalty rises, also where J is mass."""
+    problem = problem_of(load_case(ROOT / "examples" / "guided_beam" / "case.toml"))
+    problem = with_range(replace(problem, w1=1e6))
+    kappa = np.zeros(len(structure_of(problem).names))
+    at = JointPoint(problem.start, tuple(kappa), 2.0 * np.pi * 20.0)
+    model = JointModel(problem, nearby(problem, (), at.theta), at, 0.3)
+    own = hardware_at(problem, model.middle)
+    assert len(own.constraints)
+    saved = np.abs(own.cost_gradient).max() / model.unit
+    rise = PENALTY * (model.weight[:, None] * np.abs(own.slopes)).max(axis=1)
+    assert (rise >= saved).all()
+    assert model.weight.max() > 1.0
 
 
 def test_a_step_to_where_masses_are_no_longer_positive_is_no_step() -> None:

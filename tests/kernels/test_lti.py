@@ -43,7 +43,7 @@ def test_hold_and_delay_are_those_of_the_judge_and_of_the_modal_form(delay: floa
     np.testing.assert_allclose(other.at(np.exp(1j * OMEGA * T)), found, atol=1e-11)
     assert G.modes is not None
     poles, drive, reading = G.modes
-    f, _ = transfer(poles, OMEGA, T, delay)
+    f = transfer(poles, OMEGA, T, delay)
     np.testing.assert_allclose((reading * f[:, None, :]) @ drive, found, atol=1e-10)
     in_the_plane = in_w(sampled(G, T, delay)).at(2j / T * np.tan(0.5 * OMEGA * T))
     np.testing.assert_allclose(in_the_plane, found, atol=1e-9)

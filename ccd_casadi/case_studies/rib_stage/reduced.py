@@ -14,6 +14,7 @@ not: vectors of different θ may be combined. (Noor and Peters 1980; Rozza, Huyn
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from weakref import WeakValueDictionary
 
 import numpy as np
 from scipy import sparse
@@ -54,8 +55,6 @@ ROUNDING = 1e-8  # the same of a mode
 COUPLED = 24  # lowest modes of each symmetry that point masses couple
 RIGID = {"A1": 1, "A2": 1, "SA": 2, "AS": 2}  # rigid motions of a symmetry
 
-STAGES = 3  # whose last bases are kept: a plant, its finer model, and one with a payload
-
 Theta = tuple[float, ...]
 Terms = tuple[np.ndarray, sparse.csr_matrix]
 
@@ -71,6 +70,14 @@ class Basis:
     faces: tuple[Array, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Bases:
+    """Those of the groups of the square, of so many θ."""
+
+    known: tuple[Theta, ...] = ()
+    of: tuple[Basis, ...] = ()
+
+
 @dataclass(frozen=True)
 class Small:
     """Modes of a small problem, lowest first: λ (m,), ∂K and ∂M between them (θ, m, k), k <= m; u
@@ -83,7 +90,8 @@ class Small:
     du: Array
 
 
-_bases: dict[RibStage, tuple[tuple[Theta, ...], tuple[Basis, ...]]] = {}
+# The last ones of a stage, as long as somebody has them: they are large.
+_bases = WeakValueDictionary[RibStage, Bases]()
 
 
 def applies(stage: RibStage) -> bool:
@@ -92,10 +100,10 @@ def applies(stage: RibStage) -> bool:
     return stage.truncation == "symmetry" and not (square and stage.geometry.point_masses)
 
 
-def mechanics(stage: RibStage, made: Sequence[Basis], theta: Sequence[float]) -> Mechanics:
+def mechanics(stage: RibStage, known: Bases, theta: Sequence[float]) -> Mechanics:
     """`RibStage.mechanics` in bases of what is known, but for the signs of modes."""
     here, masses, points = np.array(theta, float), stage.geometry.point_masses, points_of(stage)
-    groups = zip(SQUARE_GROUPS, made, strict=True)
+    groups = zip(SQUARE_GROUPS, known.of, strict=True)
     small = [_modes(stage, group, basis, here) for group, basis in groups]
     of = {s: one for group, own in zip(SQUARE_GROUPS, small, strict=True)
           for (s,), one in zip(group.images, own, strict=True)}  # fmt: skip
@@ -119,14 +127,11 @@ def mechanics(stage: RibStage, made: Sequence[Basis], theta: Sequence[float]) ->
     return assembled(stage, lam[3:], u, du, dK)
 
 
-def bases(stage: RibStage, known: tuple[Theta, ...]) -> tuple[Basis, ...]:
-    """Those of the groups of the square, from what is known at some θ; grown from the stage's last
-    ones where these know the first of them."""
-    have, made = _bases.pop(stage, ((), ()))
-    if have != known[: len(have)]:
-        have, made = (), ()
-    if len(_bases) == STAGES:
-        del _bases[next(iter(_bases))]
+def bases(stage: RibStage, known: tuple[Theta, ...]) -> Bases:
+    """From what is known at some θ; grown from the stage's last ones where these know the first of
+    them."""
+    last = _bases.pop(stage, Bases())
+    have, made = (last.known, last.of) if last.known == known[: len(last.known)] else ((), ())
     disc = discretisation(stage)
     forget_spectra()
     for theta in map(np.array, known[len(have) :]):
@@ -137,8 +142,8 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> tuple[Basis, ...]:
 
         # That of the tilts takes longest.
         made = tuple(side_by_side(grown, range(len(SQUARE_GROUPS))[::-1])[::-1])
-    _bases[stage] = known, made
-    return made
+    found = _bases[stage] = Bases(known, made)
+    return found
 
 
 def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array) -> Basis:
