@@ -58,7 +58,6 @@ class LoopModel(Model[Assessment]):
     """The bounds of a set of loops as rows over x = (κ, τ); `goal` gives v(κ) and its gradient."""
 
     corrected = True
-    programmes = 6  # a loop costs no more than as many: the best of a step is not worth twice that
 
     def __init__(
         self,

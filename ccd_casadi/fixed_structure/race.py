@@ -19,11 +19,11 @@ from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 
-ROUNDS, STEPS = 81, 5  # at most, steps of each: what has ended or merged costs no more
-HALVINGS = (2, 8, 20)  # rounds after which the better half goes on
+ROUNDS, STEPS = 27, 15  # at most, steps of each
+HALVINGS = (0, 2, 6)  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
-OVERTAKING = 12.0  # times the gain of its last round: what a search behind may still catch up
+OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
 MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
@@ -90,8 +90,6 @@ def run_race(
         field = _merged(sorted(field, key=lambda runner: -runner.merit))
         field = _going_on(field, turn)
         lead, going = field[0].point, sum(runner.running for runner in field)
-        if going == len(running):
-            continue
         over = lead.assessment.violation
         kept = f"bounds exceeded by {100.0 * over:.1g} %" if over > WITHIN else "within every bound"
         best = f"{np.exp(lead.tau) * scale:.2f} Hz, {kept}"

@@ -13,7 +13,7 @@ damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.pullback import squared_weight_slopes
@@ -115,7 +115,7 @@ def slope_root(slope, start):
         b = start * (1.0 + step)
         fb = slope(b)
         if fa * fb <= 0.0:
-            return brentq(slope, a, b, xtol=1e-16 * start, rtol=ROUNDING)
+            return scipy.optimize.brentq(slope, a, b, xtol=1e-16 * start, rtol=ROUNDING)
         a, fa = b, fb
         step *= 3.0
     return start

@@ -24,6 +24,7 @@ import numpy as np
 from ccd_casadi.optim.quadratic import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
+PROGRAMMES = 12  # around each other, for one step
 SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to the answer of a programme
 SETTLED = 1e-2  # of the radius: a programme that moves less has no more to give
 LITTLE = 1e-2  # of the gain: what one more programme has to add
@@ -128,7 +129,6 @@ class Model(ABC, Generic[Data]):
     carried = False  # whether σ >= 0 falls away: f is the largest row
     corrected = False  # whether a trial that gains too little is corrected to second order
     growing = False  # whether the penalty grows with the multipliers
-    programmes = 12  # at most, around each other, for one step
     restoring = False  # whether the merit counts the whole penalty: the rows go before the goal
     # Whether a row that ends below its bound by little of what it moves counts with its curvature,
     # as it may bend over it. Searches over K alone end in better optima without.
@@ -253,7 +253,7 @@ def best_step(
     at, offset, M, p = slopes, value + margin[chosen], convex(H, FLAT * unit), np.zeros(n)
     (low, high), near, straight = _ends(model, here, radius), radius, 0.0
     best: Step | None = None
-    for turn in range(model.programmes):
+    for turn in range(PROGRAMMES):
         found = answer(offset)
         if found is None:
             break
