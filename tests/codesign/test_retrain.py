@@ -148,8 +148,8 @@ def test_near_duplicates_are_fitted_once(tmp_path: Path) -> None:
         outer.sampler.quantities(np.vstack([X, X + 3e-5 * (upper - lower) * (upper - 1.0 > X)]))
         known = Job(tmp_path, CASE, outer, "lifted", 0)._known()
     assert known is not None
-    assert len(known.samples) <= 16
-    np.testing.assert_allclose([s.x for s in known.samples], X[: len(known.samples)], rtol=1e-9)
+    assert len(known) <= 16
+    np.testing.assert_allclose([s.x for s in known], X[: len(known)], rtol=1e-9)
 
 
 # ---- versions, and one job at a time -------------------------------------------------------------

@@ -66,7 +66,7 @@ COMMANDS = sorted(
     {
         ".".join(p.relative_to(ROOT).with_suffix("").parts)
         for p in SOURCES
-        if "return run(command, " in p.read_text()
+        if "\n@command(" in p.read_text()
     }
     - {"ccd_casadi.imported", "ccd_casadi.tune"}  # take files of numbers, no case
 )
