@@ -1,12 +1,8 @@
 """The explorer without its page: sliders as problems, certified looks, their curves, the store."""
 
 import json
-import os
-import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from queue import Queue
 
 import numpy as np
 import pytest
@@ -15,7 +11,6 @@ from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drawing.svg import BLUE
-from ccd_casadi.explorer.background import Background, Solve
 from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
@@ -31,9 +26,7 @@ from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.reporting.bode import loop_panels
 from ccd_casadi.reporting.landscape import read_truths
 from ccd_casadi.reporting.machine import lumped, lumped_svg
-from ccd_casadi.support.options import ExitCode
 from ccd_casadi.support.units import HZ
-from ccd_casadi.support.worker_process import WorkerLost
 from ccd_casadi.synthesis.synthesis import Outcome
 
 CASE = Path("runs/two_mass.toml")
@@ -368,40 +361,3 @@ def test_a_slow_plant_is_drawn_by_a_model_whose_error_was_measured(session):
     assert known.at(away[1]).exact
     known.renew()
     assert frequency_error(known.at(away[2]).system, own(away[2])) < off[2]
-
-
-def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):
-    said, codes, over = [], [], threading.Event()
-
-    def ended(code):
-        codes.append(code)
-        over.set()
-
-    solve = Solve(tmp_path / "none.toml", tmp_path / "out", ["--workers", "1"], said.append, ended)
-    assert over.wait(300.0)
-    assert codes == [2]
-    assert "none.toml: there is no such file" in said[0]
-    assert "not verified" in ExitCode(4).words
-    solve.stop()  # there is nothing left to stop
-
-
-def told_and_done(task: int, tell: Callable[[str], None]) -> int:
-    """Work of a background that tells twice; 0 fails, and a negative number ends its process."""
-    for words in ("begun", "nearly done"):
-        tell(words)
-    if task < 0:
-        os._exit(3)
-    return 6 // task
-
-
-def test_the_background_tells_answers_and_outlives_the_death_of_its_process() -> None:
-    heard: list[str] = []
-    came: Queue[object] = Queue()
-    background = Background()
-    for task in (2, 0, -1, 3):
-        background.ask(told_and_done, task, came.put, came.put, heard.append)
-    first, failed, lost, last = (came.get(timeout=60.0) for _ in range(4))
-    background.close()
-    assert (first, last) == (3, 2)
-    assert (type(failed), type(lost)) == (ZeroDivisionError, WorkerLost)
-    assert heard == ["begun", "nearly done"] * 4
