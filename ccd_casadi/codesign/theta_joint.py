@@ -44,9 +44,11 @@ GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
 LOOKS, APART = 5, 200  # for worse plants before an end, each elsewhere in the box; numbered from
+ROUNDS = 4  # last searches at most, while worse plants are found at their end
+AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
-CLOSE = 0.02  # of the box: the reach of last searches, on plants to first order
-ENDINGS, KEPT = 12, 2e-6  # of these; of J: a promise at which the conditions of optimality hold
+CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
+ENDINGS, KEPT = 12, 2e-6  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 
 
@@ -87,17 +89,11 @@ def joint_search(
             final = APART + (LOOKS + 1) * turn + LOOKS
             looks = range(final - LOOKS, final)
             asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
-            best, problem = nearly_finished(asked, known, best), asked.problem
             del make, models
             gc.collect()  # with which the bases go
-            best, near = finished(asked, best)
-            own = uncertain_plant(problem, best.theta)
-            kappa, omega_b = np.array(best.kappa), best.bandwidth
-            scenarios = violations(problem, own, kappa, omega_b, final, tell)[1]
-            settled = near and not scenarios
+            asked, best, settled = finished_on_worse_plants(asked, best, final, tell)
             if settled:
                 break
-            asked = with_scenarios(asked, scenarios) if scenarios else asked
             known = [best.theta]
             continue
         known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
@@ -157,46 +153,46 @@ def on_worse_plants(
     return sampler, best, J
 
 
-def nearly_finished(
-    sampler: Sampler, known: Sequence[tuple[float, ...]], start: JointPoint
-) -> JointPoint:
-    """The joint optimum near by on the plants from what is known at some θ, of which it is one or
-    near one in the end."""
-    problem, best, known = sampler.problem, start, list(known)
-    if plant_of(problem).nearby is None:
-        return start
-    width = np.subtract(problem.upper, problem.lower)
-    for _ in range(ENDINGS):
-        models = nearby(problem, known, best.theta)
-        make = partial(proposed, problem, models, best, REACH, bent=True)
-        key = (*best.theta, best.bandwidth, REACH, len(known))
-        found = sampler.cached("nearly finished", key, Proposal, make)
-        best = found.end
-        away = np.abs(np.subtract(known, best.theta) / width).max(axis=1).min()
-        if away > CLOSE:
-            known = [*(known if len(known) < KNOWN else ()), best.theta]
-        elif found.gain <= KEPT * abs(problem.w2 * best.bandwidth):
-            break
-    return best
+def finished_on_worse_plants(
+    sampler: Sampler, start: JointPoint, final: int, tell: Callable[[str], None] | None
+) -> tuple[Sampler, JointPoint, bool]:
+    """The joint optimum near by with the worse plants found at it, the sampler of the problem that
+    has these, and whether it is one of all of them."""
+    best = start
+    later = (final,) if plant_of(sampler.problem).nearby is None else (final, *AGAIN)
+    for _ in range(ROUNDS):
+        best, near = finished(sampler, best, tell)
+        before, true = sampler, nearby(sampler.problem, (), best.theta)
+        sampler, best, _ = on_worse_plants(sampler, true, best, later, WITHIN, tell)
+        if sampler is before:
+            return sampler, best, near
+    return sampler, best, False
 
 
-def finished(sampler: Sampler, start: JointPoint) -> tuple[JointPoint, bool]:
-    """The joint optimum near by, on the plants to first order around one place after the other: so
+def finished(
+    sampler: Sampler, start: JointPoint, tell: Callable[[str], None] | None = None
+) -> tuple[JointPoint, bool]:
+    """The joint optimum near by, on the plants from what is known at one place after the other: so
     near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether
     it is that near, or was."""
-    problem, reach = sampler.problem, CLOSE
-    models = nearby(problem, (), start.theta)
+    problem = sampler.problem
+    reach = CLOSE if plant_of(problem).nearby is None else REACH
+    models = nearby(problem, [start.theta], start.theta)
     best, J = first = JointModel(problem, models, start, reach).adapted()
     for _ in range(ENDINGS):
-        make = partial(proposed, problem, models, best, reach, LAST_GAIN)
+        make = partial(proposed, problem, models, best, reach, LAST_GAIN, bent=True)
         found = sampler.cached("finished", (*best.theta, best.bandwidth, reach), Proposal, make)
+        if tell is not None:
+            tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
         if found.gain <= KEPT * abs(J):
             return best, True
-        others = nearby(problem, (), found.end.theta)
+        del make
+        others = nearby(problem, [found.end.theta], found.end.theta)
         end, there = JointModel(problem, others, found.end, reach).adapted()
-        reach *= 2.0 if J - there > GOOD * found.gain else 0.3
+        reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
             best, J, models = end, there, others
+        gc.collect()  # bases are large, and searches before hold theirs in circles
     return best, first[1] - J <= SETTLED * abs(J)
 
 
