@@ -83,7 +83,7 @@ def proposed(
     end = minimise(
         model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=least_gain
     ).best
-    gain = start.value - end.value - PENALTY * end.violation
+    gain = start.value - end.value + PENALTY * (start.violation - end.violation)
     return Proposal(model.place(end.x), model.unit * float(gain))
 
 
