@@ -123,7 +123,7 @@ def facts(table: str, *known: Any) -> list[Fact]:
     """Quantity, value, remark: the rows of a table of `templates/facts.txt`."""
     told = {"cost_words": cost_words, "prediction_words": prediction_words}
     lines = paragraphs(f"facts.{table}", *known, channel_words=channel_words, **told)
-    rows = (line.split(" | ", 2) for line in lines)
+    rows = (line.split(" :: ", 2) for line in lines)
     return [(name, *[*more, "", ""][:2]) for name, *more in rows]
 
 
