@@ -1,5 +1,6 @@
 """A design in words and numbers: the conclusion, the table of the design, and what binds."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -120,28 +121,30 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
 
 
 def facts(table: str, *known: Any) -> list[Fact]:
-    """Quantity, value, remark: the rows of a table of `templates/facts.txt`."""
+    """Quantity, value, remark: the rows of a table of `templates/facts.txt`, a line each."""
     told = {"cost_words": cost_words, "prediction_words": prediction_words}
-    lines = paragraphs(f"facts.{table}", *known, channel_words=channel_words, **told)
-    rows = (line.split(" :: ", 2) for line in lines)
+    text = _text(f"facts.{table}", *known, channel_words=channel_words, **told)
+    rows = (line.split(" :: ", 2) for line in text.split("\n") if line)
     return [(name, *[*more, "", ""][:2]) for name, *more in rows]
 
 
 def paragraphs(part: str, *known: Any, **functions: Any) -> list[str]:
-    """The lines of a part, `file.macro`, of the words of our pages in `templates/`.
+    """The words of a part, `file.macro`, in `templates/`: a blank line ends a paragraph."""
+    parts = re.split(r"\n[ \n]*\n", _text(part, *known, **functions))
+    return [found for found in (re.sub("[ \n]+", " ", each).strip() for each in parts) if found]
 
-    Raises KeyError where something that it says is not known, as of a run of before.
-    """
+
+def _text(part: str, *known: Any, **functions: Any) -> str:
+    """Raises KeyError where something that it says is not known, as of a run of before."""
     name, macro = part.split(".")
     made = template(
         f"templates/{name}.txt", HZ=HZ, number=number, with_unit=with_unit, counted=counted,
         small_share=small_share, **functions,
     )  # fmt: skip
     try:
-        text: str = getattr(made.module, macro)(*known)
+        return str(getattr(made.module, macro)(*known))
     except UndefinedError as error:
         raise KeyError(str(error)) from None
-    return [line for line in text.split("\n") if line]
 
 
 def prediction_words(r: Mapping[str, Any], guess: str) -> str:
