@@ -10,7 +10,7 @@ from ccd_casadi.analysis.loop_view import LoopView, phase_deg
 from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import bandwidth_level, of_plants, over_hz
 from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.support.arrays import Array
@@ -40,7 +40,7 @@ def bode(loop: LoopView, channels: Sequence[LoopChannel] = ()) -> Figure:
     title = "Bode plots of the loop, the plant and the controller"
     lines = Lines(tuple(rows), title, (3.0, 2.9, 2.3)[: len(rows)])
     gain = np.linalg.norm(loop.controller, 2, axis=(1, 2))
-    return Figure(lines, *paragraphs("report.bode", loop, channels, gain))
+    return Figure(lines, paragraph("report.bode", loop, channels, gain))
 
 
 def loop_panels(

@@ -10,7 +10,7 @@ from ccd_casadi.drawing.svg import BLACK, CYCLE
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.units import display_unit
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
@@ -44,7 +44,7 @@ def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
         rows.append((item.source.name, kind, scale * item.error, share, *moving, item.force))
     moving = (scale * model.average, scale * model.deviation) if windowed else ()
     rows.append(("together", "", scale * model.error, 100.0, *moving, model.force))
-    words = " ".join(paragraphs("report.budget_table", found, model))
+    words = paragraph("report.budget_table", found, model)
     return Words(words), Table(tuple(head), tuple(rows))
 
 
@@ -67,4 +67,4 @@ def _figure(model: BudgetFigures) -> Figure:
     panel = Panel("frequency (Hz)", f"RMS error up to it ({unit})", (*curves, total), log_x=True,
                   log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top))  # fmt: skip
     lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
-    return Figure(lines, *paragraphs("report.budget"))
+    return Figure(lines, paragraph("report.budget"))

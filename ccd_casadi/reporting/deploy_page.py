@@ -19,7 +19,7 @@ from ccd_casadi.lti.closed_loop import sensitivity, sigma_max
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.facts import paragraphs, run_name, theta_words
+from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.structured_page import structured_table
@@ -95,7 +95,7 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
     title = f"Sensitivity and controller over frequency: {', '.join(k.label for k in drawn)}"
     ends = ", ".join(f"{with_unit(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
-    caption = " ".join(paragraphs("deployment.loop", ends))
+    caption = paragraph("deployment.loop", ends)
     return c.Figure(c.Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption)
 
 

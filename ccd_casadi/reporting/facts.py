@@ -124,14 +124,19 @@ def facts(table: str, *known: Any) -> list[Fact]:
     """Quantity, value, remark: the rows of a table of `templates/facts.txt`, a line each."""
     told = {"cost_words": cost_words, "prediction_words": prediction_words}
     text = _text(f"facts.{table}", *known, channel_words=channel_words, **told)
-    rows = (line.split(" :: ", 2) for line in text.split("\n") if line)
-    return [(name, *[*more, "", ""][:2]) for name, *more in rows]
+    rows = ([*line.split(" :: ", 2), "", ""] for line in text.split("\n") if line)
+    return [(quantity, value, remark) for quantity, value, remark, *_ in rows]
 
 
 def paragraphs(part: str, *known: Any, **functions: Any) -> list[str]:
     """The words of a part, `file.macro`, in `templates/`: a blank line ends a paragraph."""
     parts = re.split(r"\n[ \n]*\n", _text(part, *known, **functions))
     return [found for found in (re.sub("[ \n]+", " ", each).strip() for each in parts) if found]
+
+
+def paragraph(part: str, *known: Any) -> str:
+    """All of a part in one."""
+    return " ".join(paragraphs(part, *known))
 
 
 def _text(part: str, *known: Any, **functions: Any) -> str:

@@ -10,7 +10,7 @@ from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import S_panel
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
@@ -34,7 +34,7 @@ def glance(
     )
     peak = float(view.sizes[0].max())
     table = isinstance(rows[0][0], Table)
-    words = " ".join(paragraphs("report.glance", view, peak, S_max, move.caption, table))
+    words = paragraph("report.glance", view, peak, S_max, move.caption, table)
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
     return Chapter("At a glance", (Figure(lines, words, (*tables_of(lines), move.tables[0])),))
 

@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.codesign.formulation import Iterate
 from ccd_casadi.drawing.content import Table, Words
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.facts import paragraphs, theta_axes
+from ccd_casadi.reporting.facts import paragraph, theta_axes
 from ccd_casadi.support.units import HZ, small_share
 
 
@@ -46,5 +46,5 @@ def history_blocks(
     stays = bool(met.size and (error[met[0] : -1] <= tolerance).all())
     first = int(met[0]) + 1 if met.size else 0
     lost = int(np.isnan(objective).sum())
-    known = (len(iterates), *ends, tolerance, first, stays, lost, lifted)
-    return Words(" ".join(paragraphs("report.history", *known))), table
+    told = (len(iterates), *ends, tolerance, first, stays, lost, lifted)
+    return Words(paragraph("report.history", *told)), table

@@ -15,6 +15,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.reporting.facts import (
     cost_axis,
     cost_words,
+    paragraph,
     paragraphs,
     run_name,
     theta_axes,
@@ -57,7 +58,7 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     else:
         drawn = front_figure(problem, front, (cost, own, "this run's design"))
         walk = (drawn, _walk(run, front))
-    changes = (
+    changes: tuple[c.Block, ...] = (
         *map(c.Words, paragraphs("insight.responses", responses)),
         table_responses(problem, responses),
     )
@@ -107,7 +108,7 @@ def front_figure(
     )
     title = f"Hardware cost against {v.words} as the weights of J change, and the hardware there"
     lines = c.Lines(((top,), (bottom,)), title, (3.3, 2.8))
-    return c.Figure(lines, *paragraphs("insight.front", front), (_table(problem, front),))
+    return c.Figure(lines, paragraph("insight.front", front), (_table(problem, front),))
 
 
 def front_answer(problem: CoDesignProblem, front: Front) -> str:
@@ -124,7 +125,7 @@ def _walk(run: FinishedRun, front: Front) -> c.Steps:
     for point in shown:
         theta = dict(zip(problem.names, point.theta, strict=True))
         named = theta_words({"theta": theta, "units": problem.parameter_units})
-        words = " ".join(paragraphs("insight.point", point, problem, named))
+        words = paragraph("insight.point", point, problem, named)
         drawn = c.Lines(((_machine(problem, point.theta), None),), "A design of the front")
         steps.append((words, drawn))
     own = float(run.result["hardware_cost"])

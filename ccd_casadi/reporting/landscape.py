@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, sample_key
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.units import HZ, number
@@ -119,7 +119,7 @@ def caption_landscape(land: Landscape, best_hz: float) -> str:
     inside = np.isfinite(field) & ~land.outside
     known = field[inside] if inside.any() else field
     ends = (float(known.min()), float(known.max())) if field.size else None
-    return " ".join(paragraphs("report.landscape", land, ends, best_hz))
+    return paragraph("report.landscape", land, ends, best_hz)
 
 
 def caption_disagreement(process: GaussianProcess | None, truths: Truths) -> str:

@@ -12,7 +12,7 @@ from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, 
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, display_unit, number, with_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
@@ -167,7 +167,7 @@ def compliance_panel(view: LoopView) -> Panel:
 
 def margin_words(view: LoopView) -> str:
     """Of one channel on the model; empty of several."""
-    return " ".join(paragraphs("report.margins", view))
+    return paragraph("report.margins", view)
 
 
 def forbidden(
@@ -214,4 +214,4 @@ def gains(view: LoopView) -> Figure:
         if np.isfinite(share).any()
         for i in [int(np.nanargmax(share))]
     ]
-    return Figure(figure_gains([view]), *paragraphs("report.gains", view, _high_peaks(view), near))
+    return Figure(figure_gains([view]), paragraph("report.gains", view, _high_peaks(view), near))

@@ -14,7 +14,7 @@ from ccd_casadi.drawing.turntable import REACH
 from ccd_casadi.plants.facts import modes_of
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.package_text import template
 from ccd_casadi.support.units import HZ, number
@@ -115,7 +115,7 @@ def mode_shape_figure(shapes: ModeShapes) -> Figure:
     """The modes with their frequencies in Hz, to be turned."""
     named = len({mode.words for mode in shapes.modes}) > 1
     paired = any(len(mode.numbers) > 1 for mode in shapes.modes)
-    words = " ".join(paragraphs("report.modes", shapes, named, paired, REACH))
+    words = paragraph("report.modes", shapes, named, paired, REACH)
     return Figure(Modes(shapes, turning=True), words, (table_modes(shapes),))
 
 

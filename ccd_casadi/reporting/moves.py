@@ -21,7 +21,7 @@ from ccd_casadi.inner_problem.move_figures import FREE, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted, display_unit, with_unit
@@ -63,7 +63,7 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     end, model = profile.duration, found[0][0]
     mm = 1e3 * float(profile.at(np.array([end]))[0, 0])
     made = (mm, 1e3 * end, other, model.free, loops[0].sampling is not None, len(loops) > 1)
-    words = " ".join(paragraphs("report.move", *made))
+    words = paragraph("report.move", *made)
     return ways_figure(dict(zip(ways, found, strict=True)), words)
 
 
@@ -100,7 +100,7 @@ def cycle_chapter(
     settling = None if settled is None else late
     limited_force = motor.peak_current[0] < UNLIMITED
     known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required)
-    words = " ".join(paragraphs("report.cycle", told, *known))
+    words = paragraph("report.cycle", told, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]
 
@@ -127,7 +127,7 @@ def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     ways = {words: [move] for words, move in found.ways.items()}
     words = "The plant has its soft suspension. Hold and delay are exact."
     peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
-    limit = c.Words(" ".join(paragraphs("report.least_force", found, peak)))
+    limit = c.Words(paragraph("report.least_force", found, peak))
     return ways_figure(ways, words), limit
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Chapter, Facts, Figure, Heading, Page, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
-from ccd_casadi.reporting.facts import facts, paragraphs, run_name, theta_words
+from ccd_casadi.reporting.facts import facts, paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
@@ -106,7 +106,7 @@ def _gains(found: Study) -> Chapter:
          with_unit(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
         for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
     ]  # fmt: skip
-    drawn = Figure(figure_gains([found.view], compliance=True), *_words("gains"))
+    drawn = Figure(figure_gains([found.view], compliance=True), paragraph("robustness.gains"))
     rms = Facts(tuple(facts("noise", found.noise, found.demands)))
     white = (Heading("White noise (one-sided density)"), rms)
     body = (drawn, Facts(tuple(tops)), *white)  # at rest: in short
@@ -114,7 +114,7 @@ def _gains(found: Study) -> Chapter:
 
 
 def _perturbed(run: FinishedRun, found: Study) -> Chapter:
-    drawn = figures.perturbed(run, found, *_words("perturbed", figures.SHOWN_PEAK))
+    drawn = figures.perturbed(run, found, paragraph("robustness.perturbed", figures.SHOWN_PEAK))
     rows = tuple(
         (number(item.place[0], 5), 100.0 * item.place[1], "yes" if item.stable else "NO",
          item.bandwidth / HZ, item.peak) for item in found.modes
@@ -139,7 +139,7 @@ def _structured(found: Study) -> list[Chapter]:
     bound = found.structured
     if bound is None:
         return []
-    drawn = figures.structured(bound, *_words("structured", bound))
+    drawn = figures.structured(bound, paragraph("robustness.structured", bound))
     return [Chapter("Structured singular value", (drawn,))]
 
 

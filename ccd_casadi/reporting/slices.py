@@ -8,7 +8,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel
 from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.facts import paragraphs, theta_axes
+from ccd_casadi.reporting.facts import paragraph, theta_axes
 from ccd_casadi.reporting.landscape import Truths, known_bandwidths
 from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
@@ -66,5 +66,5 @@ def slices_figure(
     lines = Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
     most = max(spans.items(), key=lambda item: item[1][0], default=None)
     band = max((half for _, half in spans.values()), default=0.0)
-    known = (most and (most[0], most[1][0]), band, len(same) > 1, best_hz, NEARBY)
-    return Figure(lines, " ".join(paragraphs("report.slices", *known)) + extra)
+    told = (most and (most[0], most[1][0]), band, len(same) > 1, best_hz, NEARBY)
+    return Figure(lines, paragraph("report.slices", *told) + extra)

@@ -12,7 +12,7 @@ from ccd_casadi.drawing.svg import CYCLE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
 from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.reporting.facts import paragraphs, theta_axes
+from ccd_casadi.reporting.facts import paragraph, theta_axes
 from ccd_casadi.reporting.loops import gain_panels, over_hz, synthesised_loop, view_of
 from ccd_casadi.support.units import HZ
 
@@ -46,9 +46,9 @@ def start_chapter(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
     least = [float(damping.min()) for _, damping in poles]
     gained = 100.0 * (loops[1].bandwidth_hz / start.bandwidth_hz - 1.0)
     spared = 100.0 * (costs[1] / costs[0] - 1.0) if costs[0] else None
-    words = paragraphs("report.start", gained, spared, least)
+    words = paragraph("report.start", gained, spared, least)
     beside = _table(problem, thetas, loops, costs)
-    return [Chapter(HEADING, (Figure(lines, *words), beside))]
+    return [Chapter(HEADING, (Figure(lines, words), beside))]
 
 
 def _roots(loop: LoopView) -> tuple[np.ndarray, np.ndarray]:

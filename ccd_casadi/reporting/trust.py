@@ -6,7 +6,7 @@ import numpy as np
 
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table
 from ccd_casadi.drawing.svg import BLUE, GREY
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.units import number
 from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
@@ -23,8 +23,8 @@ def trust_figure(qualities: Sequence[Quality]) -> Figure:
     """A column for each output: predicted without the sample over true, and residuals below."""
     rows = tuple(tuple(map(panel, qualities)) for panel in (_predicted, _residuals))
     title = "samples predicted without themselves, and their standardised residuals"
-    words = paragraphs("report.trust", len(qualities[0].true))
-    return Figure(Lines(rows, title, (3.3, 2.6)), *words)
+    words = paragraph("report.trust", len(qualities[0].true))
+    return Figure(Lines(rows, title, (3.3, 2.6)), words)
 
 
 def _predicted(q: Quality) -> Panel:
