@@ -5,10 +5,10 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
-from ccd_casadi.robust.demands import add_move_options, move_limits
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
+from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
+from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import one_line, positive, real
+from ccd_casadi.support.options import one_line, option, positive, real, valued
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import inform, say
 
@@ -43,12 +43,11 @@ def _delay(arguments: argparse.ArgumentParser) -> None:
     option("--fmu", action="store_true",
            help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC "
            "names"),
-    *(option(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
-      for name, metavar, words in (
-          ("--sensor-step", "METRE", "of the simulated sensor"),
-          ("--force-step", "NEWTON", "of the simulated actuator"),
-          ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"))),
-    add_move_options, needs=["ccd_casadi.deployment.pipeline"], make=run_parser,
+    valued("--sensor-step", "METRE", real(), "of the simulated sensor", 0.0),
+    valued("--force-step", "NEWTON", real(), "of the simulated actuator", 0.0),
+    valued("--jitter", "SECONDS", real(),
+           "of the simulated delay, uniform within plus or minus this", 0.0),
+    *MOVE_OPTIONS, needs=["ccd_casadi.deployment.pipeline"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""

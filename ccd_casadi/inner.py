@@ -7,8 +7,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
-from ccd_casadi.support.options import add_break_frequencies, break_frequencies
+from ccd_casadi.support.command_line import ExitCode, command, run_folder
+from ccd_casadi.support.options import break_frequencies, break_frequency_options, option
 from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -23,7 +23,7 @@ PROGRESS = partial(inform, stream=sys.stderr)  # stdout is for the answer
     option("--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"),
     option("--begin-at", metavar="FOLDER", type=Path,
            help="sections: start one search from the controller of this run, not many"),
-    partial(add_break_frequencies, "of a weight; with both: one synthesis, no search"),
+    *break_frequency_options("of a weight; with both: one synthesis, no search"),
     needs=["ccd_casadi.codesign.result"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:

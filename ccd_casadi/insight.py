@@ -8,24 +8,16 @@ case gives, what limits the bandwidth, and the rule of thumb against what was ac
 import argparse
 from time import perf_counter
 
-from ccd_casadi.support.command_line import (
-    SCHEDULER,
-    ExitCode,
-    command,
-    option,
-    run_folder,
-    run_parser,
-)
-from ccd_casadi.support.options import integer
+from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command, run_folder
+from ccd_casadi.support.options import integer, valued
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import inform
 
 
 @command(
     "ccd_casadi.insight", "Trade hardware cost against bandwidth.",
-    option("--points", metavar="N", type=integer(2, 9999), default=20,
-           help="most points on the front (default: 20)"),
-    SCHEDULER, needs=["ccd_casadi.codesign.insight"], make=run_parser,
+    valued("--points", "N", integer(2, 9999), "most points on the front", 20),
+    SCHEDULER, needs=["ccd_casadi.codesign.insight"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
@@ -119,6 +119,22 @@ def read_run(folder: str | Path) -> FinishedRun:
     problem = found.pop("problem", problem)
     plant = scaled_plant(problem, theta)
     return FinishedRun(folder, case, problem, theta, plant, result=result, **found)
+
+
+def problem_at(
+    place: Path, theta: str | None
+) -> tuple[CoDesignProblem, tuple[float, ...] | None, FinishedRun | None]:
+    """Problem, θ and run of a finished run's folder; of a case file with θ in words or without one.
+
+    Raises UserError as `read_run` and `load_case` do, and for a run with another θ.
+    """
+    if place.is_dir():
+        run = read_run(place)
+        if theta is not None:
+            raise UserError(f"{place}: a run has its own theta; leave out --theta")
+        return run.problem, run.theta, run
+    case = load_case(place)
+    return problem_of(case), None if theta is None else parse_theta(case, theta), None
 
 
 def _read_mixed(
