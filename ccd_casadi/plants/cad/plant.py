@@ -136,11 +136,6 @@ class CadStage:
         surfaces = {name: self.morph.points(theta)[used] for name, theta in thetas.items()}
         return surface_figure(surfaces, faces, [self.mass(theta) for theta in thetas.values()])
 
-    def frequencies(self, theta: Sequence[float]) -> Array:
-        """Of the flexible modes, in Hz."""
-        found = self.modal_model(theta, self.sensors, False)
-        return np.sqrt(np.diag(found.K)[-self.modes :]) / (2.0 * np.pi)
-
     def mass(self, theta: Sequence[float] | Array) -> float:
         """In kg."""
         return float(

@@ -68,31 +68,33 @@ def read_modal_table(path: Path) -> ModalTable:
         )
     ordered = [sorted(modes, key=lambda row: row["frequency_hz"]) for modes in samples.values()]
 
-    def block(names: Sequence[str]) -> Array:
-        values = np.array([[[row[name] for name in names] for row in modes] for modes in ordered])
-        values = values.reshape(len(ordered), len(ordered[0]), len(names))
-        masses = np.array([[row.get("modal_mass", 1.0) for row in modes] for modes in ordered])
-        return np.asarray(values / np.sqrt(masses)[:, :, None])
+    at = {name: np.array([[row[name] for row in modes] for modes in ordered]) for name in header}
+    shape = len(ordered), len(ordered[0])
+    masses = at.get("modal_mass", np.ones(shape))
 
-    def of_sample(name: str, default: float) -> Array:
-        table = np.array([[row.get(name, default) for row in modes] for modes in ordered])
+    def block(names: Sequence[str]) -> Array:
+        values = np.array([at[name] for name in names]).reshape(-1, *shape)
+        return np.asarray(np.moveaxis(values / np.sqrt(masses), 0, -1))
+
+    def of_sample(name: str) -> Array:
+        table = at.get(name, np.zeros(shape))
         if (np.abs(table - table[:, :1]) > 1e-9 * np.abs(table[:, :1])).any():
             raise PlantError(f"{path}: {name} differs between the modes of a sample; give one")
         return np.asarray(table[:, 0])
 
-    columns = [of_sample(name, 0.0) for name in groups["constraint:"]]
+    columns = [of_sample(name) for name in groups["constraint:"]]
     return ModalTable(
         names=tuple(theta_names),
         input_names=_stripped(groups["in:"]),
         output_names=_stripped(groups["out:"]),
         constraint_names=_stripped(groups["constraint:"]),
         theta=np.array(list(samples)),
-        omega=2.0 * np.pi * np.array([[row["frequency_hz"] for row in modes] for modes in ordered]),
-        zeta=np.array([[row["damping"] for row in modes] for modes in ordered]),
+        omega=2.0 * np.pi * at["frequency_hz"],
+        zeta=at["damping"],
         inputs=block(groups["in:"]),
         outputs=block(groups["out:"]),
         shapes=block(groups["shape:"]),
-        cost=of_sample("hardware_cost", 0.0),
+        cost=of_sample("hardware_cost"),
         constraints=np.array(columns).T.reshape(len(samples), len(columns)),
     )
 
