@@ -50,7 +50,8 @@ def parser(
     What is `without_effect` is accepted, as scripts give every command the same options, and is
     not in --help.
     """
-    result = Parser(prog=program(command), description=description)
+    codes = "Exit codes: " + ", ".join(f"{code:d} {code.words}" for code in ExitCode)
+    result = Parser(prog=program(command), description=description, epilog=codes)
     result.add_argument(type=Path, **place)
 
     def add(name: str, words: str, **how: Any) -> None:

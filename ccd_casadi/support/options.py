@@ -55,13 +55,7 @@ def usable_cores() -> int:
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, as every other bad input, without the usage;
-    its help ends with the exit codes."""
-
-    def format_help(self) -> str:
-        """The help with the exit codes below."""
-        self.epilog = "Exit codes: " + ", ".join(f"{code:d} {code.words}" for code in ExitCode)
-        return super().format_help()
+    """An argument parser whose errors are one line, as every other bad input, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         """Leave with BAD_INPUT."""

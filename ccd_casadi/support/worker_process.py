@@ -178,8 +178,18 @@ def tell(words: str) -> None:
 
 
 def _serve(pipe: connection.Connection, module: str) -> None:
-    """A worker's life: answer tasks until the pipe or the parent ends."""
-    become_worker()
+    """A worker's life: answer tasks until the pipe or the parent ends, even by SIGKILL in mid-task;
+    Ctrl-C is the parent's."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    parent: Any = multiprocessing.parent_process()
+
+    def leave() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=leave, daemon=True).start()
     _to_parent.append(pipe)
     import_module(module)
     with suppress(EOFError, OSError):
@@ -201,17 +211,3 @@ def answer_message(message: bytes) -> bytes:
             return answer
         except Exception:
             return pickle.dumps((False, RuntimeError(text)))
-
-
-def become_worker() -> None:
-    """Leave Ctrl-C to the parent and end as soon as it has ended, even by SIGKILL in mid-task."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    parent: Any = multiprocessing.parent_process()
-
-    def leave() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=leave, daemon=True).start()
