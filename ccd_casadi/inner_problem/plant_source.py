@@ -119,7 +119,7 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
     else:
         function = fixed_model(_own_function(source), held)
         return user_plant(function, names, dict(source.options), lower, upper)
-    return with_fixed(plant, held) if held else plant
+    return with_fixed(plant, held)
 
 
 def _below(

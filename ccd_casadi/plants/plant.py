@@ -90,6 +90,8 @@ class Plant:
         Known θ -> a cheaper `evaluate`, true there and nearly so beside them.
     shapes, drawing : callable, optional
         (θ, count) -> the lowest flexible modes for pictures; several θ by name -> a drawing.
+    callback : object
+        What `hardware` calls, to which CasADi holds no reference.
     """
 
     names: tuple[str, ...]
@@ -107,6 +109,7 @@ class Plant:
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
     drawing: Callable[[Mapping[str, Sequence[float]]], Figure] | None = None
+    callback: object = None
 
     @cached_property
     def slopes(self) -> ca.Function:
