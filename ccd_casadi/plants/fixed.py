@@ -59,15 +59,13 @@ def with_fixed(
 
         return at
 
-    free = ca.MX.sym("theta", len(place))
-    known = {**fixed, **dict(zip(names, ca.vertsplit(free), strict=True))}
-    domain = plant.domain
+    free, domain = ca.MX.sym("theta", len(place)), plant.domain
+    known: dict[str, Any] = {**fixed, **dict(zip(names, ca.vertsplit(free), strict=True))}
+    theta = ca.vertcat(*(known[name] for name in plant.names))
     return reparametrised(
         plant, of, own,
         names=tuple(names),
-        hardware=ca.Function("hardware", [free], plant.hardware.call([
-            ca.vertcat(*(known[name] for name in plant.names))
-        ])),
+        hardware=ca.Function("hardware", [free], plant.hardware.call([theta])),
         domain=None if domain is None else (domain[0][place], domain[1][place]),
     )  # fmt: skip
 

@@ -83,7 +83,7 @@ class InterpolatedModes:
         entries = fit_entries(table.theta, Y)
         return frame, entries, self._left_out(Y, Y - entries.left_out, frame)
 
-    def _pairs(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    def _pairs(self, frame: Frame) -> tuple[np.ndarray, ...]:
         """Rows and columns of the entries of ln K that are not zero, upper triangle."""
         label = np.zeros(self.table.omega.shape[1], int)
         for number, group in enumerate(frame.groups):
