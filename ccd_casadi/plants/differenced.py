@@ -7,7 +7,7 @@ the step, is the cross-check: their difference bounds the error from above.
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -49,8 +49,8 @@ def user_plant(
     box: `math.sqrt` or `float` of a symbol is silently nan. Raises what `build_plant` raises where
     the model takes neither symbols nor numbers.
     """
-    numeric = DifferencedModel(model, names, options, lower, upper)
-    middle = 0.5 * (np.asarray(lower) + np.asarray(upper))
+    box = np.array([lower, upper], float)
+    numeric, middle = DifferencedModel(model, tuple(names), options, *box), box.mean(axis=0)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # CasADi's notice on NumPy functions
@@ -91,28 +91,28 @@ class _Values:
         return Mechanics(M, D, K, B, C, self._ratio, none)  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True, eq=False)
 class DifferencedModel:
     """A numeric model as θ -> Mechanics with derivatives by differences; the box scales the steps.
 
     Raises PlantError where the model returns no plant, or one of another shape than before.
     """
 
-    def __init__(
-        self,
-        model: ModelFunction,
-        names: Sequence[str],
-        options: Mapping[str, Any],
-        lower: Sequence[float],
-        upper: Sequence[float],
-    ) -> None:
-        self.names = tuple(names)
-        self.lower, self.upper = np.array(lower, float), np.array(upper, float)
+    model: ModelFunction
+    names: tuple[str, ...]
+    options: Mapping[str, Any]
+    lower: Array
+    upper: Array
+
+    @cached_property
+    def _read(self) -> Callable[[tuple[float, ...]], _Values]:
+        """What the model returns; the last ones are kept."""
 
         @lru_cache(maxsize=REMEMBERED)
         def read(theta: tuple[float, ...]) -> _Values:
-            return _Values(model(dict(zip(self.names, theta, strict=True)), **options))
+            return _Values(self.model(dict(zip(self.names, theta, strict=True)), **self.options))
 
-        self._read = read
+        return read
 
     def plant(self, reason: str) -> Plant:
         """The plant of the model; `reason` says why its function cannot be traced."""
@@ -134,7 +134,6 @@ class DifferencedModel:
         theta = ca.MX.sym("theta", count)
         both = callback((theta - self.lower) / width)
         lam = both[1:] if middle.scalars.size > 1 else ca.MX(0, 1)
-        self._keep = callback  # CasADi holds no reference to it
         short = " ".join(reason.split())[:120]
 
         def notes(theta: Sequence[float]) -> tuple[str, ...]:
@@ -155,6 +154,7 @@ class DifferencedModel:
             values=self.values,
             notes=notes,
             doubt=self.doubt,
+            callback=callback,
         )
 
     def __call__(self, theta: Sequence[float] | Array) -> Mechanics:

@@ -15,6 +15,7 @@ from ccd_casadi.support.worker_process import R, T, WorkerLost, WorkerProcess, i
 
 K = TypeVar("K")
 PATIENCE = 2.0  # s of work that is not worth starting processes for
+Running = dict[connection.Connection, tuple[WorkerProcess, int]]  # by pipe, and the task's number
 _SHORT = Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
 
@@ -96,7 +97,7 @@ class Workers:
             raise RuntimeError("these workers are busy with another map: finish or close that one")
         self._mapping = True
         waiting, retried = deque(range(done_here, len(tasks))), set[int]()
-        running: dict[connection.Connection, tuple[WorkerProcess, int]] = {}
+        running: Running = {}
         try:
             while waiting or running:
                 raise_dropped()
@@ -130,11 +131,7 @@ class Workers:
             self._end([worker for worker, _ in running.values()])
 
     def _feed(
-        self,
-        function: Callable[[T], R],
-        tasks: Sequence[T],
-        waiting: deque[int],
-        running: dict[connection.Connection, tuple[WorkerProcess, int]],
+        self, function: Callable[[T], R], tasks: Sequence[T], waiting: deque[int], running: Running
     ) -> None:
         """Give every idle worker a task, starting processes up to `count`."""
         while waiting and len(running) < self.count:
