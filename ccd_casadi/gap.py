@@ -1,7 +1,6 @@
 """`python -m ccd_casadi.gap CASE.toml [--theta m1=60,m2=60]`: what no controller can reach."""
 
 import argparse
-from time import perf_counter
 from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, command, option
@@ -23,7 +22,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.json_files import json_text
     from ccd_casadi.support.versions import versions
 
-    began = perf_counter()
     problem, theta, finished = problem_at(options.case, options.theta)
     theta = problem.start if theta is None else theta
     bandwidth = finished and finished.result.get("bandwidth_hz")
@@ -32,7 +30,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         "theta": dict(zip(problem.names, theta, strict=True)),
         "bandwidth_hz": bandwidth,
         "gap": found.entry(HZ * (bandwidth or float("nan"))),
-        "seconds": perf_counter() - began,
+        "seconds": options.seconds(),
         "versions": versions(),
     }
     print(json_text(answer))

@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from time import perf_counter
 
 from ccd_casadi.robust.demands import MOVE_OPTIONS, Demands, move_limits
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
@@ -39,7 +38,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.versions import versions
 
-    began = perf_counter()
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
     if options.axis > outputs:
@@ -69,7 +67,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     with Workers(options.workers, PATIENCE) as workers:
         found = robustness(finished, demands, options.seed, options.quiet, workers)
     answer = study_dict(finished, found)
-    answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
+    answer |= {"seed": options.seed, "versions": versions(), "seconds": options.seconds()}
     write_json(folder / "robustness.json", answer)
     from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
     from ccd_casadi.reporting.robustness_page import conclusion, robustness_page

@@ -3,7 +3,6 @@
 import argparse
 import sys
 from dataclasses import replace
-from time import perf_counter
 
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.options import integer, one_line, option, positive, real, valued
@@ -42,7 +41,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.versions import versions
 
-    began = perf_counter()
     folder = run_folder(options.run[0], options.out)
     structure = None if options.biquads is None else Structure(
         lead=options.lead, biquads=options.biquads, least_damping=0.1
@@ -56,7 +54,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         )  # fmt: skip
     answer, case = answer_of(found.case, found.design), found.case
     result = json_values({
-        "status": answer.status, **answer.figures, "seconds": perf_counter() - began,
+        "status": answer.status, **answer.figures, "seconds": options.seconds(),
         "models": [norm for norm in found.norms if norm is not None],  # ‖S‖∞ of each model's loop
         "seed": options.seed, "formulation": "tune", "versions": versions(),
     })  # fmt: skip

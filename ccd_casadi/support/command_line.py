@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from threadpoolctl import threadpool_limits
@@ -24,7 +25,7 @@ from ccd_casadi.support.worker_process import WorkerLost
 
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
-Body = Callable[[argparse.Namespace], ExitCode]  # what a command does with its options
+Body = Callable[[argparse.Namespace], ExitCode]  # what a command does; `seconds()`: since it began
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
 # What a command is about, as argparse takes its positional.
 CASE = {"dest": "case", "metavar": "CASE.toml", "nargs": "?", "default": Path(DEFAULT_CASE),
@@ -130,6 +131,8 @@ def run(
             kept_quiet(options.quiet),
             ctrl_c_noticed(),
         ):
+            began = perf_counter()
+            options.seconds = lambda: perf_counter() - began
             code = main(options)
         sys.stdout.flush()  # here, where a reader that went away can still be dealt with
     except PlantError as error:  # at some θ: what evaluates a plant knows of no case file
