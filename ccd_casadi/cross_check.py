@@ -79,8 +79,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         ])  # fmt: skip
     if not options.quiet:
         names = ", ".join(f"{k} = {v:.6g}" for k, v in zip(problem.names, theta, strict=True))
-        print(f"{names}; omega_S {point[0] / HZ:.6g} Hz, omega_T {point[1] / HZ:.6g} Hz")
-        print(_table(found))
+        say(f"{names}; omega_S {point[0] / HZ:.6g} Hz, omega_T {point[1] / HZ:.6g} Hz")
+        say(_table(found))
         say(_conclusion(found))
     if options.out is not None:
         folder = run_folder(options.case, options.out)
@@ -108,8 +108,8 @@ def _table(found: "Sequence[BackendResult]") -> str:
     from ccd_casadi.synthesis.backends.mixed import TITLES
 
     lines = [
-        f"{'back end':18s} {'gamma claimed':>13s} {'certified':>11s} {'bandwidth':>12s} "
-        f"{'peak of S':>9s} {'seconds':>8s}  verdict"
+        f"{'back end':18s} {'gamma':>9s} {'certified':>9s} {'bandwidth':>11s} {'peak of S':>9s} "
+        f"{'s':>6s}  verdict"
     ]
     for item in found:
         norm = bandwidth = peak = math.nan
@@ -117,9 +117,9 @@ def _table(found: "Sequence[BackendResult]") -> str:
             figures = item.design.figures
             norm = figures.certificate.norm if figures.certificate.passed else math.nan
             bandwidth, peak = figures.bandwidth / HZ, figures.sensitivity_peak
-        cells = (f"{item.gamma_opt:13.7g}", f"{norm:11.7g}", f"{bandwidth:9.5f} Hz", f"{peak:9.5f}")
+        cells = (f"{item.gamma_opt:9.6g}", f"{norm:9.6g}", f"{bandwidth:8.3f} Hz", f"{peak:9.4f}")
         shown = " ".join(f"{'-':>{len(c)}s}" if "nan" in c else c for c in cells)
-        lines.append(f"{TITLES[item.backend]:18s} {shown} {item.seconds:8.3f}  {item.words}")
+        lines.append(f"{TITLES[item.backend]:18s} {shown} {item.seconds:6.3f}  {item.words}")
     return "\n".join(lines)
 
 

@@ -23,7 +23,7 @@ from ccd_casadi.cases.checks import (
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.kinds import check_kind
 from ccd_casadi.cases.motion import check_motion
-from ccd_casadi.cases.places import checked_places
+from ccd_casadi.cases.places import check_directions, checked_places
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.tables import REQUIRED, TABLES, Case
 from ccd_casadi.plants.nodes import names_in
@@ -169,6 +169,8 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         if parameter.varies and controller.structure != "sections":
             words = 'needs controller.structure = "sections"; choose that, or drop it'
             raise fail(f"theta.{parameter.name}.varies", words)
+    several = bool(plants) or any(parameter.varies for parameter in fixed)
+    check_directions(places, several, fail)
     check_motion(tables, {p.name: (p.lower, p.upper) for p in (*theta, *fixed)}, fail)
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **tables)
 

@@ -34,6 +34,15 @@ def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
     return replace(table, nodes=numbers)
 
 
+def check_directions(table: PlacesTable, several_plants: bool, fail: Fail) -> None:
+    """Raise where directions that follow modes would differ from plant to plant of a set."""
+    for name in ("quiet", "damped") if several_plants else ():
+        if getattr(table, name):
+            words = "gives each plant of robust.plants, and of a parameter that varies, directions "
+            words += "of its own, which no controller can follow; drop it, or these plants"
+            raise fail(f"places.{name}", words)
+
+
 def places_of(table: PlacesTable) -> Places | None:
     """Its places as plain values; None where the case has none."""
     if table == PlacesTable():

@@ -277,6 +277,9 @@ class PlacesTable:
         check=names_of_theta,
     )
     choose: int = key("how many of these are there at most", 0)
+    actuator_cost: float = key(
+        "hardware cost of each force that is there, in its unit", 0.0, check=NOT_NEGATIVE
+    )
 
 
 @dataclass(frozen=True)

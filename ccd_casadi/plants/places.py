@@ -45,6 +45,7 @@ class Places:
 
     Of both, `present` names a θ from 0 to 1 for each actuator: its force counts by the root of
     it (γ² of a mixed sensitivity is convex in it), its mass by itself. At most `choose` are there.
+    Each that is there adds `actuator_cost` to f.
     """
 
     nodes: tuple[tuple[float, ...], ...]
@@ -59,11 +60,12 @@ class Places:
     reference: tuple[tuple[float, ...], ...] = ()
     present: tuple[str, ...] = ()
     choose: int = 0
+    actuator_cost: float = 0.0
 
     @property
     def identity(self) -> dict[str, object]:
         """Its values; those that earlier stores do not know only where they are given."""
-        later = ("reference", "present", "choose")
+        later = ("reference", "present", "choose", "actuator_cost")
         return {key: value for key, value in vars(self).items() if value or key not in later}
 
     @property
@@ -125,6 +127,7 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     evaluate = of(plant.evaluate)
     x = ca.MX.sym("theta", len(names))
     f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
+    f += places.actuator_cost * (ca.sum1(x[there]) if there else len(places.actuators))
     rules = _rules(evaluate, x)
     return reparametrised(
         plant,

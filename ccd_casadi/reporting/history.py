@@ -9,9 +9,8 @@ import numpy as np
 from ccd_casadi.codesign.formulation import Iterate
 from ccd_casadi.drawing.content import Table, Words
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.facts import theta_axes
-from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, small_share
+from ccd_casadi.reporting.facts import paragraph, theta_axes
+from ccd_casadi.support.units import HZ, small_share
 
 
 def history_blocks(
@@ -42,29 +41,10 @@ def history_blocks(
         for name, item, row in zip(names, (*iterates, last), known, strict=True)
     ))  # fmt: skip
     *_, objective, error = known.T
-    return Words(_words(error, int(np.isnan(objective).sum()), tolerance, lifted)), table
-
-
-def _words(error: Array, lost: int, tolerance: float, lifted: bool) -> str:
-    """How the error fell, in numbers."""
-    known = error[np.isfinite(error)]
+    ends = [small_share(float(e)) for e in error[np.isfinite(error)][[0, -1]]]
     met = np.flatnonzero(error[:-1] <= tolerance)
-    first, last = small_share(float(known[0])), small_share(float(known[-1]))
-    words = f"{counted(len(error) - 1, 'round')} of fit, IPOPT and truth: the error "
-    words += f"is {last}" if first == last else f"goes from {first} to {last}"
-    if met.size:
-        stays = (error[met[0] : -1] <= tolerance).all()
-        when = f"from round {met[0] + 1} on" if stays else f"first in round {met[0] + 1}"
-        words += f" and is within the tolerance of {100.0 * tolerance:g} % {when}"
-    else:
-        words += f", in no round within the tolerance of {100.0 * tolerance:g} %"
-    words += ". "
-    if lost:
-        words += f"{lost} of the predicted θ had no feasible design. "
-    if lifted:
-        words += (
-            "In the rounds the error is the largest of those of ω_b (relative), ln‖S‖∞ and "
-            "ln|S(ω_low)|; at the verified design, of ω_b alone. A round may predict a design just "
-            "outside S_max, so its true J may lie below the final one."
-        )
-    return words.strip()
+    stays = bool(met.size and (error[met[0] : -1] <= tolerance).all())
+    first = int(met[0]) + 1 if met.size else 0
+    lost = int(np.isnan(objective).sum())
+    told = (len(iterates), *ends, tolerance, first, stays, lost, lifted)
+    return Words(paragraph("report.history", *told)), table

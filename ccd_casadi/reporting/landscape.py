@@ -9,6 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, sample_key
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.units import HZ, number
@@ -114,30 +115,11 @@ def known_bandwidths(
 
 def caption_landscape(land: Landscape, best_hz: float) -> str:
     """What the colours and the dots are, and what the field leaves out."""
-    if not land.bandwidth_hz.size:
-        return (
-            "No surrogate was fitted to ω_b*(θ): the large dots are the θ where a synthesis met "
-            "S_max and S_low, in the colour of the best ω_b found there (ω_b* is at least "
-            f"that), {len(land.truths)} of them; at the {len(land.designs)} small ones none did. "
-            f"The verified design (★) has {number(best_hz)} Hz."
-        )
     field = land.bandwidth_hz
     inside = np.isfinite(field) & ~land.outside
     known = field[inside] if inside.any() else field
-    limited = " inside the last trust region" if land.outside.any() else ""
-    words = (
-        f"ω_b*(θ), the surrogate: {number(float(known.min()), 4)} to "
-        f"{number(float(known.max()), 4)} Hz{limited}; the verified design (★) has "
-        f"{number(best_hz)} Hz."
-    )
-    if land.outside.any():
-        words += (
-            f" Pale: outside the last trust region ({100.0 * land.outside.mean():.0f} % of the "
-            "grid), where the last surrogate was not checked; believe the dots there."
-        )
-    if land.forbidden is not None and land.forbidden.any():
-        words += f" Hatched: a constraint on θ forbids {100.0 * land.forbidden.mean():.0f} %."
-    return words
+    ends = (float(known.min()), float(known.max())) if field.size else None
+    return paragraph("report.landscape", land, ends, best_hz)
 
 
 def caption_disagreement(process: GaussianProcess | None, truths: Truths) -> str:

@@ -8,9 +8,9 @@ import numpy as np
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel
 from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.facts import theta_axes
+from ccd_casadi.reporting.facts import paragraph, theta_axes
 from ccd_casadi.reporting.landscape import Truths, known_bandwidths
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
 from surrogates.gaussian_process import TWO_SIDED_95
 
@@ -64,19 +64,7 @@ def slices_figure(
     rows = tuple(tuple(full[i : i + per_row]) for i in range(0, len(full), per_row))
     heights = (3.2 if len(rows) == 1 else 2.5,) * len(rows)
     lines = Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
-    return Figure(lines, _caption(spans, len(same) > 1, best_hz) + extra)
-
-
-def _caption(spans: dict[str, tuple[float, float]], many: bool, best_hz: float) -> str:
-    """Along which parameter the bandwidth changes most, and how sure the surrogate is."""
-    words = "ω_b* along each parameter, the others at the optimum" if many else "ω_b*(θ)"
-    words += f" ({number(best_hz)} Hz there, dashed line); dots: true values"
-    words += f" within {100 * NEARBY:.0f} % of the box." if many else "."
-    if not spans:
-        return words + " No surrogate was fitted to ω_b*(θ): the dots are designs of the run."
-    most = max(spans, key=lambda name: spans[name][0])
-    return (
-        f"{words} It changes {'most ' if many else ''}along {most}, by "
-        f"{number(spans[most][0], 3)} Hz over the range; the 95 % band is at most "
-        f"±{number(max(half for _, half in spans.values()), 2)} Hz."
-    )
+    most = max(spans.items(), key=lambda item: item[1][0], default=None)
+    band = max((half for _, half in spans.values()), default=0.0)
+    told = (most and (most[0], most[1][0]), band, len(same) > 1, best_hz, NEARBY)
+    return Figure(lines, paragraph("report.slices", *told) + extra)

@@ -6,6 +6,7 @@ import numpy as np
 
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table
 from ccd_casadi.drawing.svg import BLUE, GREY
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.units import number
 from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
@@ -22,7 +23,8 @@ def trust_figure(qualities: Sequence[Quality]) -> Figure:
     """A column for each output: predicted without the sample over true, and residuals below."""
     rows = tuple(tuple(map(panel, qualities)) for panel in (_predicted, _residuals))
     title = "samples predicted without themselves, and their standardised residuals"
-    return Figure(Lines(rows, title, (3.3, 2.6)), _caption(qualities))
+    words = paragraph("report.trust", len(qualities[0].true))
+    return Figure(Lines(rows, title, (3.3, 2.6)), words)
 
 
 def _predicted(q: Quality) -> Panel:
@@ -47,16 +49,6 @@ def _residuals(q: Quality) -> Panel:
         (Curve(q.true, q.standardised, "", BLUE, "", "o"),),
         levels=tuple(Level(sign * TWO_SIDED_95, "95 % band") for sign in (1.0, -1.0)),
         y_range=(-most, most),
-    )
-
-
-def _caption(qualities: Sequence[Quality]) -> str:
-    """What is drawn; the figures are in the table."""
-    return (
-        f"Each of the {len(qualities[0].true)} samples of the last surrogate, predicted from the "
-        "others (above; on the dashed line the prediction is exact) and the difference in units of "
-        "the predicted deviation (below). Points far outside the bands, or a curve instead of a "
-        "cloud, show what a smooth surrogate cannot follow."
     )
 
 

@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.plants.nodes import NodeInterpolation
 from ccd_casadi.plants.places import Places, placed
-from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, mechanics
+from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, hardware_cost, mechanics
 from ccd_casadi.support.errors import PlantError
 
 CASE = Path(__file__).parents[2] / "examples" / "placed_motors" / "case.toml"
@@ -173,6 +173,8 @@ def test_an_actuator_that_is_not_there_is_as_if_never_given(
     compare_slopes(plant, parts)
     assert plant.constraint_names[-1] == "actuators chosen"
     assert constraint_values(plant, parts)[-1] == pytest.approx(3.9 / 4.0 - 1.0)
+    dearer = placed(beam_of_nodes(seed), replace(whole, actuator_cost=0.5), plant.names)
+    assert hardware_cost(dearer, parts) == pytest.approx(hardware_cost(plant, parts) + 0.5 * 3.9)
 
 
 @few(20)
@@ -283,3 +285,16 @@ def test_what_varies_needs_sections_and_bounds() -> None:
     del data["theta"]["at"]["integer"], data["controller"], data["loop"], data["robust"]
     with pytest.raises(CaseError, match=r"theta\.at\.varies: needs controller\.structure"):
         parse_case(data, STROKE)
+
+
+@pytest.mark.parametrize("key", ["quiet", "damped"])
+def test_one_controller_has_no_directions_for_modes_of_several_plants(key: str) -> None:
+    """Forces that leave a mode of one plant alone drive that of another."""
+    data = tomllib.loads(case_to_toml(load_case(CASE)))
+    data["places"][key] = [1]
+    parse_case(data, CASE)
+    with pytest.raises(CaseError, match=rf"places\.{key}: .* drop it, or these plants"):
+        parse_case(data | {"robust": data["robust"] | {"plants": [{}]}}, CASE)
+    varies = {"lower": 0.03, "upper": 0.11, "start": 0.07, "varies": True}
+    with pytest.raises(CaseError, match=rf"places\.{key}: .* drop it, or these plants"):
+        parse_case(data | {"theta": data["theta"] | {"b": varies}}, CASE)
