@@ -7,46 +7,30 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.cases.checks import (
-    ANY,
-    FRACTION,
-    USUAL,
-    Check,
-    Fail,
-    Test,
-    closest,
-    count,
-    flag,
-    listed,
-    names,
-    number,
-    require_good,
-    short_repr,
-    text,
-    too_large,
-)
+from ccd_casadi.cases import checks
+from ccd_casadi.cases.checks import Check, Fail, short_repr
 from ccd_casadi.cases.tables import Parameter, PlantTable
 from ccd_casadi.plants.registry import OWN, model_named, model_names
 
 # Checks of a model's options that its builder's annotations do not say, by their names.
 _OPTIONS: dict[str, Check] = {
-    "zeta": FRACTION,
-    "poisson": number(0.0, 0.5, "give a number between 0 and 0.5"),
-    "modes": count(1),
+    "zeta": checks.FRACTION,
+    "poisson": checks.number(0.0, 0.5, "give a number between 0 and 0.5"),
+    "modes": checks.count(1),
 }
 MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
 
 # Every key of a [theta.NAME], what is asked of it, and what it says.
 KEYS: dict[str, tuple[Check, str]] = {
-    "lower": (ANY, "least value, in `unit`"),
-    "upper": (ANY, "largest value"),
-    "start": (ANY, "start of searches; default: the middle"),
-    "unit": (text, "unit, as the plant function takes it; shown in tables and on pages"),
-    "values": (listed, "instead of bounds: a list of values, as in a catalogue"),
-    "integer": (flag, "whole numbers between the bounds only; default false"),
-    "fixed": (ANY, "instead of bounds: its value, which is not searched"),
+    "lower": (checks.ANY, "least value, in `unit`"),
+    "upper": (checks.ANY, "largest value"),
+    "start": (checks.ANY, "start of searches; default: the middle"),
+    "unit": (checks.text, "unit, as the plant function takes it; shown in tables and on pages"),
+    "values": (checks.listed, "instead of bounds: a list of values, as in a catalogue"),
+    "integer": (checks.flag, "whole numbers between the bounds only; default false"),
+    "fixed": (checks.ANY, "instead of bounds: its value, which is not searched"),
     "varies": (
-        flag,
+        checks.flag,
         "with sections: true: not chosen; the loop holds at every value, as along a stroke; "
         "`start` is the model",
     ),
@@ -63,7 +47,7 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
         raise fail("plant.model", words)
     known = model_named(model) if isinstance(model, str) else None
     if model is not None and known is None:
-        hint = closest(str(model), model_names())
+        hint = checks.closest(str(model), model_names())
         words = f"is {short_repr(model)}, not a known model{hint}; or use function"
         raise fail("plant.model", words)
     if function is not None:
@@ -73,15 +57,15 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
         function = f"{_absolute(path, parts[0], 'plant.function', fail)}:{parts[1]}"
     options = {key: value for key, value in table.items() if key not in ("model", "function")}
     takes = {} if known is None else dict(inspect.signature(known.build).parameters)
-    checks = {} if known is None else known.checks
+    own_checks = {} if known is None else known.checks
     for key, value in options.items():
         if not key.isidentifier():
             raise fail(f"plant.{key}", "is not a keyword; use a Python identifier")
         own = list(takes)[1:]
         if takes and key not in own:
-            raise fail(f"plant.{key}", f"is not an option of {model}{closest(key, own)}")
+            raise fail(f"plant.{key}", f"is not an option of {model}{checks.closest(key, own)}")
         usual = _check_of(takes[key]) if model in OWN else _option
-        wrong = checks.get(key, usual)(value)
+        wrong = own_checks.get(key, usual)(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)
     data = "" if known is None else known.data
@@ -103,16 +87,20 @@ def _absolute(case: Path, name: str, key: str, fail: Fail) -> str:
     raise fail(key, f"there is no {short_repr(name)}; give its path relative to the case file")
 
 
-def _check_of(option: inspect.Parameter) -> Test:
+def _check_of(option: inspect.Parameter) -> checks.Test:
     """What its name or its annotation in the builder asks of an option."""
-    usual = names if option.annotation == Sequence[str] else USUAL.get(option.annotation, _option)
+    usual = (
+        checks.names
+        if option.annotation == Sequence[str]
+        else checks.USUAL.get(option.annotation, _option)
+    )
     return _OPTIONS.get(option.name, usual)
 
 
 def _option(value: Any) -> str | None:
     if isinstance(value, float) and not math.isfinite(value):
         return f"is {value}; give a finite number"
-    if too_large(value):
+    if checks.too_large(value):
         return f"is {short_repr(value)}; write it as a float"
     if isinstance(value, list):
         return next(filter(None, map(_option, value)), None)
@@ -139,7 +127,9 @@ def theta_tables(
     needed = (*(own or ()), *of_case)
     for name in () if own is None else table:
         if name not in needed:
-            raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
+            raise fail(
+                f"theta.{name}", f"is not a parameter of {model}{checks.closest(name, needed)}"
+            )
     for name in needed:
         if name not in table:
             which = "[places] or [motor] names" if name in of_case else f"{model} needs"
@@ -155,7 +145,7 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
         raise fail(place, "is not an identifier; use letters, digits and _")
     if not isinstance(entry, Mapping):
         raise fail(place, f"is {short_repr(entry)}; write a table [theta.{name}]")
-    require_good(place, entry, {key: check for key, (check, _) in KEYS.items()}, fail)
+    checks.require_good(place, entry, {key: check for key, (check, _) in KEYS.items()}, fail)
     unit = entry.get("unit", "")
     for key, others in (("fixed", ("values", "lower", "upper", "start", "integer", "varies")),
                         ("values", ("lower", "upper", "integer", "varies")),
