@@ -7,17 +7,18 @@ only), `modal_mass` (1 where mode shapes are mass-normalised), `hardware_cost`, 
 """
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.plants.imported.csv_rows import number_in, read_rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 KNOWN = ("mode", "frequency_hz", "damping", "modal_mass", "hardware_cost")
+Rows = dict[str, dict[str, str]]  # cells by column, by the row's place: `FILE: line N`
 PREFIXES = ("in:", "out:", "shape:", "constraint:")
 
 
@@ -133,3 +134,42 @@ def _mode(place: str, cells: dict[str, str]) -> dict[str, float]:
 
 def _stripped(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name.split(":", 1)[1] for name in names)
+
+
+def read_rows(path: Path) -> Rows:
+    """The rows under a header; lines that start with # are remarks.
+
+    Raises PlantError where it cannot be read, holds no rows, or a row has not the header's columns.
+    """
+    try:
+        lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
+        kept = [(i, line) for i, line in lines if line.strip() and not line.startswith("#")]
+        parsed = list(csv.reader((line for _, line in kept), skipinitialspace=True))
+    except (OSError, UnicodeDecodeError) as error:
+        raise PlantError(f"{path}: cannot be read: {error}; name a CSV file in UTF-8") from None
+    except csv.Error as error:
+        raise PlantError(f"{path}: is not a CSV: {error}; separate cells by commas") from None
+    if len(parsed) < 2:
+        raise PlantError(f"{path}: holds no rows; give a header and rows below it")
+    header, *rows = ([cell.strip() for cell in cells] for cells in parsed)
+    if len(set(header)) < len(header) or not all(header):
+        raise PlantError(f"{path}: line {kept[0][0]}: a column's name is empty or twice there")
+    found = {}
+    for (number, _), cells in zip(kept[1:], rows, strict=False):
+        place = f"{path}: line {number}"
+        if len(cells) != len(header):
+            words = f"has {len(cells)} columns, the header {len(header)}"
+            raise PlantError(f"{place}: {words}; correct it")
+        found[place] = dict(zip(header, cells, strict=True))
+    return found
+
+
+def number_in(place: str, key: str, text: str) -> float:
+    """A cell as a finite number. Raises PlantError."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise PlantError(f"{place}: {key}: {text[:40]!r} is not a number; give one") from None
+    if not math.isfinite(value):
+        raise PlantError(f"{place}: {key}: {text[:40]!r} is not finite; give a number")
+    return value
