@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     raise_on_ctrl_c()
     match words:
         case [] | ["--help" | "-h" | "help"]:
-            print(overview(Path()))
+            say(overview(Path()))
         case ["--version"]:
             import ccd_casadi
 

@@ -12,23 +12,24 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 
 def table(comparison: "Comparison") -> str:
-    """The methods in a few columns for the terminal."""
+    """The methods in columns that a terminal of 80 characters holds, then how they ended."""
     from ccd_casadi.reporting.verdict import head_words
 
-    head = f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'check':>10}"
-    lines = [f"{head}{'s':>8}  status"]
+    lines = [f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>9}{'syntheses':>10}{'check':>7}{'s':>8}"]
+    ends: dict[str, list[str]] = {}
     for method in comparison.methods:
         f = method.figures
+        words = f"{f['status']} ({head_words(f)})" if f.get("verdict") else f["status"]
         if f.get("objective") is None:
-            lines.append(f"{method.name:24}{'':59}  {f['status']}: {f.get('reason', '')}")
-            continue
-        lines.append(
-            f"{method.name:24}{f['objective']:11.4f}{f['bandwidth_hz']:9.3f}"
-            f"{f['hardware_cost']:10.4g}{f['syntheses_to_optimum']:11d}"
-            f"{f['syntheses'] - f['syntheses_to_optimum']:10d}{f['seconds']:8.1f}  {f['status']}"
-            + (f" ({head_words(f)})" if f.get("verdict") else "")
-        )
-    return "\n".join(lines)
+            words = f"{words}: {f.get('reason', '')}"
+        else:
+            lines.append(
+                f"{method.name:24}{f['objective']:11.4f}{f['bandwidth_hz']:9.3f}"
+                f"{f['hardware_cost']:9.4g}{f['syntheses_to_optimum']:10d}"
+                f"{f['syntheses'] - f['syntheses_to_optimum']:7d}{f['seconds']:8.1f}"
+            )
+        ends.setdefault(words, []).append(method.name)
+    return "\n".join([*lines, *(f"{', '.join(names)}: {words}" for words, names in ends.items())])
 
 
 @command(
@@ -52,7 +53,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     answer = comparison_dict(comparison, options.seed)
     write_json(folder / "compare.json", answer)
     if not options.quiet:
-        print(table(comparison))
+        say(table(comparison))
         say("\n".join(answer["conclusions"]["sentences"]))
     from ccd_casadi.drawing.stored import write_page  # matplotlib is slow to import
     from ccd_casadi.studies.compare_page import comparison_page

@@ -90,9 +90,10 @@ def judge(
         doubts.append(f"between {np.isinf(reach).sum()} pairs of lines GK may pass -1")
     head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
     of = "1 + GK" if len(G[0]) == 1 else "det(I + GK)"
+    as_low = f"as (jω)^-{measured.slope}" if measured.slope else "constant"
     assumed = (
         f"{head} by the winding of {of}, with {measured.unstable_poles} unstable poles of G, and G "
-        f"as (jω)^-{measured.slope} below {hz[0]:.4g} Hz and |GK| < 1 above {hz[-1]:.4g} Hz"
+        f"{as_low} below {hz[0]:.4g} Hz and |GK| < 1 above {hz[-1]:.4g} Hz"
     )
     words, sure = "; ".join([assumed, *doubts]), measured.modelled or not doubts
     if Z != 0:

@@ -13,7 +13,9 @@ solve are the cost f and bandwidth m ± δ/|w2| of designs with w1 f + w2 m <= J
     δ = 2 max EI + |w2| |v(θ_n) - m(θ_n)|,   θ_n the surrogate's last optimum, where v is known.
 
 A structured controller is the best of climbs from what is known near by; at both ends a multi-start
-search asks whether there is a better one, which the samples around learn from then.
+search asks whether there is a better one, which the samples around learn from then. A full solve
+may end in the next local optimum, and counts worse plants of the box: δ has both besides
+(`search_error`).
 
 No bound: a region without samples may be better.
 """
@@ -29,10 +31,12 @@ from scipy.special import ndtr
 from ccd_casadi.cases.case import Case
 from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
-from ccd_casadi.codesign.outer_structured import multistart_at
+from ccd_casadi.codesign.outer_structured import multistart_at, value_with_design
 from ccd_casadi.codesign.run import outer_of
+from ccd_casadi.codesign.theta_joint import with_scenarios
 from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.structured_robustness import worst_case
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
@@ -103,6 +107,8 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
             for at in better:
                 sampler.value_from(at, found[at].design.kappa.tolist())
             if not (better and rounds_left):
+                if unsure := search_error(sampler, ahead.best):
+                    ahead = outlook(problem, known, missed + unsure, seed)
                 break
             missed, searched = 0.0, searched | ends.keys()
             continue
@@ -176,6 +182,22 @@ def outlook(
     if new[0]:
         return Outlook(best, left, expected, float(mean[0]), *ends)
     return Outlook(best, left, cloud[gains.argmax()], np.nan, *ends)
+
+
+def search_error(sampler: Sampler, best: InnerSample) -> float:
+    """By how much a full solve may end with another bandwidth at this θ (rad/s): by what the worst
+    plants found in the box cost, and, where one search alone found the best controller, by the
+    distance to the next local optimum."""
+    if not best.kappa:
+        return 0.0
+    ends = multistart_at(sampler, best).design.local_optima[:2]
+    alone = len(ends) == 2 and ends[0].count == 1
+    apart = ends[0].bandwidth - ends[1].bandwidth if alone else 0.0
+    design = value_with_design(sampler, best).design
+    if plants := worst_case(sampler.problem, best.theta, design)[1]:
+        wider = with_scenarios(sampler, plants).value_from(best.theta, best.kappa)
+        apart += best.value - float(np.nan_to_num(wider.value))
+    return apart
 
 
 def worth_words(found: Mapping[str, Any]) -> list[str]:

@@ -2,17 +2,20 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ccd_casadi import HZ, Lifted, load_case, problem_of, solve
+from ccd_casadi.fixed_structure.race import LocalOptimum
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box, plant_of, true_inner
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.studies.worth import outlook
+from ccd_casadi.studies import worth
+from ccd_casadi.studies.worth import outlook, search_error
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.worth import main
 from surrogates import design
@@ -63,6 +66,25 @@ def test_a_round_is_expected_to_gain_less_the_more_true_designs_there_are(tmp_pa
     assert abs(problem.w2) * first.left >= gained
     assert last.left < 1e-2 * first.left
     assert last.costs[0] <= hardware_cost(plant_of(problem), last.best.theta) <= last.costs[1]
+
+
+@pytest.mark.parametrize(
+    ("count", "with_plants", "expected"),
+    [(1, None, 2.0), (3, None, 0.0), (3, 9.5, 0.5), (1, 9.5, 2.5), (3, np.nan, 10.0)],
+)
+def test_what_a_search_may_have_missed_is_stated(monkeypatch, count, with_plants, expected) -> None:
+    """The next local optimum, where one search alone found the best, and worse plants."""
+    ends = SimpleNamespace(local_optima=(LocalOptimum(10.0, count), LocalOptimum(8.0, 4)))
+    searched = SimpleNamespace(design=ends)
+    wider = SimpleNamespace(value_from=lambda *at: SimpleNamespace(value=with_plants))
+    plants = () if with_plants is None else ((0, (0.03,)),)
+    monkeypatch.setattr(worth, "multistart_at", lambda *at: searched)
+    monkeypatch.setattr(worth, "value_with_design", lambda *at: searched)
+    monkeypatch.setattr(worth, "worst_case", lambda *at: (None, plants))
+    monkeypatch.setattr(worth, "with_scenarios", lambda *at: wider)
+    best = SimpleNamespace(kappa=(1.0,), theta=(0.1,), value=10.0)
+    assert search_error(SimpleNamespace(problem=None), best) == pytest.approx(expected)
+    assert search_error(SimpleNamespace(problem=None), SimpleNamespace(kappa=())) == 0.0
 
 
 def test_a_case_that_it_cannot_count_is_one_line(tmp_path, capsys) -> None:

@@ -46,6 +46,14 @@ def test_an_answer_is_wrapped_to_the_terminal(columns: int) -> None:
     assert "left" not in ends[0]
 
 
+def test_the_table_of_back_ends_holds_80_characters() -> None:
+    at = ["--theta", "m1=60,m2=60", "--omega-s-hz", "900", "--omega-t-hz", "25"]
+    lines = on_screen(80, "cross_check", str(ccd_casadi.TWO_MASS), *at)
+    row = next(line for line in lines if line.startswith("one Riccati (ours)"))
+    assert row.endswith("  certified")
+    assert max(map(len, lines)) <= 80
+
+
 def test_a_line_goes_on_under_its_words() -> None:
     line = "survives      warned   stable for resonances -0.76 to +7.9 %, less than +-2 %"
     broken = wrapped(line, 50).split("\n")

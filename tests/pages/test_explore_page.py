@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from pictures import picture
 
 from ccd_casadi import explore
 from ccd_casadi.cases.case import load_case
@@ -90,6 +91,7 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     assert max(gain) == pytest.approx(1.75, rel=1e-6)  # S_max binds in the search at this θ
     page.get_by_role("button", name="Save as case").click()
     page.get_by_text("explored_1.toml").wait_for()
+    picture(page, "explorer_dragged", whole=True)
     page.reload()  # a second document of the same session
     page.wait_for_function(f"window.{READY}")
     assert not heard
@@ -97,6 +99,7 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     page.get_by_role("alert").wait_for(state="visible")
     assert "does not answer" in page.get_by_role("alert").inner_text()
     assert page.get_by_text("Reconnection").count() == 0  # it does not come back
+    picture(page, "explorer_without_its_server")
     with SampleStore(Path(tmp_path) / "samples.sqlite") as store:
         assert tuple(theta) in {sample.theta for sample in store.select()}
 
@@ -128,6 +131,7 @@ def test_pins_outlive_a_reload_and_a_change_to_dark(browser, server):
         == "1800"
     )
     assert page.get_by_role("img", name="Sensitivity S").is_visible()
+    picture(page, "explorer_pins_dark", whole=True)
     assert not heard
 
 
@@ -138,6 +142,7 @@ def test_a_solve_from_here_tells_how_far_it_is_and_ends_with_its_report(browser,
     page.get_by_text(re.compile(r"sampling +\d+/\d+ \[")).wait_for()
     page.get_by_text("the solve ended: done and verified").wait_for()
     assert (tmp_path / "solved_1" / "report.html").exists()
+    picture(page, "explorer_solved_from_here", whole=True)
     with page.expect_popup() as opening:
         page.get_by_role("link", name="the report of it").click()
     report = opening.value
@@ -165,6 +170,7 @@ def test_it_fits_and_does_not_complain(browser, server, width, scheme):
     ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
     light = sum(map(int, re.findall(r"\d+", ground)[:3])) > 3 * 128
     assert light == (scheme == "light")
+    picture(page, f"explorer_{width}_{scheme}", whole=True)
     assert not heard
 
 
@@ -206,6 +212,7 @@ def test_a_circle_of_the_nyquist_plot_is_one_in_pixels(browser, tmp_path):
         page.set_viewport_size({"width": width, "height": 600})
         page.wait_for_timeout(300)
         page.wait_for_function(f"(([x, y]) => Math.abs(x / y - 1) < 0.01)({SCALES})", timeout=10e3)
+        picture(page, f"nyquist_{width}")
     page.close()
 
 

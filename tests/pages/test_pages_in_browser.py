@@ -6,6 +6,7 @@ import shutil
 from io import BytesIO
 
 import pytest
+from pictures import picture
 from PIL import Image
 
 from ccd_casadi.deploy import main as deploy
@@ -88,6 +89,7 @@ def looked_at(browser, pages, schemes=SCHEMES):
                 assert page.evaluate("document.documentElement.scrollWidth") <= width, place
                 assert page.evaluate(SPLIT) == [], (place, width)
                 assert page.evaluate(LABELS) == [], (place, width)
+                picture(page, f"{name_of(place)}_{width}_{scheme}", whole=True)
             found = page.evaluate(CONTRAST)
             if page.locator("svg text").count():
                 assert found["words"] >= 4.5, (place, scheme)
@@ -97,9 +99,15 @@ def looked_at(browser, pages, schemes=SCHEMES):
             assert page.evaluate(SPLIT) == [], place
             assert page.evaluate(CONTRAST)["words"] >= 4.5  # on white, whatever the theme is
             assert page.pdf().startswith(b"%PDF")
+            picture(page, f"{name_of(place)}_print", whole=True)
             page.emulate_media(media="screen")
         assert not heard
         context.close()
+
+
+def name_of(place):
+    """Of a page in pictures: index, report, deploy, insight, robustness."""
+    return place.parent.name if place.parent.name == "deploy" else place.stem
 
 
 def test_the_pages_of_a_run_are_read_on_any_screen_and_on_paper(browser, solved):
@@ -135,6 +143,7 @@ def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
         found = next(filter(None, (re.search(rf" {name} {value}", text) for text in words)))
         return float(found[1]) * 10.0 ** int((found[2] or "0").translate(plain))
 
+    picture(page, "cursor_over_frequency")
     # read off different pictures: |L| = |G| |K|
     product = read(r"\|G\|") * read(r"\|K\|")
     assert read(r"\|L\|") == pytest.approx(product, rel=0.03)
@@ -155,6 +164,7 @@ def test_the_cursor_of_a_nyquist_plot_reads_its_frequency(browser, solved):
     assert float(found[1]) == pytest.approx(hz, rel=0.01)
     L = complex(float(found[2]), float(found[4]) * (-1) ** (found[3] == "−"))
     assert abs(1.0 + L) == pytest.approx(float(found[5]), abs=0.02)
+    picture(page, "cursor_in_nyquist")
     others = [text for text in page.locator("svg .readout:visible").all_text_contents() if text]
     assert len(others) > 5
     assert {text.split(" · ")[0] for text in others} == {f"{found[1]} Hz"}  # one frequency on all
@@ -184,6 +194,7 @@ def test_a_part_of_a_figure_is_enlarged_and_the_whole_shown_again(browser, solve
     assert hz == pytest.approx(low * (high / low) ** (0.5 + 0.25 * 0.4), rel=0.02)
     assert plot.locator(".scale text").count() >= 4  # scales written anew
     assert not plot.locator("[id*=xtick_1]").is_visible()
+    picture(page, "figure_enlarged")
     page.mouse.dblclick(*at(0.25, 0.4))
     page.mouse.move(0.0, 0.0)
     assert plot.screenshot() == before
@@ -206,6 +217,7 @@ def test_a_part_of_a_map_is_enlarged(browser, solved):
     page.mouse.down()
     page.mouse.move(start + 0.5 * (right - left) * scale, box["y"] + 0.6 * box["height"], steps=3)
     page.mouse.up()
+    picture(page, "map_enlarged")
     after = [float(dot.get_attribute("x")) for dot in dots.all()]
     assert max(after) - min(after) == pytest.approx(2.0 * (max(before) - min(before)), rel=0.1)
     assert plot.locator(".scale text").count() >= 4
@@ -224,6 +236,7 @@ def test_a_table_that_goes_on_has_a_shadow_there(browser, tmp_path, width):
     right = {"x": box["x"] + box["width"] - 4, "y": box["y"] + 4, "width": 4, "height": 4}
     shown = Image.open(BytesIO(page.screenshot(clip=right))).convert("L").getextrema()[0]
     assert (shown < 200) == (width == 390)  # a grey there, and else white
+    picture(page, f"wide_table_{width}")
 
 
 def test_words_outside_and_on_each_other_are_noticed(browser):
