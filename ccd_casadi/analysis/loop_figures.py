@@ -28,7 +28,9 @@ PER_PERIOD = 100  # points of a continuous loop's step
 BAND = 0.02  # about its end, in which a step has settled
 SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
 OCTAVE = 0.1
-LIGHT = 0.1  # damping of a root of K that is worth a word within NEAR of ω_b
+LIGHT = 0.1 * (
+    1.0 - 1e-6
+)  # damping of a root of K worth a word within NEAR of ω_b; not a bound on it
 NEAR = 0.2
 RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
 
