@@ -176,16 +176,17 @@ def finished(
     near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether
     it is that near, or was."""
     problem = sampler.problem
-    reach = CLOSE if plant_of(problem).nearby is None else REACH
+    bent = plant_of(problem).nearby is not None
+    reach = REACH if bent else CLOSE
     models = nearby(problem, [start.theta], start.theta)
     best, J = first = JointModel(problem, models, start, reach).adapted()
     for _ in range(ENDINGS):
-        make = partial(proposed, problem, models, best, reach, LAST_GAIN, bent=True)
+        make = partial(proposed, problem, models, best, reach, LAST_GAIN, bent)
         found = sampler.cached("finished", (*best.theta, best.bandwidth, reach), Proposal, make)
         if tell is not None:
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
-        if found.gain <= KEPT * abs(J):
-            return best, True
+        if found.gain <= KEPT * abs(J):  # the optimum of models that bend as the plants do, or here
+            return found.end if bent and found.gain > 0.0 else best, True
         del make
         others = nearby(problem, [found.end.theta], found.end.theta)
         end, there = JointModel(problem, others, found.end, reach).adapted()
