@@ -48,6 +48,7 @@ ROUNDS = 4  # last searches at most, while worse plants are found at their end
 AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
+FOLLOWING = 0.1  # of that reach, after a search on a reduced basis
 ENDINGS, KEPT = 12, 2e-6  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 
@@ -158,37 +159,50 @@ def finished_on_worse_plants(
 ) -> tuple[Sampler, JointPoint, bool]:
     """The joint optimum near by with the worse plants found at it, the sampler of the problem that
     has these, and whether it is one of all of them."""
-    best = start
-    later = (final,) if plant_of(sampler.problem).nearby is None else (final, *AGAIN)
+    best, has_basis = start, plant_of(sampler.problem).nearby is not None
+    looks, kinds = ((final, *AGAIN), (True, False)) if has_basis else ((final,), (False,))
     for _ in range(ROUNDS):
-        best, near = finished(sampler, best, tell)
-        before, true = sampler, nearby(sampler.problem, (), best.theta)
-        sampler, best, _ = on_worse_plants(sampler, true, best, later, WITHIN, tell)
-        if sampler is before:
+        for bent in kinds:
+            best, near = finished(sampler, best, bent, tell)
+            before, true = sampler, nearby(sampler.problem, (), best.theta)
+            sampler, best, _ = on_worse_plants(sampler, true, best, looks, WITHIN, tell)
+            if sampler is not before:
+                break
+        else:
             return sampler, best, near
     return sampler, best, False
 
 
 def finished(
-    sampler: Sampler, start: JointPoint, tell: Callable[[str], None] | None = None
+    sampler: Sampler,
+    start: JointPoint,
+    bent: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> tuple[JointPoint, bool]:
     """The joint optimum near by, on the plants from what is known at one place after the other: so
     near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether
-    it is that near, or was."""
+    it is that near, or was. With `bent` on reduced bases around these places, which go further;
+    else on the plants to first order, exact there."""
     problem = sampler.problem
-    bent = plant_of(problem).nearby is not None
     reach = REACH if bent else CLOSE
-    models = nearby(problem, [start.theta], start.theta)
+    if not bent and plant_of(problem).nearby is not None:
+        reach *= FOLLOWING
+
+    def around(place: JointPoint) -> tuple[Evaluate, ...]:
+        return nearby(problem, [place.theta] if bent else (), place.theta)
+
+    models = around(start)
     best, J = first = JointModel(problem, models, start, reach).adapted()
     for _ in range(ENDINGS):
         make = partial(proposed, problem, models, best, reach, LAST_GAIN, bent)
-        found = sampler.cached("finished", (*best.theta, best.bandwidth, reach), Proposal, make)
+        key = (*best.theta, best.bandwidth, reach, bent)
+        found = sampler.cached("finished", key, Proposal, make)
         if tell is not None:
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
-        if found.gain <= KEPT * abs(J):  # the optimum of models that bend as the plants do, or here
-            return found.end if bent and found.gain > 0.0 else best, True
+        if found.gain <= KEPT * abs(J):
+            return best, True
         del make
-        others = nearby(problem, [found.end.theta], found.end.theta)
+        others = around(found.end)
         end, there = JointModel(problem, others, found.end, reach).adapted()
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
