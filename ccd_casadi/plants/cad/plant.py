@@ -138,13 +138,11 @@ class CadStage:
 
     def mass_slope(self, theta: Sequence[float] | Array) -> Array:
         """∂mass/∂θ, (p,)."""
-        first = self.morph.points(theta)[self.morph.tets]
-        edges = first[:, 1:] - first[:, :1]
+        corners = self.morph.points(theta)[self.morph.tets]
         moved = self.morph.velocities(theta)[:, self.morph.tets]
-        steps = moved[:, :, 1:] - moved[:, :, :1]
-        a, b, c = edges.transpose(1, 0, 2)
-        sides = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-        return self.material.density * np.einsum("ptij,tij->p", steps, sides) / 6.0
+        edges, steps = (part[..., 1:, :] - part[..., :1, :] for part in (corners, moved))
+        growth = np.einsum("tij,ptji->pt", np.linalg.inv(edges), steps)
+        return self.material.density * growth @ np.linalg.det(edges) / 6.0
 
 
 def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh") -> Plant:
