@@ -7,11 +7,17 @@ design that is not certified does not count, and among those that are the lowest
 import argparse
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
-from ccd_casadi.support.options import add_break_frequencies, break_frequencies, positive
+from ccd_casadi.support.command_line import ExitCode, command, run_folder
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import (
+    break_frequencies,
+    break_frequency_options,
+    option,
+    positive,
+    valued,
+)
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
@@ -24,31 +30,23 @@ def _problem(
     options: argparse.Namespace,
 ) -> "tuple[CoDesignProblem, tuple[float, ...], tuple[float, float]]":
     """Problem, θ and (ω_S, ω_T) in rad/s of a case file with --theta, or of a finished run."""
-    from ccd_casadi.cases.case import CaseError, load_case, parse_theta
-    from ccd_casadi.cases.case_problem import problem_of
-    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.cases.run_folder import problem_at
     from ccd_casadi.inner_problem.problem import true_inner
 
     point = break_frequencies(options)
-    if options.case.is_dir():
-        done = read_run(options.case)
-        if options.theta is not None:
-            raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
+    problem, theta, done = problem_at(options.case, options.theta)
+    if theta is None:
+        raise UserError(f"{options.case}: give --theta, or a run folder in place of the case")
+    if done is not None:
         point = point or (done.weights.omega_S, done.weights.omega_T)
         if done.kappa is not None:
             words = 'cross_check is for controller.structure = "h_infinity" so far'
             remedy = "result.json holds the judge's own figures"
-            raise CaseError(f"{done.folder}/case.toml: controller.structure: {words}; {remedy}")
-        problem, theta = done.problem, done.theta
-    else:
-        case = load_case(options.case)
-        if options.theta is None:
-            raise CaseError(f"{options.case}: give --theta, or a run folder in place of the case")
-        problem, theta = problem_of(case), parse_theta(case, options.theta)
+            raise UserError(f"{done.folder}/case.toml: controller.structure: {words}; {remedy}")
     if point is None:
         found = true_inner(problem, theta)
         if found.optimum is None:
-            raise CaseError(f"{options.case}: {found.shortfall}; give --omega-s-hz, --omega-t-hz")
+            raise UserError(f"{options.case}: {found.shortfall}; give --omega-s-hz, --omega-t-hz")
         point = (found.optimum.figures.omega_S, found.optimum.figures.omega_T)
     return problem, theta, point
 
@@ -57,9 +55,8 @@ def _problem(
     "ccd_casadi.cross_check",
     "Compare one synthesis by every back end. CASE.toml may be the folder of a finished solve.",
     option("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file"),
-    partial(add_break_frequencies, "of a weight (default: the best at theta, or the run's)"),
-    option("--limit", type=positive, default=60.0, metavar="SECONDS",
-           help="time limit of each optional back end (default: 60)"),
+    *break_frequency_options("of a weight (default: the best at theta, or the run's)"),
+    valued("--limit", "SECONDS", positive, "time limit of each optional back end", 60.0),
     needs=["ccd_casadi.codesign.result", "ccd_casadi.synthesis.backends.mixed"],
     without_effect=["--seed"],
 )  # fmt: skip

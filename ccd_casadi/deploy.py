@@ -5,10 +5,10 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.deployment.timing import Timing
-from ccd_casadi.robust.demands import add_move_options, move_limits
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
+from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
+from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import one_line, positive, real
+from ccd_casadi.support.options import one_line, option, positive, real, valued
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import inform, say
 
@@ -43,27 +43,20 @@ def _delay(arguments: argparse.ArgumentParser) -> None:
     option("--fmu", action="store_true",
            help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC "
            "names"),
-    *(option(name, metavar=metavar, type=real(), default=0.0, help=f"{words} (default: 0)")
-      for name, metavar, words in (
-          ("--sensor-step", "METRE", "of the simulated sensor"),
-          ("--force-step", "NEWTON", "of the simulated actuator"),
-          ("--jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"))),
-    add_move_options, needs=["ccd_casadi.deployment.pipeline"], make=run_parser,
+    valued("--sensor-step", "METRE", real(), "of the simulated sensor", 0.0),
+    valued("--force-step", "NEWTON", real(), "of the simulated actuator", 0.0),
+    valued("--jitter", "SECONDS", real(),
+           "of the simulated delay, uniform within plus or minus this", 0.0),
+    *MOVE_OPTIONS, needs=["ccd_casadi.deployment.pipeline"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
-    from ccd_casadi.deployment.c_code import FILES as C_FILES
-    from ccd_casadi.deployment.c_code import write_c
-    from ccd_casadi.deployment.files import DESIGN_FILES, write_files
-    from ccd_casadi.deployment.fmu import FILE as FMU_FILE
-    from ccd_casadi.deployment.fmu import write_fmu
+    from ccd_casadi.deployment import c_code, files, fmu, structured_text
     from ccd_casadi.deployment.move import Electronics
     from ccd_casadi.deployment.on_hardware import on_hardware
     from ccd_casadi.deployment.pipeline import deploy
-    from ccd_casadi.deployment.structured_text import FILE as ST_FILE
-    from ccd_casadi.deployment.structured_text import structured_text
     from ccd_casadi.deployment.words import deployed_line
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
@@ -99,15 +92,16 @@ def main(options: argparse.Namespace) -> ExitCode:
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
-    for name in (*DESIGN_FILES, *C_FILES, ST_FILE, FMU_FILE):
+    for name in (*files.DESIGN_FILES, *c_code.FILES, structured_text.FILE, fmu.FILE):
         (folder / name).unlink(missing_ok=True)
-    write_files(folder, finished, found, options.seed, moved)
+    files.write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
         K, name = found.realisation, run_name(options.run)
         naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed}
-        texts = write_c(folder, K, **naming, forward=moved.forward)
-        (folder / ST_FILE).write_text(structured_text(K, **naming), "utf-8")
-        if options.fmu and not write_fmu(folder / FMU_FILE, K, texts, name):
+        texts = c_code.write_c(folder, K, **naming, forward=moved.forward)
+        code = structured_text.structured_text(K, **naming)
+        (folder / structured_text.FILE).write_text(code, "utf-8")
+        if options.fmu and not fmu.write_fmu(folder / fmu.FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
     inform(_summary(finished, found))

@@ -6,14 +6,15 @@ Serves one page on the loopback address until Ctrl-C.
 import argparse
 from pathlib import Path
 
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
+from ccd_casadi.support.command_line import RUN, ExitCode, command, option, run_folder
 
 
 @command(
     "ccd_casadi.explore", "Drag a design and see its certified loop, in the browser.",
     option("--no-open", action="store_true", help="only print the address, open no browser"),
-    needs=["ccd_casadi.codesign.result"], make=run_parser, metavar="CASE.toml|RUN_DIR",
-    about="a case file, or the folder of a finished solve",
+    needs=["ccd_casadi.codesign.result"],
+    place={**RUN, "metavar": "CASE.toml|RUN_DIR",
+           "help": "a case file, or the folder of a finished solve"},
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""

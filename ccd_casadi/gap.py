@@ -1,7 +1,6 @@
 """`python -m ccd_casadi.gap CASE.toml [--theta m1=60,m2=60]`: what no controller can reach."""
 
 import argparse
-from time import perf_counter
 from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, command, option
@@ -18,28 +17,20 @@ from ccd_casadi.support.units import HZ
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; of a run's folder at its θ, beside its own bandwidth."""
-    from ccd_casadi.cases.case import load_case, parse_theta
-    from ccd_casadi.cases.case_problem import problem_of
-    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.cases.run_folder import problem_at
     from ccd_casadi.limitations.of_problem import gap_of
     from ccd_casadi.support.json_files import json_text
     from ccd_casadi.support.versions import versions
 
-    began, bandwidth = perf_counter(), None
-    if options.case.is_dir():
-        finished = read_run(options.case)
-        problem, theta = finished.problem, finished.theta
-        bandwidth = finished.result.get("bandwidth_hz")
-    else:
-        case = load_case(options.case)
-        problem = problem_of(case)
-        theta = problem.start if options.theta is None else parse_theta(case, options.theta)
+    problem, theta, finished = problem_at(options.case, options.theta)
+    theta = problem.start if theta is None else theta
+    bandwidth = finished and finished.result.get("bandwidth_hz")
     found = gap_of(problem, theta)
     answer: dict[str, Any] = {
         "theta": dict(zip(problem.names, theta, strict=True)),
         "bandwidth_hz": bandwidth,
         "gap": found.entry(HZ * (bandwidth or float("nan"))),
-        "seconds": perf_counter() - began,
+        "seconds": options.seconds(),
         "versions": versions(),
     }
     print(json_text(answer))

@@ -4,9 +4,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
+from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.options import integer
+from ccd_casadi.support.options import integer, option, valued
 from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -29,11 +29,10 @@ def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
 @command(
     "ccd_casadi.imported",
     "Make a modal table from result files or matrices; see docs/own_finite_elements.md.",
-    option("--modes", type=integer(1), default=10, metavar="N",
-           help="modes of matrices (default: 10)"),
+    valued("--modes", "N", integer(1), "modes of matrices", 10),
     option("--static-correction", action="store_true", help="exact static compliance of matrices"),
-    needs=["ccd_casadi.plants.imported.results"], make=run_parser, metavar="FOLDER",
-    about="the folder with index.csv and dofs.csv",
+    needs=["ccd_casadi.plants.imported.results"],
+    place=RUN | {"metavar": "FOLDER", "help": "the folder with index.csv and dofs.csv"},
     without_effect=["--workers", "--seed", "--no-user-code"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:

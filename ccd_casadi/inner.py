@@ -4,11 +4,10 @@ import argparse
 import sys
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
-from ccd_casadi.support.options import add_break_frequencies, break_frequencies
+from ccd_casadi.support.command_line import ExitCode, command, run_folder
+from ccd_casadi.support.options import break_frequencies, break_frequency_options, option
 from ccd_casadi.support.terminal import inform
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -23,7 +22,7 @@ PROGRESS = partial(inform, stream=sys.stderr)  # stdout is for the answer
     option("--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"),
     option("--begin-at", metavar="FOLDER", type=Path,
            help="sections: start one search from the controller of this run, not many"),
-    partial(add_break_frequencies, "of a weight; with both: one synthesis, no search"),
+    *break_frequency_options("of a weight; with both: one synthesis, no search"),
     needs=["ccd_casadi.codesign.result"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
@@ -37,10 +36,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.process_pool import Workers
 
-    began = perf_counter()
     measured = measured_case(options.case)
     if measured is not None:
-        return _measured(measured, options, began)
+        return _measured(measured, options)
     case = load_case(options.case)
     if options.theta is None:
         start = ",".join(f"{each.name}={each.start:g}" for each in case.theta)
@@ -55,10 +53,10 @@ def main(options: argparse.Namespace) -> ExitCode:
             found = answer[type(problem.controller)](problem, theta, how)
         except UserError as error:
             raise CaseError(f"{case.path}: {error}") from error
-    return _print(found, options, began)
+    return _print(found, options)
 
 
-def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -> ExitCode:
+def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     """Sections on a measured response, with a page where a folder is asked for."""
     from ccd_casadi.cases.case import CaseError
     from ccd_casadi.codesign.inner_answer import measured_answer
@@ -76,10 +74,10 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -
         folder = run_folder(options.case, options.out)
         answer = {"status": found.status, **found.figures}
         write_page(folder / "report.html", measured_page(case, made.controller, answer))
-    return _print(found, options, began)
+    return _print(found, options)
 
 
-def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> ExitCode:
+def _print(found: "InnerAnswer", options: argparse.Namespace) -> ExitCode:
     """Print the answer, after controller.json is written: the folder may be refused."""
     from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.support.json_files import json_text, write_json
@@ -91,7 +89,7 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
     answer: dict[str, Any] = {
         "status": found.status,
         **found.figures,
-        "seconds": perf_counter() - began,
+        "seconds": options.seconds(),
         "seed": options.seed,
         "formulation": "inner",
         "versions": versions(),

@@ -6,26 +6,17 @@ case gives, what limits the bandwidth, and the rule of thumb against what was ac
 """
 
 import argparse
-from time import perf_counter
 
-from ccd_casadi.support.command_line import (
-    SCHEDULER,
-    ExitCode,
-    command,
-    option,
-    run_folder,
-    run_parser,
-)
-from ccd_casadi.support.options import integer
+from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command, run_folder
+from ccd_casadi.support.options import integer, valued
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import inform
 
 
 @command(
     "ccd_casadi.insight", "Trade hardware cost against bandwidth.",
-    option("--points", metavar="N", type=integer(2, 9999), default=20,
-           help="most points on the front (default: 20)"),
-    SCHEDULER, needs=["ccd_casadi.codesign.insight"], make=run_parser,
+    valued("--points", "N", integer(2, 9999), "most points on the front", 20),
+    SCHEDULER, needs=["ccd_casadi.codesign.insight"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
@@ -38,7 +29,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.support.json_files import write_json
 
-    began = perf_counter()
     done = read_run(options.run)
     folder = run_folder(options.run, options.out or options.run)
     with (
@@ -51,7 +41,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             outer_of, sampler, done.theta, points=options.points, seed=options.seed
         )
         responses = outer.responses(outer.point_of(done))
-    seconds = perf_counter() - began
+    seconds = options.seconds()
     told = insight_dict(done, front, responses)
     write_json(folder / "insight.json", told | {"seed": options.seed, "seconds": seconds})
     verified = [point for point in front.points if point.verified]

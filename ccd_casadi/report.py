@@ -6,14 +6,14 @@ its design, as far as case.toml, controller.json and result.json hold it.
 
 import argparse
 
-from ccd_casadi.support.command_line import ExitCode, command, run_parser
+from ccd_casadi.support.command_line import RUN, ExitCode, command
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.terminal import inform
 
 
 @command(
     "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
-    needs=["ccd_casadi.drawing.stored"], make=run_parser,
+    needs=["ccd_casadi.drawing.stored"], place=RUN,
     without_effect=["--out", "--workers", "--seed"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:

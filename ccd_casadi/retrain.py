@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ccd_casadi.codesign import FORMULATIONS
-from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_parser
+from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import integer, real
+from ccd_casadi.support.options import integer, option, real, valued
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import say
 from surrogates.files import copy_run
@@ -19,12 +19,11 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 @command(
     "surrogates.retrain", "True samples where they help the optimum most, then a new fit.",
-    option("--budget", metavar="N", type=integer(1), default=500,
-           help="most syntheses that retraining adds in total (default: 500)"),
+    valued("--budget", "N", integer(1), "most syntheses that retraining adds in total", 500),
     option("--tolerance", metavar="X", type=real(1e-12, 0.5),
            help="relative agreement of prediction and truth (default: the case's)"),
-    SCHEDULER, needs=["ccd_casadi.codesign.run"], make=run_parser,
-    about="the run folder; with --out a copy there is retrained",
+    SCHEDULER, needs=["ccd_casadi.codesign.run"],
+    place=RUN | {"help": "the run folder; with --out a copy there is retrained"},
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""

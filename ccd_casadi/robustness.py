@@ -2,12 +2,11 @@
 
 import argparse
 from pathlib import Path
-from time import perf_counter
 
-from ccd_casadi.robust.demands import Demands, add_move_options, move_limits
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
+from ccd_casadi.robust.demands import MOVE_OPTIONS, Demands, move_limits
+from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import integer, positive, real
+from ccd_casadi.support.options import integer, option, positive, real, valued
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from ccd_casadi.support.terminal import inform, plain
 
@@ -20,21 +19,15 @@ PERCENT = real(0.0, 50.0, strict=True)
     option("--controller", type=Path, metavar="FILE",
            help="judge this controller, not the run's: .json, .mat or .toml, see "
            "docs/robustness.md"),
-    option("--shift", type=PERCENT, default=5.0, metavar="PERCENT",
-           help="resonance shift; default 5"),
+    valued("--shift", "PERCENT", PERCENT, "resonance shift", 5.0),
     option("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
-           help="range of factors of the damping; default 0.5 2"),
-    option("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
-           help="tolerance of every hardware parameter; default 1"),
-    option("--samples", type=integer(1), default=200, metavar="N",
-           help="number of random sets of hardware; default 200"),
-    option("--noise", type=positive, default=1.0, metavar="X",
-           help="sensor noise, m/√Hz; default 1"),
-    option("--disturbance", type=positive, default=1.0, metavar="X",
-           help="density of the force at every actuator, N/√Hz; default 1"),
-    option("--axis", type=integer(1), default=1, metavar="N",
-           help="output that moves; default 1"),
-    add_move_options, needs=["ccd_casadi.robust.study"], make=run_parser,
+           help="range of factors of the damping (default: 0.5 2)"),
+    valued("--tolerance", "PERCENT", PERCENT, "tolerance of every hardware parameter", 1.0),
+    valued("--samples", "N", integer(1), "number of random sets of hardware", 200),
+    valued("--noise", "X", positive, "sensor noise, m/√Hz", 1.0),
+    valued("--disturbance", "X", positive, "density of the force at every actuator, N/√Hz", 1.0),
+    valued("--axis", "N", integer(1), "output that moves", 1),
+    *MOVE_OPTIONS, needs=["ccd_casadi.robust.study"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
@@ -45,7 +38,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.versions import versions
 
-    began = perf_counter()
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
     if options.axis > outputs:
@@ -75,7 +67,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     with Workers(options.workers, PATIENCE) as workers:
         found = robustness(finished, demands, options.seed, options.quiet, workers)
     answer = study_dict(finished, found)
-    answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
+    answer |= {"seed": options.seed, "versions": versions(), "seconds": options.seconds()}
     write_json(folder / "robustness.json", answer)
     from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
     from ccd_casadi.reporting.robustness_page import conclusion, robustness_page

@@ -96,22 +96,17 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
         say(f"note: {words}", sys.stderr)
 
 
-def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
+def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -> "Solution":
     """The solution, a failed one's reason with what looks like a wrong unit."""
-    from ccd_casadi.cases.findings import unit_findings
-    from ccd_casadi.inner_problem.problem import plant_of
-    from ccd_casadi.plants.facts import facts_of
-    from ccd_casadi.plants.modal import modal_plant
-    from ccd_casadi.plants.plant import mechanics
-    from ccd_casadi.plants.scaling import scale_plant
+    from ccd_casadi.cases.diagnosis import diagnose
+    from ccd_casadi.cases.findings import Topic
 
     if solution.result["status"] == "verified":
         return solution
-    modal = modal_plant(mechanics(plant_of(problem), problem.start), problem.suspension)
-    scaled = scale_plant(modal, problem.weights.M_K)
-    found = unit_findings(problem, facts_of(problem.start, modal, scaled), scaled)
-    words = [solution.result["reason"], *(item.words for item in found)]
-    return replace(solution, result=solution.result | {"reason": "; ".join(filter(None, words))})
+    found = diagnose(problem, case.suspension.rigid_modes)[1]
+    units = [item.words for item in found if item.topic is Topic.UNITS]
+    words = "; ".join(filter(None, [solution.result["reason"], *units]))
+    return replace(solution, result=solution.result | {"reason": words})
 
 
 @command(
@@ -156,7 +151,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             held = counted(samples.count(), "row") if samples.count() else "nothing yet"
             inform(f"resuming      {store} holds {held}", sys.stderr)
         sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-        solution = with_units(co_design(sampler, formulation, options.seed), problem)
+        solution = with_units(co_design(sampler, formulation, options.seed), case, problem)
         write_run(folder, case, solution)
     code = ExitCode.of(solution.result["status"])
     inform(summary(solution))

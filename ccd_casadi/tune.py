@@ -3,27 +3,26 @@
 import argparse
 import sys
 from dataclasses import replace
-from time import perf_counter
 
-from ccd_casadi.support.command_line import ExitCode, command, option, run_folder, run_parser
-from ccd_casadi.support.options import integer, one_line, positive, real
+from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
+from ccd_casadi.support.options import integer, one_line, option, positive, real, valued
 from ccd_casadi.support.terminal import inform, say
 
 
 @command(
     "ccd_casadi.tune", "Find the fastest PID with notches for a plant that exists.",
-    *(option(name, metavar=metavar, type=kind, default=default,
-             help=words if default is None else f"{words} (default: {default:g})")
-      for name, metavar, kind, default, words in (
-          ("--rate-hz", "X", positive, None, "sampling rate; responses include the hold"),
-          ("--delay", "SECONDS", real(), 0.0, "delay in s besides that in DATA"),
-          ("--s-max", "X", real(1.0, strict=True), 1.8, "bound of |S|"),
-          ("--shape", "X", real(1.0), 1.1, "bound of |S| over ω/(√2 ω_b)"),
-          ("--effort", "X", positive, 20.0, "bound of |KS| over 1/|G| about ω_b"),
-          ("--lead", "N", integer(0), 1, "number of leads, with --biquads"),
-          ("--biquads", "N", integer(0), None, "number of notches (default: by the resonances)"))),
-    needs=["ccd_casadi.codesign.tuning"], make=run_parser, metavar="DATA", nargs="+",
-    about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
+    option("--rate-hz", metavar="X", type=positive,
+           help="sampling rate; responses include the hold"),
+    valued("--delay", "SECONDS", real(), "delay in s besides that in DATA", 0.0),
+    valued("--s-max", "X", real(1.0, strict=True), "bound of |S|", 1.8),
+    valued("--shape", "X", real(1.0), "bound of |S| over ω/(√2 ω_b)", 1.1),
+    valued("--effort", "X", positive, "bound of |KS| over 1/|G| about ω_b", 20.0),
+    valued("--lead", "N", integer(0), "number of leads, with --biquads", 1),
+    option("--biquads", metavar="N", type=integer(0),
+           help="number of notches (default: by the resonances)"),
+    needs=["ccd_casadi.codesign.tuning"],
+    place=RUN | {"metavar": "DATA", "nargs": "+", "help": "responses (.csv, .mat, .npz) or models "
+                 "(.mat with A, B, C, D); several are one set"},
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
@@ -42,7 +41,6 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.versions import versions
 
-    began = perf_counter()
     folder = run_folder(options.run[0], options.out)
     structure = None if options.biquads is None else Structure(
         lead=options.lead, biquads=options.biquads, least_damping=0.1
@@ -56,7 +54,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         )  # fmt: skip
     answer, case = answer_of(found.case, found.design), found.case
     result = json_values({
-        "status": answer.status, **answer.figures, "seconds": perf_counter() - began,
+        "status": answer.status, **answer.figures, "seconds": options.seconds(),
         "models": [norm for norm in found.norms if norm is not None],  # ‖S‖∞ of each model's loop
         "seed": options.seed, "formulation": "tune", "versions": versions(),
     })  # fmt: skip

@@ -106,7 +106,8 @@ def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:
     r = ca.sqrt(far)
     e = ca.exp(-ROOT5 * r)
     closed = [(1.0 + ROOT5 * r + (5.0 / 3.0) * far) * e, (-5.0 / 6.0) * (1.0 + ROOT5 * r) * e]
-    c = matern_series(10)
+    # of (1 + a r + a² r²/3) e^(-a r), a = √5: (-a)^m (m - 1)(m - 3) / (3 m!)
+    c = [(-ROOT5) ** m * ((m - 1) * (m - 3)) / (3.0 * factorial(m)) for m in range(10)]
     # φ = Σ c_m r^m and φ' = Σ (m/2) c_m r^(m-2); c_1 = c_3 = 0, which is what makes
     # the kernel twice differentiable.
     c1 = [0.5 * (m + 2) * c[m + 2] for m in range(len(c) - 2)]
@@ -125,12 +126,3 @@ def even_odd(c: list[float], first_odd: int, s: ca.MX, r: ca.MX) -> ca.MX:
     for coefficient in reversed(c[first_odd::2]):
         odd = coefficient + s * odd
     return even + s ** ((first_odd - 1) // 2) * r * odd
-
-
-def matern_series(terms: int) -> list[float]:
-    """Taylor coefficients in r of (1 + a r + a² r²/3) e^(-a r), a = √5, degrees 0 to terms - 1.
-
-    (-a)^m (m - 1)(m - 3) / (3 m!): those of r and r³ vanish, which makes the kernel twice
-    differentiable.
-    """
-    return [(-ROOT5) ** m * ((m - 1) * (m - 3)) / (3.0 * factorial(m)) for m in range(terms)]

@@ -122,28 +122,14 @@ def blocks(
 
 
 def observed_covariance(
-    kernel: Kernel,
-    X: Array,
-    parameters: Hyperparameters,
-    gradients: bool,
-    jitter: float,
-    sample_noise: Array = NO_NOISE,
+    C: Array, n: int, parameters: Hyperparameters, jitter: float, sample_noise: Array = NO_NOISE
 ) -> Array:
-    """Return K = σ² C + jitter diag(σ² C) + noise of the observations at X (n, d).
+    """Return K = σ² C + jitter diag(σ² C) + noise of the observations of n samples.
 
-    `sample_noise` (n,), or (0,) for none, are variances that add to the common noise.
-    The jitter is relative to the prior variance of each observation, so that it treats
-    values and gradients, whatever their units, alike.
+    C is their `covariance`; `sample_noise` (n,), or (0,) for none, are variances that add to the
+    common noise. The jitter is relative to the prior variance of each observation, so that it
+    treats values and gradients, whatever their units, alike.
     """
-    lengths = parameters.length_scales
-    C = covariance(kernel, X, X, lengths, gradients_of_a=gradients, gradients_of_b=gradients)
-    return with_noise(C, len(X), parameters, jitter, sample_noise)
-
-
-def with_noise(
-    C: Array, n: int, parameters: Hyperparameters, jitter: float, sample_noise: Array
-) -> Array:
-    """Return K of `observed_covariance` from C of n samples."""
     K = parameters.signal_variance * C
     diagonal = np.einsum("ii->i", K)
     diagonal *= 1.0 + jitter

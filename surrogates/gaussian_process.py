@@ -88,14 +88,8 @@ class GaussianProcess:
         """Lower Cholesky factor of the observations' covariance, scaled units."""
         # Recomputed rather than stored, O(n²) numbers that follow from O(n). Another
         # machine may round differently and need a little more jitter than was found.
-        return factorise(
-            self.kernel,
-            self.X,
-            self.hyperparameters,
-            self.has_gradients,
-            self.jitter,
-            self.sample_noise,
-        )[0]
+        own = self.has_gradients, self.jitter, self.sample_noise
+        return factorise(self.kernel, self.X, self.hyperparameters, *own)[0]
 
     def in_unit_box(self, X: ArrayLike) -> Array:
         """x̂ = (x - lower) / (upper - lower) of points (m, d); a single point (d,) is one row.

@@ -13,10 +13,10 @@ from surrogates.covariance import (
     Hyperparameters,
     Kernel,
     blocks,
+    covariance,
     observed_covariance,
     radial,
     separations,
-    with_noise,
 )
 from surrogates.interface import Array, SurrogateFitError
 
@@ -44,8 +44,10 @@ def factorise(
         SurrogateFitError: K is indefinite beyond a jitter of 1e-6 (contradictory
             repeated samples with no noise, or parameters that are not finite).
     """
+    lengths = parameters.length_scales
+    C = covariance(kernel, X, X, lengths, gradients_of_a=gradients, gradients_of_b=gradients)
     for jitter in (j for j in JITTERS if j >= least):
-        K = observed_covariance(kernel, X, parameters, gradients, jitter, sample_noise)
+        K = observed_covariance(C, len(X), parameters, jitter, sample_noise)
         try:
             return cholesky(K, lower=True, overwrite_a=True), jitter
         except (LinAlgError, ValueError):
@@ -78,7 +80,7 @@ def log_likelihood(
     squares = z * z
     phi = radial(kernel, squares.sum(axis=0), 3 if gradients else 1)
     C = blocks(z, phi, lengths, gradients, gradients)
-    K = with_noise(C, n, parameters, jitter, sample_noise)
+    K = observed_covariance(C, n, parameters, jitter, sample_noise)
     L = cholesky(K, lower=True, overwrite_a=True)
     alpha = cho_solve((L, True), targets)
     value = (

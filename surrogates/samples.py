@@ -114,24 +114,17 @@ def checked(
             raise SurrogateFitError("noise must not be negative")
     if not all(np.isfinite(a).all() for a in (points, values, slopes, deviations) if a is not None):
         raise SurrogateFitError("samples must be finite; drop the failed evaluations first")
-    low, high = _bounds(points, lower, upper)
+    still = np.flatnonzero(np.ptp(points, axis=0) == 0.0)
+    if still.size and (lower is None or upper is None):
+        raise SurrogateFitError(
+            f"input {still[0]} does not vary among the samples: give lower and upper, or leave it "
+            "out"
+        )
+    ends = points.min(axis=0), points.max(axis=0)
+    try:
+        low, high = box(ends[0] if lower is None else lower, ends[1] if upper is None else upper)
+    except ValueError as error:
+        raise SurrogateFitError(str(error)) from error
     if points.shape[1] != low.size:
         raise SurrogateFitError(f"expected X (n >= 2, {low.size}), got {points.shape}")
     return Samples(low, high, points, values, slopes, deviations)
-
-
-def _bounds(points: Array, lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[Array, Array]:
-    if lower is None or upper is None:
-        still = np.flatnonzero(np.ptp(points, axis=0) == 0.0)
-        if still.size:
-            raise SurrogateFitError(
-                f"input {still[0]} does not vary among the samples: give lower and upper, "
-                "or leave it out"
-            )
-    try:
-        return box(
-            points.min(axis=0) if lower is None else lower,
-            points.max(axis=0) if upper is None else upper,
-        )
-    except ValueError as error:
-        raise SurrogateFitError(str(error)) from error

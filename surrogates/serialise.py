@@ -83,21 +83,18 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[GaussianProcess, ...], dic
     if schema not in READABLE:
         raise SurrogateFileError(f"{path}: expected schema {SCHEMA!r}, found {schema!r:.60}")
     try:
-        members = [_member(record) for record in document["surrogates"]]
+        members = []
+        for record in document["surrogates"]:
+            body = dict(record)
+            if (kind := body.pop("kind")) != KIND:
+                raise ValueError(f"kind {kind!r:.60} is not {KIND}; fit it again")
+            members.append(_decode(GaussianProcess, body))
         extra = document["extra"]
         if not isinstance(extra, dict):
             raise TypeError("extra is not an object")
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise SurrogateFileError(f"{path}: damaged record ({error!r:.300})") from error
     return tuple(members), extra
-
-
-def _member(record: Any) -> Any:
-    body = dict(record)
-    kind = body.pop("kind")
-    if kind != KIND:
-        raise ValueError(f"kind {kind!r:.60} is not {KIND}; fit it again")
-    return _decode(GaussianProcess, body)
 
 
 def _decode(cls: Any, value: Any) -> Any:

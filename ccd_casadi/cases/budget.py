@@ -19,7 +19,7 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
 from ccd_casadi.cases import checks
-from ccd_casadi.cases.checks import Fail, short_repr
+from ccd_casadi.cases.checks import Fail, several, short_repr
 from ccd_casadi.cases.tables import BudgetTable
 
 # Unit -> factor of a density to SI, and whether the number is its square root.
@@ -35,16 +35,11 @@ MOST_ROWS = 20_000  # of a table
 PATH = ("mass", "damping", "stiffness")
 
 
-def _corner(value: Any) -> str | None:
-    parts = value if isinstance(value, list | tuple) else [value]
-    good = len(parts) in (1, 2) and all(checks.POSITIVE(part) is None for part in parts)
-    return None if good else "is none"
-
-
-CORNERS = checks.every(
-    checks.Check(_corner, {"type": ["number", "array"]}),
-    "give a list of Hz, or of [Hz, damping ratio], all above 0",
+_CORNER = checks.Check(
+    lambda value: "too many" if len(several(value)) > 2 else checks.one_or_more(value),
+    {"type": ["number", "array"]},
 )
+CORNERS = checks.every(_CORNER, "give a list of Hz, or of [Hz, damping ratio], all above 0")
 TABLE_CHECKS: dict[str, checks.Check] = {
     "name": checks.text,
     "unit": checks.text,
@@ -61,11 +56,9 @@ def checked_budget(table: BudgetTable, folder: Path, fail: Fail) -> BudgetTable:
     """The table with every entry checked and the files of spectra read into `psd`."""
     found: dict[str, tuple[Mapping[str, Any], ...]] = {}
     for kind in Kind:
-        given = getattr(table, kind.value)
-        several = given if isinstance(given, list | tuple) else (given,)
-        entries = []
-        for i, entry in enumerate(several, 1):
-            place = f"budget.{kind.value}" + (f" {i}" if len(several) > 1 else "")
+        given, entries = several(getattr(table, kind.value)), []
+        for i, entry in enumerate(given, 1):
+            place = f"budget.{kind.value}" + (f" {i}" if len(given) > 1 else "")
             entries.append(_checked(entry, kind, place, folder, fail))
         found[kind.value] = tuple(entries)
     if table.window_ms is not None and not any(found.values()):
@@ -129,10 +122,7 @@ def _source(entry: Mapping[str, Any], kind: Kind) -> Source:
 
 
 def _pairs(value: Any) -> tuple[tuple[float, ...], ...]:
-    return tuple(
-        tuple(map(float, item)) if isinstance(item, list | tuple) else (float(item),)
-        for item in value
-    )
+    return tuple(tuple(map(float, several(item))) for item in value)
 
 
 def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:

@@ -10,16 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.cases import checks
 from ccd_casadi.cases.budget import checked_budget
-from ccd_casadi.cases.checks import (
-    CaseError,
-    Fail,
-    Test,
-    check_of,
-    closest,
-    require_good,
-    short_repr,
-)
+from ccd_casadi.cases.checks import CaseError, Fail, short_repr
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.kinds import check_kind
 from ccd_casadi.cases.motion import check_motion
@@ -134,7 +127,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     known = ("plant", "theta", *TABLES)
     for name, table in data.items():
         if name not in known:
-            raise fail(name, f"unknown table{closest(name, known)}")
+            raise fail(name, f"unknown table{checks.closest(name, known)}")
         if not isinstance(table, Mapping):
             raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     for name in ("plant", "theta", *REQUIRED):
@@ -177,11 +170,11 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
 
 def table_of(kind: type, name: str, table: Mapping[str, Any], fail: Fail) -> Any:
     """A table as its dataclass, every key checked."""
-    checks: dict[str, Test] = {item.name: check_of(item) for item in fields(kind)}
+    tests: dict[str, checks.Test] = {item.name: checks.check_of(item) for item in fields(kind)}
     if kind is not ChannelTable:
-        whole = checks.keys() & set(_OF_THE_WHOLE)
-        checks |= {key: partial(_number_of_the_whole, checks[key]) for key in whole}
-    require_good(name, table, checks, fail)
+        whole = tests.keys() & set(_OF_THE_WHOLE)
+        tests |= {key: partial(_number_of_the_whole, tests[key]) for key in whole}
+    checks.require_good(name, table, tests, fail)
     values = {}
     for item in fields(kind):
         key = item.name
@@ -200,7 +193,7 @@ def table_of(kind: type, name: str, table: Mapping[str, Any], fail: Fail) -> Any
     return kind(**values)
 
 
-def _number_of_the_whole(check: Test, value: Any) -> str | None:
+def _number_of_the_whole(check: checks.Test, value: Any) -> str | None:
     return f"is {short_repr(value)}; {_PER_CHANNEL}" if isinstance(value, list) else check(value)
 
 
@@ -233,7 +226,9 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
                 f"{short_repr(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
             )
         if name not in names:
-            raise fail(f"{short_repr(name)} is not a parameter of the case{closest(name, names)}")
+            raise fail(
+                f"{short_repr(name)} is not a parameter of the case{checks.closest(name, names)}"
+            )
         if name in found:
             raise fail(f"{name} is given twice; give it once")
         try:

@@ -1,5 +1,6 @@
 """A case in SI: the co-design problem that the lower layers take."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from ccd_casadi.cases.budget import error_budget
@@ -55,13 +56,12 @@ def problem_of(case: Case) -> CoDesignProblem:
         name, function = case.plant.function.rsplit(":", 1)
         file = str((case.path.parent / name).resolve())
     structured = case.controller.structure == "sections"
-    options = tuple(sorted((key, _frozen(value)) for key, value in case.plant.options.items()))
     problem = CoDesignProblem(
         source=PlantSource(
             case.plant.model,
             file,
             function,
-            options,
+            _options(case.plant.options),
             case.limits.plant_seconds,
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
             motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
@@ -91,7 +91,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
         robust=None if structured else _robust(case.robust),
-        controller=structured_problem(case, _option_sets(case))
+        controller=structured_problem(case, tuple(map(_options, case.robust.plants)))
         if structured
         else MixedSensitivityProblem(),
         budget=error_budget(case.budget),
@@ -119,12 +119,9 @@ def problem_of(case: Case) -> CoDesignProblem:
     return problem
 
 
-def _option_sets(case: Case) -> tuple[Options, ...]:
-    """The options of every plant that [robust] names."""
-    return tuple(
-        tuple(sorted((key, _frozen(value)) for key, value in options.items()))
-        for options in case.robust.plants
-    )
+def _options(of: Mapping[str, Any]) -> Options:
+    """The options of a plant, in an order of their own, as values that never change."""
+    return tuple(sorted((key, _frozen(value)) for key, value in of.items()))
 
 
 def _robust(table: RobustTable) -> RobustSet | None:

@@ -51,7 +51,7 @@ def _list(items: Mapping[str, Any], least: int = 0, most: int | None = None) -> 
     return schema if most is None else schema | {"maxItems": most}
 
 
-def _several(value: Any) -> Any:
+def several(value: Any) -> Any:
     """A list as it is, another value as the only one of a list."""
     return value if isinstance(value, list | tuple) else [value]
 
@@ -116,7 +116,7 @@ table = _good(
 )
 tables = _good(
     {"anyOf": [{"type": "object"}, _list({"type": "object"})]},
-    lambda value: all(isinstance(item, Mapping) for item in _several(value)),
+    lambda value: all(isinstance(item, Mapping) for item in several(value)),
     "write a table, or several in double brackets",
 )
 
@@ -156,14 +156,24 @@ ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
 one_or_more = _good(
     {"anyOf": [POSITIVE.schema, _list(POSITIVE.schema, 1)]},
-    lambda value: bool(_several(value)) and all(POSITIVE(v) is None for v in _several(value)),
+    lambda value: bool(several(value)) and all(POSITIVE(v) is None for v in several(value)),
     "give a number above 0, or a list of them",
 )
-_pair = every(POSITIVE, "give two positive numbers [low, high] with low < high", 2, 2)
+_pair = every(POSITIVE, "", 2, 2)
+interval = _good(
+    _pair.schema,
+    lambda value: _pair(value) is None and value[0] < value[1],
+    "give two positive numbers [low, high] with low < high",
+)
 points = every(count(2), "give two whole numbers of at least 2", 2, 2)
 steps = every(FRACTION, "give a list of numbers between 0 and 1, both exclusive", 1)
 factors = every(POSITIVE, "give a list of numbers above 0")
 numbers = every(ANY, "give a list of numbers", 1)
+direction = _good(
+    numbers.schema,
+    lambda value: numbers(value) is None and any(value),
+    "give a list of numbers, one for each, that are not all 0",
+)
 listed = Check(numbers.test, _list(ANY.schema, 2))
 named = _good({"type": "string", "minLength": 1}, lambda v: bool(v) and isinstance(v, str), "")
 _named_or_table = Check(
@@ -183,23 +193,6 @@ places = every(
 )
 names_of_theta = every(named, "give a list of names of [theta] in quotes")
 numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
-
-
-def _interval(value: Any) -> str | None:
-    wrong = _pair(value)
-    if wrong is None and not value[0] < value[1]:
-        return f"is an empty range {short_repr(value)}; give [low, high] with low < high"
-    return wrong
-
-
-def _direction(value: Any) -> str | None:
-    wrong = numbers(value)
-    if wrong is not None:
-        return f"{wrong}, one for each"
-    return None if any(value) else f"is {short_repr(value)}; give numbers that are not all 0"
-
-
-interval, direction = Check(_interval, _pair.schema), Check(_direction, numbers.schema)
 
 
 def rows(width: int) -> Check:

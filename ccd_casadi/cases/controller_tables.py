@@ -4,17 +4,8 @@
 import math
 from dataclasses import dataclass
 
-from ccd_casadi.cases.checks import (
-    DAMPING,
-    FRACTION,
-    choice,
-    count,
-    direction,
-    key,
-    number,
-    steps,
-    table,
-)
+from ccd_casadi.cases import checks
+from ccd_casadi.cases.checks import key
 
 
 @dataclass(frozen=True)
@@ -30,23 +21,23 @@ class ChannelTable:
     """
 
     outputs: tuple[float, ...] | None = key(
-        "the channel's measurement as weights of the plant's outputs", None, check=direction
+        "the channel's measurement as weights of the plant's outputs", None, check=checks.direction
     )
     inputs: tuple[float, ...] | None = key(
         "the channel's force as weights of the plant's inputs; default: as outputs",
         None,
-        check=direction,
+        check=checks.direction,
     )
     like: str | None = key("another channel: both have one controller", None)
     integrator: bool | None = key("instead of [controller]'s", None)
     lead: int | None = key("instead of [controller]'s", None)
     biquads: int | None = key("instead of [controller]'s", None)
     roll_off: int | None = key("instead of [controller]'s", None)
-    least_damping: float | None = key("instead of [controller]'s", None, check=DAMPING)
+    least_damping: float | None = key("instead of [controller]'s", None, check=checks.DAMPING)
     S_max: float | None = key(
         "bound of the peak of this channel's S, tighter than the whole loop's in [inner]",
         None,
-        check=number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
+        check=checks.number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
     )
     M_K: float | None = key(
         "M_K of this channel's W_KS, lower than that of [weights]: its force counts more",
@@ -56,7 +47,7 @@ class ChannelTable:
     bandwidth_ratio: float = key(
         "least ratio of this channel's bandwidth to ω_b, which is that of the slowest channel",
         1.0,
-        check=number(
+        check=checks.number(
             1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True
         ),
     )
@@ -73,7 +64,7 @@ class ControllerTable:
     structure: str = key(
         "mixed sensitivity, the same with an input disturbance, or a fixed structure",
         "h_infinity",
-        check=choice("h_infinity", "h_infinity_disturbance", "sections"),
+        check=checks.choice("h_infinity", "h_infinity_disturbance", "sections"),
     )
     integrator: bool = key("sections: whether K has an integrator with a zero", True)
     lead: int = key("sections: number of first-order leads", 1)
@@ -85,11 +76,11 @@ class ControllerTable:
         "sections: bound of |W_KS KS| and |W_T T|; absent: no bound, which results report", None
     )
     least_damping: float = key(
-        "sections: least damping ratio of zeros and poles", 0.0, check=DAMPING
+        "sections: least damping ratio of zeros and poles", 0.0, check=checks.DAMPING
     )
-    starts: int = key("sections: number of starts of the search", 12, check=count(1))
+    starts: int = key("sections: number of starts of the search", 12, check=checks.count(1))
     channel: tuple[tuple[str, ChannelTable], ...] = key(
-        "tables [controller.channel.NAME] for plants with several outputs", (), check=table
+        "tables [controller.channel.NAME] for plants with several outputs", (), check=checks.table
     )
 
 
@@ -103,7 +94,7 @@ class LoopTable:
     delay_us: float = key(
         "delay from reading the sensor to the new force",
         0.0,
-        check=number(0.0, 1e6, "give 0 to 1e6", closed=True),
+        check=checks.number(0.0, 1e6, "give 0 to 1e6", closed=True),
     )
 
 
@@ -111,9 +102,9 @@ class LoopTable:
 class SamplingTable:
     """[sampling]: the plan over θ."""
 
-    design: str = key("sampling plan over θ", "grid", check=choice("grid", "sobol", "lhs"))
+    design: str = key("sampling plan over θ", "grid", check=checks.choice("grid", "sobol", "lhs"))
     points: int = key(
-        "number of θ: along each axis of a grid, in total for other plans", 5, check=count(2)
+        "number of θ: along each axis of a grid, in total for other plans", 5, check=checks.count(2)
     )
     lifted_points: int = key(
         "number of designs (θ, ω_S, ω_T) for lifted; 0: chosen by the program", 0
@@ -124,16 +115,16 @@ class SamplingTable:
 class OuterTable:
     """[outer]: starts, agreement of prediction and truth, rounds of refinement, global check."""
 
-    starts: int = key("starts of IPOPT on the surrogates", 16, check=count(1))
-    direct_starts: int = key("local solves on the true problem", 4, check=count(1))
+    starts: int = key("starts of IPOPT on the surrogates", 16, check=checks.count(1))
+    direct_starts: int = key("local solves on the true problem", 4, check=checks.count(1))
     tolerance: float = key(
-        "largest relative difference of prediction and truth", 1e-3, check=FRACTION
+        "largest relative difference of prediction and truth", 1e-3, check=checks.FRACTION
     )
     max_refinements: int = key("most rounds of adding true samples", 12)
     surrogate: str = key(
         'kernel of the Gaussian processes; "auto": the one with the least left-out error',
         "matern52",
-        check=choice("matern52", "rbf", "auto"),
+        check=checks.choice("matern52", "rbf", "auto"),
     )
     box_points: int = key(
         "number of θ over the box in the global check at the end; 0: no check", 32
@@ -146,12 +137,12 @@ class BaselineTable:
 
     first_resonance_hz: float = key("least first resonance of the sequential design", 250.0)
     steps: tuple[float, ...] = key(
-        "first steps of the descents, as shares of the box", (0.02, 0.05, 0.1), check=steps
+        "first steps of the descents, as shares of the box", (0.02, 0.05, 0.1), check=checks.steps
     )
     starts: int = key(
-        "starts of the descents: the case's own, then a Latin hypercube", 3, check=count(1)
+        "starts of the descents: the case's own, then a Latin hypercube", 3, check=checks.count(1)
     )
-    max_iterations: int = key("most iterations of a descent", 100, check=count(1))
+    max_iterations: int = key("most iterations of a descent", 100, check=checks.count(1))
 
 
 @dataclass(frozen=True)

@@ -128,19 +128,14 @@ def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
     return found
 
 
-def _clusters(modal: ModalPlant) -> list[np.ndarray]:
-    """Modes of one frequency, whose shapes are one space; the rigid ones are one."""
-    w, rigid = modal.natural, modal.rigid
-    same = (rigid[1:] & rigid[:-1]) | (~rigid[:-1] & (np.diff(w) <= HIDDEN * w[1:]))
-    return np.split(np.arange(len(w)), np.flatnonzero(~same) + 1)
-
-
 def _hidden(modal: ModalPlant, place: str) -> list[Finding]:
     """Directions of each eigenspace that no input drives, or no output measures (rank of B, C)."""
     D = np.abs(modal.D - np.diag(np.diag(modal.D)))
     coupled = (COUPLED * np.diag(modal.D).max() < D).any(axis=1)
-    found = []
-    for group in _clusters(modal):
+    w, rigid, found = modal.natural, modal.rigid, []
+    # modes of one frequency, whose shapes are one space; the rigid ones are one
+    same = (rigid[1:] & rigid[:-1]) | (~rigid[:-1] & (np.diff(w) <= HIDDEN * w[1:]))
+    for group in np.split(np.arange(len(w)), np.flatnonzero(~same) + 1):
         if coupled[group].any():
             continue  # a damper hands its motion on to others
         lacks = [
@@ -151,7 +146,7 @@ def _hidden(modal: ModalPlant, place: str) -> list[Finding]:
         if not lacks:
             continue
         missing = "not " + " and not ".join(lacks)
-        if modal.rigid[group[0]]:
+        if rigid[group[0]]:
             words = (
                 f"of {len(group)} rigid-body motions {place} one or more are {missing}: the "
                 "suspension alone holds them; add an input or output, or take them out of the model"
@@ -159,7 +154,7 @@ def _hidden(modal: ModalPlant, place: str) -> list[Finding]:
         else:
             formal = {"driven": "uncontrollable", "measured": "unobservable"}
             words = (
-                f"the mode at {modal.natural[group[0]] / HZ:.5g} Hz {place} is {missing} "
+                f"the mode at {w[group[0]] / HZ:.5g} Hz {place} is {missing} "
                 f"({', '.join(formal[name] for name in lacks)}): no controller damps it, and S "
                 "does not show it"
             )

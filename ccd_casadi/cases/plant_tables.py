@@ -7,28 +7,33 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.cases.checks import (
-    FRACTION,
-    USUAL,
-    Check,
-    Fail,
-    Test,
-    closest,
-    count,
-    names,
-    number,
-    short_repr,
-    too_large,
-)
-from ccd_casadi.cases.parameters import parameters_of
+from ccd_casadi.cases import checks
+from ccd_casadi.cases.checks import Check, Fail, short_repr
 from ccd_casadi.cases.tables import Parameter, PlantTable
 from ccd_casadi.plants.registry import OWN, model_named, model_names
 
 # Checks of a model's options that its builder's annotations do not say, by their names.
 _OPTIONS: dict[str, Check] = {
-    "zeta": FRACTION,
-    "poisson": number(0.0, 0.5, "give a number between 0 and 0.5"),
-    "modes": count(1),
+    "zeta": checks.FRACTION,
+    "poisson": checks.number(0.0, 0.5, "give a number between 0 and 0.5"),
+    "modes": checks.count(1),
+}
+MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
+
+# Every key of a [theta.NAME], what is asked of it, and what it says.
+KEYS: dict[str, tuple[Check, str]] = {
+    "lower": (checks.ANY, "least value, in `unit`"),
+    "upper": (checks.ANY, "largest value"),
+    "start": (checks.ANY, "start of searches; default: the middle"),
+    "unit": (checks.text, "unit, as the plant function takes it; shown in tables and on pages"),
+    "values": (checks.listed, "instead of bounds: a list of values, as in a catalogue"),
+    "integer": (checks.flag, "whole numbers between the bounds only; default false"),
+    "fixed": (checks.ANY, "instead of bounds: its value, which is not searched"),
+    "varies": (
+        checks.flag,
+        "with sections: true: not chosen; the loop holds at every value, as along a stroke; "
+        "`start` is the model",
+    ),
 }
 
 
@@ -42,7 +47,7 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
         raise fail("plant.model", words)
     known = model_named(model) if isinstance(model, str) else None
     if model is not None and known is None:
-        hint = closest(str(model), model_names())
+        hint = checks.closest(str(model), model_names())
         words = f"is {short_repr(model)}, not a known model{hint}; or use function"
         raise fail("plant.model", words)
     if function is not None:
@@ -52,15 +57,15 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
         function = f"{_absolute(path, parts[0], 'plant.function', fail)}:{parts[1]}"
     options = {key: value for key, value in table.items() if key not in ("model", "function")}
     takes = {} if known is None else dict(inspect.signature(known.build).parameters)
-    checks = {} if known is None else known.checks
+    own_checks = {} if known is None else known.checks
     for key, value in options.items():
         if not key.isidentifier():
             raise fail(f"plant.{key}", "is not a keyword; use a Python identifier")
         own = list(takes)[1:]
         if takes and key not in own:
-            raise fail(f"plant.{key}", f"is not an option of {model}{closest(key, own)}")
+            raise fail(f"plant.{key}", f"is not an option of {model}{checks.closest(key, own)}")
         usual = _check_of(takes[key]) if model in OWN else _option
-        wrong = checks.get(key, usual)(value)
+        wrong = own_checks.get(key, usual)(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)
     data = "" if known is None else known.data
@@ -82,16 +87,20 @@ def _absolute(case: Path, name: str, key: str, fail: Fail) -> str:
     raise fail(key, f"there is no {short_repr(name)}; give its path relative to the case file")
 
 
-def _check_of(option: inspect.Parameter) -> Test:
+def _check_of(option: inspect.Parameter) -> checks.Test:
     """What its name or its annotation in the builder asks of an option."""
-    usual = names if option.annotation == Sequence[str] else USUAL.get(option.annotation, _option)
+    usual = (
+        checks.names
+        if option.annotation == Sequence[str]
+        else checks.USUAL.get(option.annotation, _option)
+    )
     return _OPTIONS.get(option.name, usual)
 
 
 def _option(value: Any) -> str | None:
     if isinstance(value, float) and not math.isfinite(value):
         return f"is {value}; give a finite number"
-    if too_large(value):
+    if checks.too_large(value):
         return f"is {short_repr(value)}; write it as a float"
     if isinstance(value, list):
         return next(filter(None, map(_option, value)), None)
@@ -103,20 +112,75 @@ def _option(value: Any) -> str | None:
 def theta_tables(
     table: Mapping[str, Any], model: str | None, of_case: tuple[str, ...], fail: Fail
 ) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
-    """[theta.NAME] of every parameter, searched ones and fixed ones.
+    """[theta.NAME] of every parameter: searched ones; fixed ones, with those that vary.
 
     Those that a model of the package needs, those that [places] and [motor] name, and no other.
     """
-    searched, fixed = parameters_of(table, fail)
+    if not table:
+        raise fail("theta", "names no parameter; add a table [theta.NAME]")
+    found = [_parameter(name, entry, fail) for name, entry in table.items()]
+    if all(parameter.values or parameter.varies for parameter in found):
+        words = "has no parameter with a range: give one lower and upper, or ask inner for each"
+        raise fail("theta", words)
     known = model_named(model)
     own = None if known is None else known.theta
     needed = (*(own or ()), *of_case)
     for name in () if own is None else table:
         if name not in needed:
-            raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
+            raise fail(
+                f"theta.{name}", f"is not a parameter of {model}{checks.closest(name, needed)}"
+            )
     for name in needed:
         if name not in table:
             which = "[places] or [motor] names" if name in of_case else f"{model} needs"
             words = f"is missing; add a table [theta.{name}], which {which}"
             raise fail(f"theta.{name}", words)
-    return searched, fixed
+    free = tuple(p for p in found if len(p.values) != 1 and not p.varies)
+    return free, tuple(p for p in found if p not in free)
+
+
+def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
+    place = f"theta.{name}"
+    if not name.isidentifier():
+        raise fail(place, "is not an identifier; use letters, digits and _")
+    if not isinstance(entry, Mapping):
+        raise fail(place, f"is {short_repr(entry)}; write a table [theta.{name}]")
+    checks.require_good(place, entry, {key: check for key, (check, _) in KEYS.items()}, fail)
+    unit = entry.get("unit", "")
+    for key, others in (("fixed", ("values", "lower", "upper", "start", "integer", "varies")),
+                        ("values", ("lower", "upper", "integer", "varies")),
+                        ("integer", ("varies",))):  # fmt: skip
+        beside = [other for other in others if key in entry and other in entry]
+        if beside:
+            raise fail(f"{place}.{beside[0]}", f"has no place beside {key}; drop it")
+    if "fixed" in entry:
+        value = float(entry["fixed"])
+        return Parameter(name, value, value, value, unit, (value,))
+    values = tuple(sorted({float(value) for value in entry.get("values", ())}))
+    if "values" in entry and len(values) < 2:
+        raise fail(f"{place}.values", "needs two different numbers or more; or give fixed")
+    bounds = {"lower": values[0], "upper": values[-1]} if values else entry
+    for key in ("lower", "upper"):
+        if key not in bounds:
+            raise fail(f"{place}.{key}", "is missing; add it")
+    lower, upper = float(bounds["lower"]), float(bounds["upper"])
+    if lower > upper:
+        raise fail(f"{place}.lower", f"{lower:g} is above upper = {upper:g}; swap them")
+    if lower == upper or not math.isfinite(upper - lower):
+        words = f"{lower:g} to {upper:g} is not a range; widen it, or give fixed"
+        raise fail(f"{place}.lower", words)
+    start = float(entry.get("start", 0.5 * lower + 0.5 * upper))
+    if not lower <= start <= upper:
+        words = f"{start:g} is outside {lower:g} to {upper:g}; give a start within the bounds"
+        raise fail(f"{place}.start", words)
+    if entry.get("integer", False):
+        first, last = math.ceil(lower), math.floor(upper)
+        if last - first < 1 or last - first >= MOST_VALUES:
+            words = f"{lower:g} to {upper:g} holds {max(0, last - first + 1)} whole numbers"
+            raise fail(f"{place}.integer", f"{words}; give bounds with 2 to {MOST_VALUES}")
+        values = tuple(float(value) for value in range(first, last + 1))
+        lower, upper = values[0], values[-1]
+        start = min(max(start, lower), upper)
+    if len(values) > MOST_VALUES:
+        raise fail(f"{place}.values", f"has more than {MOST_VALUES}; give lower and upper instead")
+    return Parameter(name, lower, upper, start, unit, values, entry.get("varies", False))

@@ -6,14 +6,15 @@ checked, and the controller is certified again on the plant that the case file d
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
@@ -121,6 +122,31 @@ def read_run(folder: str | Path) -> FinishedRun:
     return FinishedRun(folder, case, problem, theta, plant, result=result, **found)
 
 
+def problem_at(
+    place: Path, theta: str | None
+) -> tuple[CoDesignProblem, tuple[float, ...] | None, FinishedRun | None]:
+    """Problem, θ and run of a finished run's folder; of a case file with θ in words or without one.
+
+    Raises UserError as `read_run` and `load_case` do, and for a run with another θ.
+    """
+    if place.is_dir():
+        run = read_run(place)
+        if theta is not None:
+            raise UserError(f"{place}: a run has its own theta; leave out --theta")
+        return run.problem, run.theta, run
+    case = load_case(place)
+    return problem_of(case), None if theta is None else parse_theta(case, theta), None
+
+
+@contextmanager
+def _damaged(place: str, words: str) -> Iterator[None]:
+    """Raise UserError in these words where the block finds that a file holds something else."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise UserError(f"{place}: {words}") from None
+
+
 def _read_mixed(
     folder: Path, problem: CoDesignProblem, theta: tuple[float, ...], result: Mapping[str, Any]
 ) -> dict[str, Any]:
@@ -177,20 +203,19 @@ def with_function(
     """
     if "anchors" not in result:
         return problem  # of an earlier version
-    try:
-        warm_starts = tuple(tuple(map(float, kappa)) for kappa in result["anchors"])
+    words = "anchors, robust.set and seed are not those of a solve; solve the case again"
+    with _damaged(str(path), words):
+        warm_starts, slower = (
+            tuple(tuple(map(float, kappa)) for kappa in result.get(name, ()))
+            for name in ("anchors", "error_anchors")
+        )
         scenarios = tuple(
             (int(item["option"]), tuple(map(float, item["point"])))
             for item in result["robust"]["set"]
         )
-        seed = int(result["seed"])
-        slower = tuple(tuple(map(float, k)) for k in result.get("error_anchors", ()))
-    except (KeyError, TypeError, ValueError):
-        words = "anchors, robust.set and seed are not those of a solve; solve the case again"
-        raise UserError(f"{path}: {words}") from None
-    own = len(structure_of(problem).names)
-    if any(len(kappa) != own for kappa in (*warm_starts, *slower)):
-        raise UserError(f"{path}: anchors: are of another structure; solve the case again")
+        seed, own = int(result["seed"]), len(structure_of(problem).names)
+        if any(len(kappa) != own for kappa in (*warm_starts, *slower)):
+            raise ValueError("of another structure")
     known = {"warm_starts": warm_starts, "error_warm_starts": slower}
     return with_range(with_structured(problem, **known, scenarios=scenarios, seed=seed))
 
@@ -199,13 +224,10 @@ def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tup
     """κ in SI of the controller.json of a folder. Raises UserError where it is of another kind."""
     path = folder / "controller.json"
     words = f"is not a list of the {len(structure.names)} parameters of the case's structure"
-    try:
+    with _damaged(f"{path}: sections.kappa", f"{words}; name a run of this case"):
         kappa = np.array(read_json(path)["sections"]["kappa"], dtype=np.float64)
-        good = kappa.shape == (len(structure.names),) and bool((np.abs(kappa) < 200.0).all())
-    except (KeyError, TypeError, ValueError, OverflowError):
-        good = False
-    if not good:
-        raise UserError(f"{path}: sections.kappa: {words}; name a run of this case")
+        if kappa.shape != (len(structure.names),) or not (np.abs(kappa) < 200.0).all():
+            raise ValueError("of another structure")
     return tuple(map(float, kappa))
 
 
@@ -217,7 +239,7 @@ def _with_directions(
     if not isinstance(table, Mapping) or "channels" not in table:
         return problem
     own = {channel.name: channel for channel in structured.channels}
-    try:
+    with _damaged(f"{path}: sections.channels", "names no directions; solve the case again"):
         channels = tuple(
             replace(
                 own.get(str(item["name"]), ChannelProblem(str(item["name"]), structured.structure)),
@@ -226,9 +248,6 @@ def _with_directions(
             )
             for item in table["channels"]
         )
-    except (KeyError, TypeError, ValueError):
-        words = "sections.channels: names no directions; solve the case again"
-        raise UserError(f"{path}: {words}") from None
     return with_structured(problem, channels=channels)
 
 
@@ -253,51 +272,39 @@ def read_json(path: Path) -> Mapping[str, Any]:
     return found
 
 
-def _number(path: Path, table: Mapping[str, Any], key: str) -> float:
-    value = table.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{path}: {key}: is not a number; solve the case again")
-    if value <= 0.0:
-        raise UserError(f"{path}: {key}: is not positive; solve the case again")
+def _number(
+    path: Path, table: Mapping[str, Any], key: str, low: float = 0.0, high: float = math.inf,
+    words: str = "is not a positive number",
+) -> float:  # fmt: skip
+    value = table.get(key.rpartition(".")[2])
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
+        raise UserError(f"{path}: {key}: {words}; solve the case again")
     return float(value)
 
 
 def _theta(path: Path, result: Mapping[str, Any], problem: CoDesignProblem) -> tuple[float, ...]:
-    table = result.get("theta")
+    table, values = result.get("theta"), []
     if not isinstance(table, dict) or set(table) != set(problem.names):
         words = f"does not name {', '.join(problem.names)} as case.toml does; solve the case again"
         raise UserError(f"{path}: theta: {words}")
-    values = []
     for name, low, high in zip(problem.names, problem.lower, problem.upper, strict=True):
-        value = table[name]
-        slack = 1e-9 * (high - low)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not low - slack <= value <= high + slack
-        ):
-            words = f"is outside the bounds {low:g} to {high:g} of case.toml; solve the case again"
-            raise UserError(f"{path}: theta.{name}: {words}")
-        values.append(float(value))
+        words, slack = (
+            f"is outside the bounds {low:g} to {high:g} of case.toml",
+            1e-9 * (high - low),
+        )
+        values.append(_number(path, table, f"theta.{name}", low - slack, high + slack, words))
     return tuple(values)
 
 
 def _controller(path: Path, plant: ScaledPlant) -> StateSpace:
     table, m, p = read_json(path), plant.B.shape[1], plant.C.shape[0]
-    found = {key: _matrix(path, table, key) for key in "ABCD"}
-    n = len(found["A"])
+    found: dict[str, Array] = {}
+    for key in "ABCD":
+        with _damaged(f"{path}: {key}", "is not a matrix; solve the case again"):
+            found[key] = np.array(table[key], dtype=float)
+            n = len(found["A"])
     for key, shape in {"A": (n, n), "B": (n, p), "C": (m, n), "D": (m, p)}.items():
-        if found[key].shape != shape:
-            words = f"is {found[key].shape}, not {shape} for this plant; solve the case again"
+        if found[key].shape != shape or not np.isfinite(found[key]).all():
+            words = f"is not a finite matrix {shape} for this plant; solve the case again"
             raise UserError(f"{path}: {key}: {words}")
-    return StateSpace(*(found[key] for key in "ABCD"))
-
-
-def _matrix(path: Path, table: Mapping[str, Any], key: str) -> Array:
-    try:
-        matrix = np.array(table[key], dtype=float)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: {key}: is not a matrix; solve the case again") from None
-    if matrix.ndim != 2 or matrix.size == 0 or not np.isfinite(matrix).all():
-        raise UserError(f"{path}: {key}: is not a finite matrix; solve the case again")
-    return matrix
+    return StateSpace(*found.values())

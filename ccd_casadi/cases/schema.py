@@ -12,7 +12,7 @@ from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
 from ccd_casadi.cases.checks import check_of, unit_of
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
-from ccd_casadi.cases.parameters import KEYS as THETA
+from ccd_casadi.cases.plant_tables import KEYS as THETA
 from ccd_casadi.cases.tables import REQUIRED, TABLES
 from ccd_casadi.cases.toml_writer import toml
 from ccd_casadi.plants.registry import model_names
@@ -68,18 +68,14 @@ def _table(kind: type) -> dict[str, Any]:
     return {
         "type": "object",
         "properties": found,
-        "required": [item.name for item in fields(kind) if _required(item)],
+        "required": [item.name for item in fields(kind) if item.default is MISSING],
         "additionalProperties": False,
     }
 
 
-def _required(item: Field[Any]) -> bool:
-    return item.default is MISSING
-
-
 def _row(item: Field[Any]) -> tuple[str, str, str, str]:
     default = "absent" if item.default in (None, ()) else toml(item.default)
-    default = "required" if _required(item) else default
+    default = "required" if item.default is MISSING else default
     names = ", ".join(map(toml, check_of(item).schema.get("enum", ())))
     says = item.metadata["says"] + (f" (one of {names})" if names else "")
     return item.name, default, unit_of(item), says

@@ -9,34 +9,8 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from ccd_casadi.cases.checks import (
-    ABOVE_ONE,
-    FRACTION,
-    NOT_NEGATIVE,
-    choice,
-    count,
-    factors,
-    interval,
-    key,
-    names_of_theta,
-    number,
-    numbers_of_modes,
-    places,
-    plant_options,
-    points,
-    rows,
-    signed,
-    tables,
-    text_or_rows,
-)
-from ccd_casadi.cases.controller_tables import (
-    BaselineTable,
-    ControllerTable,
-    LimitsTable,
-    LoopTable,
-    OuterTable,
-    SamplingTable,
-)
+from ccd_casadi.cases import checks, controller_tables
+from ccd_casadi.cases.checks import key
 from ccd_casadi.cases.motion import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import NotebookHtml
@@ -89,12 +63,12 @@ class ObjectiveTable:
 
     w1: float = key(
         "weight of the hardware cost f(θ) in J",
-        check=number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
+        check=checks.number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
     )
     w2: float = key(
         "weight of the bandwidth in J, negative, 1/(rad/s); of an RMS error or a move's time "
         "positive, 1/m or 1/s",
-        check=signed("give a negative number: J must reward bandwidth"),
+        check=checks.signed("give a negative number: J must reward bandwidth"),
     )
     cost_unit: str = key("unit of the hardware cost f(θ), for tables and pages", "")
 
@@ -105,16 +79,16 @@ class WeightsTable:
 
     M_S: float = key("W_S at high frequency is 1/M_S: the peak of S that the weight allows")
     A_S: float = key(
-        "W_S at zero frequency is 1/A_S: the S that the weight allows there", check=FRACTION
+        "W_S at zero frequency is 1/A_S: the S that the weight allows there", check=checks.FRACTION
     )
-    c_K: float = key("W_KS grows by this factor above omega_K", check=ABOVE_ONE)
+    c_K: float = key("W_KS grows by this factor above omega_K", check=checks.ABOVE_ONE)
     omega_K_hz: float = key("W_KS is 1/M_K below this frequency and grows above it")
     M_K: float = key(
         "gain of the controller that W_KS allows: about mass times (2π ω_b)²", unit="N/m"
     )
     A_l: float = key("W_T at zero frequency is 1/A_l")
     A_u: float = key(
-        "W_T at high frequency is 1/A_u: the T that the weight allows there", check=FRACTION
+        "W_T at high frequency is 1/A_u: the T that the weight allows there", check=checks.FRACTION
     )
     disturbance: float | None = key(
         '"h_infinity_disturbance": force that weighs as 1 m of reference; default 10 M_K',
@@ -129,40 +103,44 @@ class InnerTable:
 
     S_max: float = key(
         "bound of the peak of S, as a ratio: 2 is 6 dB",
-        check=number(
+        check=checks.number(
             1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral"
         ),
     )
-    S_low: float = key("bound of |S| at omega_low", check=FRACTION)
+    S_low: float = key("bound of |S| at omega_low", check=checks.FRACTION)
     omega_low_hz: float = key("where S_low holds")
-    omega_S_hz: tuple[float, float] = key("searched range of the frequency of W_S", check=interval)
+    omega_S_hz: tuple[float, float] = key(
+        "searched range of the frequency of W_S", check=checks.interval
+    )
     omega_T_hz: tuple[float, float] = key(
         "searched range of the frequency of W_T; sections: the lower end is that of W_T",
-        check=interval,
+        check=checks.interval,
     )
     gamma_backoff: float = key(
         "controllers are synthesised at this multiple of γ_opt",
         1.02,
-        check=number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"),
+        check=checks.number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"),
     )
     sweep_points: tuple[int, int] = key(
-        'grid of (omega_S, omega_T) for method "sweep", as in the paper', (20, 20), check=points
+        'grid of (omega_S, omega_T) for method "sweep", as in the paper',
+        (20, 20),
+        check=checks.points,
     )
     method: str = key(
         "find the best weights by a search with exact derivatives, or on a grid",
         "search",
-        check=choice("search", "sweep"),
+        check=checks.choice("search", "sweep"),
     )
     shape: float | None = key(
         "sections: |S| stays below this times (ω/ω_b)/√2 at every frequency; absent: 1.1",
         None,
-        check=number(1.0, 10.0, "give 1 to 10", closed=True),
+        check=checks.number(1.0, 10.0, "give 1 to 10", closed=True),
     )
     shape_ends: str = key(
         "with sections: the shape holds up to S_max, or up to ω_b only, which lets a narrow "
         "filter at ω_b buy bandwidth",
         ShapeEnd.S_MAX.value,
-        check=choice(*ShapeEnd),
+        check=checks.choice(*ShapeEnd),
     )
     compliance_max: float | None = key(
         "bound of the peak of GS, the displacement by a force at any frequency", None, unit="m/N"
@@ -171,7 +149,7 @@ class InnerTable:
         "with sections: the negative bandwidth, the RMS error of [budget], or the time of "
         "[move] until it has settled",
         "bandwidth",
-        check=choice("bandwidth", "rms_error", "move_time"),
+        check=checks.choice("bandwidth", "rms_error", "move_time"),
     )
     bandwidth_least_hz: float | None = key(
         'least bandwidth, where minimise is not "bandwidth"', None
@@ -205,27 +183,31 @@ class RobustTable:
     resonance_shift: float = key(
         "largest common shift of all flexible frequencies, as a share",
         0.0,
-        check=number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
+        check=checks.number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
     )
-    shifts: int = key("number of plants over that range (full-order kinds)", 5, check=count(2))
-    damping: tuple[float, ...] = key("factors of every modal damping, besides 1", (), check=factors)
+    shifts: int = key(
+        "number of plants over that range (full-order kinds)", 5, check=checks.count(2)
+    )
+    damping: tuple[float, ...] = key(
+        "factors of every modal damping, besides 1", (), check=checks.factors
+    )
     design_at: str = key(
         'plant of the range that a full-order controller is made for; "auto" tries all three',
         "auto",
-        check=choice("auto", "low", "nominal", "high"),
+        check=checks.choice("auto", "low", "nominal", "high"),
     )
     mode_shift: float = key(
         "sections: largest shift of each flexible mode by itself, as a share",
         0.0,
-        check=number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
+        check=checks.number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
     )
     gain: float = key(
         "sections: largest error of the plant's gain, as a share",
         0.0,
-        check=number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
+        check=checks.number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
     )
     plants: tuple[Any, ...] = key(
-        "sections: options of other plants, in TOML files or tables", (), check=plant_options
+        "sections: options of other plants, in TOML files or tables", (), check=checks.plant_options
     )
 
 
@@ -240,19 +222,22 @@ class PlacesTable:
         "places of the plant's inputs, each a unit force, in their order: a CSV file with a "
         "row of coordinates each after a header, or the rows",
         (),
-        check=text_or_rows,
+        check=checks.text_or_rows,
         unit="m",
     )
     actuators: tuple[tuple[float | str, ...], ...] = key(
-        "coordinates of each force: numbers, or names of [theta]", (), check=places, unit="m"
+        "coordinates of each force: numbers, or names of [theta]", (), check=checks.places, unit="m"
     )
     sensors: tuple[tuple[float | str, ...], ...] = key(
-        "coordinates of each sensor; absent: the plant's own outputs", (), check=places, unit="m"
+        "coordinates of each sensor; absent: the plant's own outputs",
+        (),
+        check=checks.places,
+        unit="m",
     )
-    actuator_mass: float = key("moves with each force", 0.0, check=NOT_NEGATIVE, unit="kg")
-    sensor_mass: float = key("moves with each sensor", 0.0, check=NOT_NEGATIVE, unit="kg")
+    actuator_mass: float = key("moves with each force", 0.0, check=checks.NOT_NEGATIVE, unit="kg")
+    sensor_mass: float = key("moves with each sensor", 0.0, check=checks.NOT_NEGATIVE, unit="kg")
     apart: float = key(
-        "least distance of two forces, and of two sensors", 0.0, check=NOT_NEGATIVE, unit="m"
+        "least distance of two forces, and of two sensors", 0.0, check=checks.NOT_NEGATIVE, unit="m"
     )
     axes: bool = key(
         "true: all forces and all sensors act together, an input and an output for each "
@@ -260,25 +245,29 @@ class PlacesTable:
         False,
     )
     quiet: tuple[int, ...] = key(
-        "with axes: flexible modes, from 1, that these leave alone", (), check=numbers_of_modes
+        "with axes: flexible modes, from 1, that these leave alone",
+        (),
+        check=checks.numbers_of_modes,
     )
     damped: tuple[int, ...] = key(
-        "with axes: flexible modes, from 1, each with its own axis", (), check=numbers_of_modes
+        "with axes: flexible modes, from 1, each with its own axis",
+        (),
+        check=checks.numbers_of_modes,
     )
     reference: tuple[tuple[float, ...], ...] = key(
         "3 or (with twist) 4 points of a plane: inputs are loads, outputs displacements there",
         (),
-        check=rows(2),
+        check=checks.rows(2),
         unit="m",
     )
     present: tuple[str, ...] = key(
         "with either: a [theta] for each actuator, 1 where it is there, else 0",
         (),
-        check=names_of_theta,
+        check=checks.names_of_theta,
     )
     choose: int = key("how many of these are there at most", 0)
     actuator_cost: float = key(
-        "hardware cost of each force that is there, in its unit", 0.0, check=NOT_NEGATIVE
+        "hardware cost of each force that is there, in its unit", 0.0, check=checks.NOT_NEGATIVE
     )
 
 
@@ -290,14 +279,18 @@ class BudgetTable:
     """
 
     window_ms: float | None = key("window of the moving average and the moving deviation", None)
-    force: tuple[Mapping[str, Any], ...] = key("spectra of forces on the stage", (), check=tables)
+    force: tuple[Mapping[str, Any], ...] = key(
+        "spectra of forces on the stage", (), check=checks.tables
+    )
     floor_motion: tuple[Mapping[str, Any], ...] = key(
-        "spectra of the floor's motion", (), check=tables
+        "spectra of the floor's motion", (), check=checks.tables
     )
     sensor_noise: tuple[Mapping[str, Any], ...] = key(
-        "spectra of the sensor's noise", (), check=tables
+        "spectra of the sensor's noise", (), check=checks.tables
     )
-    setpoint: tuple[Mapping[str, Any], ...] = key("spectra of the setpoint", (), check=tables)
+    setpoint: tuple[Mapping[str, Any], ...] = key(
+        "spectra of the setpoint", (), check=checks.tables
+    )
 
 
 @dataclass(frozen=True)
@@ -313,13 +306,13 @@ class Case(NotebookHtml):
     suspension: SuspensionTable
     places: PlacesTable
     robust: RobustTable
-    controller: ControllerTable
-    loop: LoopTable
+    controller: controller_tables.ControllerTable
+    loop: controller_tables.LoopTable
     budget: BudgetTable
-    sampling: SamplingTable
-    outer: OuterTable
-    baseline: BaselineTable
-    limits: LimitsTable
+    sampling: controller_tables.SamplingTable
+    outer: controller_tables.OuterTable
+    baseline: controller_tables.BaselineTable
+    limits: controller_tables.LimitsTable
     motor: MotorTable
     move: MoveTable
     fixed: tuple[Parameter, ...] = ()

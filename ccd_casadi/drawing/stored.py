@@ -12,7 +12,7 @@ from typing import Any
 from ccd_casadi.drawing.content import Page
 from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.plain_values import plain, restored
+from ccd_casadi.support.json_files import plain, restored
 from surrogates.files import write_whole
 
 NAME = "report.json"

@@ -56,6 +56,12 @@ class Curves:
         """Of the loop: it has no step, no move and no margins."""
         return not self.poles[2].real.max() < 0.0
 
+    @property
+    def unstable_controller_hz(self) -> list[float]:
+        """Unstable poles of K by itself, a pair once, ascending."""
+        K = self.poles[1]
+        return sorted(np.abs(K[(K.real > 1e-9 * np.abs(K)) & (K.imag >= 0.0)]).tolist())
+
 
 @dataclass(frozen=True)
 class AsSampled:

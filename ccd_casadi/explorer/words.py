@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.drawing.content import Lines, Modes
-from ccd_casadi.drawing.page import escape
-from ccd_casadi.drawing.paint import block_html
+from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -26,25 +25,8 @@ def standing_html(
     """
     known = beside is not None and np.isfinite(beside[1])
     return template("explorer/assets/standing.html", number=number, HZ=HZ).render(
-        look=look, beside=beside if known else None,
-        survival="" if curves is None else survival_words(curves),
-        sampled="" if sampled is None else sampled_words(sampled, look.problem.inner.S_max),
+        look=look, beside=beside if known else None, curves=curves, sampled=sampled,
     )  # fmt: skip
-
-
-def survival_words(curves: Curves) -> str:
-    """The margins of the loop that is drawn, and whether its controller is stable by itself."""
-    m, unstable = curves.view.margins, curves.poles[1]
-    unstable = unstable[(unstable.real > 1e-9 * np.abs(unstable)) & (unstable.imag >= 0.0)]
-    gain = f"gain × {number(m.gain_down, 3)} to {number(m.gain_up, 3)}"
-    margins = "the loop drawn is unstable: no margins" if curves.unstable else (
-        f"the loop drawn is stable for {gain}; phase margin {number(m.phase_deg, 3)}°, delay "
-        f"margin {number(1e6 * m.delay, 3)} µs"
-    )  # fmt: skip
-    if not unstable.size:
-        return f"{margins}; K by itself is stable"
-    at = ", ".join(number(float(hz), 4) for hz in np.sort(np.abs(unstable))[:3])
-    return f"{margins}; K by itself is UNSTABLE (poles at {at} Hz)"
 
 
 def move_words(curves: Curves | None) -> str:
@@ -52,18 +34,6 @@ def move_words(curves: Curves | None) -> str:
     if curves is None or curves.unstable:
         return ""
     return f"the default one of robustness, {curves.move.words}"
-
-
-def sampled_words(sampled: AsSampled, S_max: float) -> str:
-    """What hold and delay make of the loop; they are no part of an H∞ synthesis."""
-    if not sampled.stable:
-        return "Run at this rate and delay the loop is NOT stable (hold and delay exact)."
-    over = 100.0 * (sampled.peak / S_max - 1.0)
-    return (
-        "Run at this rate and delay (exact, dash-dotted, not designed for it): ω_b = "
-        f"{number(sampled.bandwidth_hz, 4)} Hz, ‖S‖∞ = {number(sampled.peak, 4)}, {over:+.2g} % of "
-        "S_max."
-    )
 
 
 def machine_html(look: Look, start: Sequence[float], reference: float) -> str:

@@ -15,7 +15,7 @@ from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
-from ccd_casadi.plants.registry import data_option, model_named
+from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.user_code import require_user_code, with_time_limit
 
@@ -60,8 +60,8 @@ class PlantSource:
         """What determines the plant; a file counts by its content, not by where it lies."""
         digest = self.pinned().content
         options = dict(self.options)
-        data = data_option(self.model)
-        if data:
+        model = model_named(self.model)
+        if data := model.data if model else "":
             digest = _digest(Path(str(options.pop(data, ""))))
         return {
             "model": self.model,
@@ -119,7 +119,7 @@ def _built(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant
     else:
         function = fixed_model(_own_function(source), held)
         return user_plant(function, names, dict(source.options), lower, upper)
-    return with_fixed(plant, held) if held else plant
+    return with_fixed(plant, held)
 
 
 def _below(

@@ -31,7 +31,18 @@ def in_axes(
     PlantError where the points do not tell them apart.
     """
     A, dA = W.T @ motions, dW.transpose(0, 2, 1) @ motions + W.T @ dmotions
-    Q, dQ = (part[..., quiet:] for part in _orthonormal(A, dA))
+    Q, R = np.linalg.qr(A)
+    if np.abs(np.diag(R)).min() < 1e-9 * np.abs(np.diag(R)).max():
+        words = "places: forces or sensors are on one line, or a quiet or damped mode is not seen"
+        raise PlantError(f"{words} where they are; move one, or drop the mode")
+    sign = np.where(np.diag(R) < 0.0, -1.0, 1.0)
+    Q, R = Q * sign, sign[:, None] * R
+    # with the positive diagonal of R that makes Q one: dQ = Q Ω + (I - Q Qᵀ) dA R⁻¹
+    step = dA @ np.linalg.inv(R)
+    turn = Q.T @ step
+    lower = np.tril(turn, -1)
+    dQ = Q @ (lower - lower.transpose(0, 2, 1)) + step - Q @ turn
+    Q, dQ = Q[:, quiet:], dQ[..., quiet:]
     return W @ Q, dW @ Q + W @ dQ
 
 
@@ -74,17 +85,3 @@ def followed_modes(
         own = 0.5 * (dM @ modes[:, i]) @ modes[:, i]
         slopes[:, :, k] = (moved @ modes / gap) @ modes.T - own[:, None] * modes[:, i]
     return modes[:, at], slopes
-
-
-def _orthonormal(A: Array, dA: Array) -> tuple[Array, Array]:
-    """Q of A = Q R with a positive diagonal of R, and its slopes: dQ = Q Ω + (I - Q Qᵀ) dA R⁻¹."""
-    Q, R = np.linalg.qr(A)
-    if np.abs(np.diag(R)).min() < 1e-9 * np.abs(np.diag(R)).max():
-        words = "places: forces or sensors are on one line, or a quiet or damped mode is not seen"
-        raise PlantError(f"{words} where they are; move one, or drop the mode")
-    sign = np.where(np.diag(R) < 0.0, -1.0, 1.0)
-    Q, R = Q * sign, sign[:, None] * R
-    step = dA @ np.linalg.inv(R)
-    turn = Q.T @ step
-    lower = np.tril(turn, -1)
-    return Q, Q @ (lower - lower.transpose(0, 2, 1)) + step - Q @ turn

@@ -7,7 +7,7 @@ the step, is the cross-check: their difference bounds the error from above.
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -32,6 +32,7 @@ REMEMBERED = 256  # values of the function kept: matrices and hardware cost ask 
 WRONG = 0.1  # relative disagreement of two difference formulas from which a derivative is wrong
 LEAP = 1e-2  # of a matrix: what its values differ by over one step where they leap
 NOISE = 1e-4  # of a matrix over the box: a derivative below it is none
+OFFSETS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # steps, of the points about θ
 AGREEMENT = 1e-9  # relative; a function gives the same numbers for numbers and for symbols
 
 
@@ -48,8 +49,8 @@ def user_plant(
     box: `math.sqrt` or `float` of a symbol is silently nan. Raises what `build_plant` raises where
     the model takes neither symbols nor numbers.
     """
-    numeric = DifferencedModel(model, names, options, lower, upper)
-    middle = 0.5 * (np.asarray(lower) + np.asarray(upper))
+    box = np.array([lower, upper], float)
+    numeric, middle = DifferencedModel(model, tuple(names), options, *box), box.mean(axis=0)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # CasADi's notice on NumPy functions
@@ -90,24 +91,28 @@ class _Values:
         return Mechanics(M, D, K, B, C, self._ratio, none)  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True, eq=False)
 class DifferencedModel:
     """A numeric model as θ -> Mechanics with derivatives by differences; the box scales the steps.
 
     Raises PlantError where the model returns no plant, or one of another shape than before.
     """
 
-    def __init__(
-        self,
-        model: ModelFunction,
-        names: Sequence[str],
-        options: Mapping[str, Any],
-        lower: Sequence[float],
-        upper: Sequence[float],
-    ) -> None:
-        self._model, self._options = model, dict(options)
-        self.names = tuple(names)
-        self.lower, self.upper = np.array(lower, float), np.array(upper, float)
-        self._read = lru_cache(maxsize=REMEMBERED)(self._call)
+    model: ModelFunction
+    names: tuple[str, ...]
+    options: Mapping[str, Any]
+    lower: Array
+    upper: Array
+
+    @cached_property
+    def _read(self) -> Callable[[tuple[float, ...]], _Values]:
+        """What the model returns; the last ones are kept."""
+
+        @lru_cache(maxsize=REMEMBERED)
+        def read(theta: tuple[float, ...]) -> _Values:
+            return _Values(self.model(dict(zip(self.names, theta, strict=True)), **self.options))
+
+        return read
 
     def plant(self, reason: str) -> Plant:
         """The plant of the model; `reason` says why its function cannot be traced."""
@@ -123,13 +128,12 @@ class DifferencedModel:
             count,
             middle.scalars.size,
             lambda unit: self._at(inside(unit)).scalars,
-            lambda unit: self.scalar_slopes(inside(unit)) * width,
+            lambda unit: self._slopes(inside(unit), lambda item: (item.scalars,))[0][0].T * width,
             hessians=True,
         )
         theta = ca.MX.sym("theta", count)
         both = callback((theta - self.lower) / width)
         lam = both[1:] if middle.scalars.size > 1 else ca.MX(0, 1)
-        self._keep = callback  # CasADi holds no reference to it
         short = " ".join(reason.split())[:120]
 
         def notes(theta: Sequence[float]) -> tuple[str, ...]:
@@ -150,6 +154,7 @@ class DifferencedModel:
             values=self.values,
             notes=notes,
             doubt=self.doubt,
+            callback=callback,
         )
 
     def __call__(self, theta: Sequence[float] | Array) -> Mechanics:
@@ -162,8 +167,8 @@ class DifferencedModel:
                 raise PlantError(f"{words}, in its place")
             return item.system.matrices
 
-        M, D, K, B, C = self._slopes(theta, parts, 4)
-        jump = self._disagreement(theta, WRONG, LEAP)
+        M, D, K, B, C = (fine for fine, _ in self._slopes(theta, parts))
+        jump = self._disagreement(theta, LEAP)
         if jump:  # a value leaps between neighbouring points, not only bends
             raise PlantError(jump)
         return replace(here, derivatives=(M, D, K, B, C))
@@ -171,10 +176,6 @@ class DifferencedModel:
     def values(self, theta: Sequence[float] | Array) -> Mechanics:
         """M, D, K, B, C at θ, with derivatives to no parameter."""
         return self._at(theta).system
-
-    def scalar_slopes(self, theta: Array) -> Array:
-        """∂(f, λ)/∂θ, one row a scalar."""
-        return self._slopes(theta, lambda item: (item.scalars,), 4)[0].T
 
     def error(self, theta: Sequence[float] | Array) -> float:
         """The largest difference of both formulas, over the largest derivative of its matrix."""
@@ -184,12 +185,12 @@ class DifferencedModel:
 
     def doubt(self, theta: Sequence[float] | Array) -> str:
         """Which derivative is wrong at θ, and the usual cause; empty where both formulas agree."""
-        return self._disagreement(theta, WRONG, 0.0)
+        return self._disagreement(theta, 0.0)
 
-    def _disagreement(self, theta: Sequence[float] | Array, share: float, leap: float) -> str:
-        """The worst derivative whose two formulas differ by `share` of it, and over a step by
+    def _disagreement(self, theta: Sequence[float] | Array, leap: float) -> str:
+        """The worst derivative whose two formulas differ by `WRONG` of it, and over a step by
         `leap` of the matrix."""
-        worst, words = share, ""
+        worst, words = WRONG, ""
         for k, i, gap, slope, size in self._gaps(theta):
             floor = max(slope, NOISE * size)
             if not gap > worst * floor or STEP * gap <= leap * size:
@@ -219,48 +220,38 @@ class DifferencedModel:
 
         width = self.upper - self.lower
         sizes = [float(np.abs(part).max(initial=0.0)) for part in parts(self._at(theta))]
-        pairs = zip(self._slopes(theta, parts, 4), self._slopes(theta, parts, 2), strict=True)
-        for k, ((fine, coarse), size) in enumerate(zip(pairs, sizes, strict=True)):
+        pairs = zip(self._slopes(theta, parts), sizes, strict=True)
+        for k, ((fine, coarse), size) in enumerate(pairs):
             over_box = width.reshape(-1, *[1] * (fine.ndim - 1))
             slope = float(np.abs(fine * over_box).max(initial=0.0))
             for i, gap in enumerate(np.abs((fine - coarse) * over_box)):
                 yield k, i, float(gap.max(initial=0.0)), slope, size
 
     def _slopes(
-        self,
-        theta: Sequence[float] | Array,
-        parts: Callable[[_Values], tuple[Array, ...]],
-        order: int,
-    ) -> list[Array]:
-        """Derivatives of every part, a leading axis over θ; `order` 4, or 2 with twice the step."""
+        self, theta: Sequence[float] | Array, parts: Callable[[_Values], tuple[Array, ...]]
+    ) -> list[tuple[Array, Array]]:
+        """Derivatives of every part, a leading axis over θ, by five points, and by three of them
+        with twice the step."""
         point = np.asarray(theta, float)
         base = parts(self._at(point))
         rows: list[list[Array]] = []
         for i, width in enumerate(self.upper - self.lower):
             h = STEP * width
             centre = np.clip(point[i], self.lower[i] + 2.0 * h, self.upper[i] - 2.0 * h)
-            offsets = np.array([-2.0, -1.0, 0.0, 1.0, 2.0] if order == 4 else [-2.0, 0.0, 2.0])
-            away = (point[i] - centre) / h
-            weights = _derivative_weights(offsets, away) / h
-            found = []
-            for offset in offsets:
+            away, weights, found = (point[i] - centre) / h, np.zeros((2, len(OFFSETS))), []
+            for row, every in zip(weights, (1, 2), strict=True):
+                powers = np.arange(len(OFFSETS[::every]))
+                # row k: ((x - at)^k), of which only k = 1 slopes
+                system = (OFFSETS[::every] - away) ** powers[:, None]
+                row[::every] = np.linalg.solve(system, (powers == 1) / h)
+            for offset in OFFSETS:
                 moved = point.copy()
                 moved[i] = point[i] if offset == away else centre + offset * h
                 found.append(parts(self._at(moved)))
             # The weights sum to zero: without the value at θ a constant has no slope at all.
             pairs = zip(zip(*found, strict=True), base, strict=True)
             rows.append([np.tensordot(weights, np.array(c) - b, 1) for c, b in pairs])
-        return [np.array(column) for column in zip(*rows, strict=True)]
+        return [tuple(np.stack(column, axis=1)) for column in zip(*rows, strict=True)]
 
     def _at(self, theta: Sequence[float] | Array) -> _Values:
         return self._read(tuple(float(value) for value in theta))
-
-    def _call(self, theta: tuple[float, ...]) -> _Values:
-        return _Values(self._model(dict(zip(self.names, theta, strict=True)), **self._options))
-
-
-def _derivative_weights(offsets: Array, at: float) -> Array:
-    """Weights of f at `offsets` whose sum is the interpolating polynomial's derivative at `at`."""
-    powers = np.arange(offsets.size)
-    system = (offsets - at) ** powers[:, None]  # row k: ((x - at)^k), of which only k = 1 slopes
-    return np.linalg.solve(system, (powers == 1).astype(float))

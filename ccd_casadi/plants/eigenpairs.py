@@ -103,20 +103,11 @@ def flexible_modes(pencil: Pencil, rigid: Array, count: int) -> tuple[Array, Arr
 
     # a fixed start: the same θ gives the same digits
     start = inverse(np.random.default_rng(0).standard_normal(pencil.size))
-    M = operator(pencil.mass)
     ncv = min(pencil.size, max(18, 2 * count + 1))
+    how = {"v0": start, "ncv": ncv, "maxiter": 500, "tol": 1e-11, "OPinv": operator(inverse)}
+    M = operator(pencil.mass)
     try:
-        mu, V = eigsh(
-            M,
-            k=count,
-            M=M,
-            sigma=0.0,
-            OPinv=operator(inverse),
-            v0=start,
-            ncv=ncv,
-            maxiter=500,
-            tol=1e-11,
-        )
+        mu, V = eigsh(M, k=count, M=M, sigma=0.0, **how)
     except Exception as error:
         raise StageError(f"the stage's eigen-solve failed ({error}); check theta") from error
     order = np.argsort(mu)

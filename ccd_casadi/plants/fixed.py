@@ -1,6 +1,4 @@
-"""A plant with some of its parameters at given values: the rest of θ is free; and a builder's own
-order of θ beside the order that a case gives it in.
-"""
+"""A plant with some of its parameters at given values, and the others in a given order."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +9,8 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
-from ccd_casadi.support.arrays import Array
+
+REMEMBERED = 64  # θ whose matrices are kept
 
 
 def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:
@@ -25,31 +24,11 @@ def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFuncti
     return of_free
 
 
-class Reparametrised:
-    """Free θ -> Mechanics of a plant at all of θ, with the derivatives to the free ones.
-
-    `place` is where the free parameters are in the whole θ, whose others are those of `whole`.
-    """
-
-    def __init__(self, evaluate: Evaluate, place: Sequence[int], whole: Array) -> None:
-        self.evaluate, self.place, self._whole = evaluate, list(place), whole
-
-    def own(self, theta: Sequence[float]) -> tuple[float, ...]:
-        """The whole θ, in the plant's own order."""
-        out = self._whole.copy()
-        out[self.place] = theta
-        return tuple(out.tolist())
-
-    def __call__(self, theta: Sequence[float]) -> Mechanics:
-        found = self.evaluate(self.own(theta))
-        if not len(found.derivatives[0]):  # values alone
-            return found
-        M, D, K, B, C = (array[self.place] for array in found.derivatives)
-        return replace(found, derivatives=(M, D, K, B, C))
-
-
-def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
-    """The plant as a function of the parameters that `fixed` does not name.
+def with_fixed(
+    plant: Plant, fixed: Mapping[str, float], names: Sequence[str] | None = None
+) -> Plant:
+    """The plant as a function of the parameters that `fixed` does not name, in their order or that
+    of `names`.
 
     >>> from ccd_casadi.plants.plant import build_plant, mechanics
     >>> from ccd_casadi.plants.two_mass import two_mass
@@ -58,21 +37,35 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
     >>> one.names, mechanics(one, (50.0,)).M.diagonal().tolist()
     (('m2',), [60.0, 50.0])
     """
-    place = [i for i, name in enumerate(plant.names) if name not in fixed]
+    names = [name for name in plant.names if name not in fixed] if names is None else names
+    if tuple(names) == plant.names:
+        return plant
+    place = [plant.names.index(name) for name in names]
     whole = np.array([fixed.get(name, np.nan) for name in plant.names])
 
-    def of(evaluate: Evaluate) -> Reparametrised:
-        return Reparametrised(evaluate, place, whole)
+    def own(theta: Sequence[float]) -> tuple[float, ...]:
+        """The whole θ, in the plant's own order."""
+        out = whole.copy()
+        out[place] = theta
+        return tuple(out.tolist())
 
-    own = of(plant.evaluate)
-    free = ca.MX.sym("theta", len(place))
-    entries = iter(ca.vertsplit(free))
-    theta = [fixed[name] if name in fixed else next(entries) for name in plant.names]
-    domain = plant.domain
+    def of(evaluate: Evaluate) -> Evaluate:
+        def at(theta: Sequence[float]) -> Mechanics:
+            found = evaluate(own(theta))
+            if not len(found.derivatives[0]):  # values alone
+                return found
+            M, D, K, B, C = (array[place] for array in found.derivatives)
+            return replace(found, derivatives=(M, D, K, B, C))
+
+        return at
+
+    free, domain = ca.MX.sym("theta", len(place)), plant.domain
+    known: dict[str, Any] = {**fixed, **dict(zip(names, ca.vertsplit(free), strict=True))}
+    theta = ca.vertcat(*(known[name] for name in plant.names))
     return reparametrised(
-        plant, of, own.own,
-        names=tuple(plant.names[i] for i in place),
-        hardware=ca.Function("hardware", [free], plant.hardware.call([ca.vertcat(*theta)])),
+        plant, of, own,
+        names=tuple(names),
+        hardware=ca.Function("hardware", [free], plant.hardware.call([theta])),
         domain=None if domain is None else (domain[0][place], domain[1][place]),
     )  # fmt: skip
 
@@ -101,20 +94,9 @@ def reparametrised(
     return replace(plant, **(seen | others))
 
 
-REMEMBERED = 64  # θ whose matrices are kept
-
-
-class Ordered(Reparametrised):
-    """θ in the order of `names` -> Mechanics, of `mechanics(θ in the order `own`, derivatives)`."""
-
-    keep: object = None  # what has to live as long
-
-    def __init__(
-        self,
-        mechanics: Callable[[tuple[float, ...], bool], Mechanics],
-        own: Sequence[str],
-        names: Sequence[str],
-        derivatives: bool = True,
-    ) -> None:
-        evaluate = lru_cache(maxsize=REMEMBERED)(lambda theta: mechanics(theta, derivatives))
-        super().__init__(evaluate, [list(own).index(name) for name in names], np.zeros(len(own)))
+def remembered(
+    mechanics: Callable[[tuple[float, ...], bool], Mechanics], derivatives: bool = True
+) -> Evaluate:
+    """θ -> `mechanics(θ, derivatives)`, of which the last ones are kept."""
+    kept = lru_cache(maxsize=REMEMBERED)(mechanics)
+    return lambda theta: kept(tuple(map(float, theta)), derivatives)

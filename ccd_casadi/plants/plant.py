@@ -90,6 +90,8 @@ class Plant:
         Known θ -> a cheaper `evaluate`, true there and nearly so beside them.
     shapes, drawing : callable, optional
         (θ, count) -> the lowest flexible modes for pictures; several θ by name -> a drawing.
+    callback : object
+        What `hardware` calls, to which CasADi holds no reference.
     """
 
     names: tuple[str, ...]
@@ -107,6 +109,7 @@ class Plant:
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
     drawing: Callable[[Mapping[str, Sequence[float]]], Figure] | None = None
+    callback: object = None
 
     @cached_property
     def slopes(self) -> ca.Function:
@@ -174,7 +177,14 @@ def model_parts(
 ) -> tuple[tuple[Any, ...], float | None, dict[str, Any]]:
     """M, D, K, B, C as matrices of CasADi's `kind`, the damping ratio, and f and λ by name, of what
     a model returns. Raises PlantError where that is no plant."""
-    _check_keys(result)
+    missing = [key for key in _REQUIRED if key not in result]
+    if missing:
+        raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
+    unknown = sorted(set(result) - _KNOWN)
+    if unknown:
+        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
+    if ("damping" in result) == ("damping_ratio" in result):
+        raise PlantError("the plant model must return either damping or damping_ratio; give one")
     M, K, B, C = (kind(result[key]) for key in ("mass", "stiffness", "input", "output"))
     n = M.shape[0]
     for key, size in {"mass": n, "input": B.shape[1], "output": C.shape[0]}.items():
@@ -193,18 +203,6 @@ def model_parts(
         if value.shape != (1, 1):
             raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
     return (M, D, K, B, C), None if ratio is None else float(ratio), scalars
-
-
-def _check_keys(result: Mapping[str, Any]) -> None:
-    """Raise PlantError unless a model's result has the keys of a plant and no others."""
-    missing = [key for key in _REQUIRED if key not in result]
-    if missing:
-        raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
-    unknown = sorted(set(result) - _KNOWN)
-    if unknown:
-        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
-    if ("damping" in result) == ("damping_ratio" in result):
-        raise PlantError("the plant model must return either damping or damping_ratio; give one")
 
 
 def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
@@ -254,11 +252,7 @@ def nearby_model(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[
     """θ -> Mechanics from what is known: the plant's own way, or to first order around `here`."""
     if plant.nearby is not None and known:
         return plant.nearby(known)
-    return first_order(mechanics(plant, here), here)
-
-
-def first_order(system: Mechanics, here: Sequence[float]) -> Evaluate:
-    """θ -> Mechanics around `here`."""
+    system = mechanics(plant, here)
     return lambda theta: to_first_order(system, np.array(theta) - np.array(here))
 
 

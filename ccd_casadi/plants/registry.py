@@ -51,12 +51,6 @@ def _own(name: str) -> Model:
     return Model(sampled_matrices, data="folder")
 
 
-def data_option(name: str | None) -> str:
-    """The option of that model that names its data; empty where there is none."""
-    found = model_named(name)
-    return "" if found is None else found.data
-
-
 @cache
 def _offered() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group=GROUP)}

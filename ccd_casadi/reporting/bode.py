@@ -10,10 +10,11 @@ from ccd_casadi.analysis.loop_view import LoopView, phase_deg
 from ccd_casadi.deployment.channels import LoopChannel
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY
-from ccd_casadi.reporting.loops import bandwidth_level, margin_words, of_plants, over_hz
+from ccd_casadi.reporting.facts import paragraph
+from ccd_casadi.reporting.loops import bandwidth_level, of_plants, over_hz
 from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number, with_unit
+from ccd_casadi.support.units import HZ, number
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
@@ -38,7 +39,8 @@ def bode(loop: LoopView, channels: Sequence[LoopChannel] = ()) -> Figure:
         ))  # fmt: skip
     title = "Bode plots of the loop, the plant and the controller"
     lines = Lines(tuple(rows), title, (3.0, 2.9, 2.3)[: len(rows)])
-    return Figure(lines, _caption(loop, channels))
+    gain = np.linalg.norm(loop.controller, 2, axis=(1, 2))
+    return Figure(lines, paragraph("report.bode", loop, channels, gain))
 
 
 def loop_panels(
@@ -170,38 +172,5 @@ def _marks(loop: LoopView, gains: Array) -> list[Mark]:
     return found
 
 
-def _caption(loop: LoopView, channels: Sequence[LoopChannel]) -> str:
-    scalar = loop.plant.shape[1:] == (1, 1)
-    what = "" if scalar else (
-        "Every channel by itself; the signs are those of the outputs that it moves together. "
-        if len(channels) > 1
-        else "All singular values of plant and controller. "
-    )  # fmt: skip
-    poles, zeros = (_list(p) for p in (loop.resonances_hz, loop.antiresonances_hz))
-    up, down = (" (▲)", " (▼)") if len(channels) < 2 else ("", "")
-    if scalar:
-        what = f"Crossover and, in green, the margins of L.{margin_words(loop)} "
-    words = f"{what}Resonances{up} of the plant: {poles}; anti-resonances{down}: {zeros}."
-    gain = float(np.linalg.norm(loop.controller[0], 2))
-    K = np.linalg.norm(loop.controller, 2, axis=(1, 2))
-    i = int(K.argmax())
-    words += (
-        f" The controller's gain is {with_unit(gain, 'N/m')} at {number(float(loop.hz[0]), 3)} Hz "
-        f"and at most {with_unit(float(K[i]), 'N/m')}, at {number(float(loop.hz[i]), 4)} Hz."
-    )
-    below = [hz for hz in loop.antiresonances_hz if hz > loop.bandwidth_hz]
-    if below:
-        ratio = loop.bandwidth_hz / below[0]
-        words += f" The bandwidth is {100.0 * ratio:.0f} % of the first anti-resonance above it."
-    return words
-
-
 def _singular_values(response: NDArray[np.complex128]) -> Array:
     return np.asarray(np.linalg.svd(response, compute_uv=False), dtype=float)
-
-
-def _list(places: Sequence[float]) -> str:
-    if not places:
-        return "none"
-    shown = ", ".join(number(hz, 4) for hz in places[:12])
-    return f"{shown}{' …' if len(places) > 12 else ''} Hz"

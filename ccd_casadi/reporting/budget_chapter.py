@@ -10,7 +10,8 @@ from ccd_casadi.drawing.svg import BLACK, CYCLE
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.units import display_unit, number, with_unit
+from ccd_casadi.reporting.facts import paragraph
+from ccd_casadi.support.units import display_unit
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
 DECADES = 3.5  # of the error's axis
@@ -43,24 +44,8 @@ def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
         rows.append((item.source.name, kind, scale * item.error, share, *moving, item.force))
     moving = (scale * model.average, scale * model.deviation) if windowed else ()
     rows.append(("together", "", scale * model.error, 100.0, *moving, model.force))
-    words = "The error of the true position, r - y"
-    words += " at the samples" if found.hold is not None else ""
-    if found.plants > 1:
-        words += (
-            f", on the model; on the {found.plants} plants of the set at most "
-            f"{with_unit(found.largest_error, 'm', 4)} and {number(found.largest_force, 4)} N"
-        )
-    if windowed:
-        words += (
-            f". MA and MSD: moving average and moving standard deviation over "
-            f"{number(1e3 * (model.window or 0.0))} ms"
-        )
-    filters = "Filters by Lyapunov's equation; the integral over frequency differs by {} (relative)"
-    tables = "Tables by quadrature, relative error {} by its own estimate"
-    for shaped, sentence in ((True, filters), (False, tables)):
-        off = [item.disagreement for item in model.sources if item.source.shaped == shaped]
-        words += f". {sentence.format(number(max(off), 1))}" if off else ""
-    return Words(words + "."), Table(tuple(head), tuple(rows))
+    words = paragraph("report.budget_table", found, model)
+    return Words(words), Table(tuple(head), tuple(rows))
 
 
 def _figure(model: BudgetFigures) -> Figure:
@@ -82,8 +67,4 @@ def _figure(model: BudgetFigures) -> Figure:
     panel = Panel("frequency (Hz)", f"RMS error up to it ({unit})", (*curves, total), log_x=True,
                   log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top))  # fmt: skip
     lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
-    words = (
-        "Dynamic error budget: the RMS error up to each frequency, by source; the squares of the "
-        "curves add up to that of the black one. A source acts where its curve rises."
-    )
-    return Figure(lines, words)
+    return Figure(lines, paragraph("report.budget"))

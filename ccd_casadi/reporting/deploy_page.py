@@ -1,11 +1,12 @@
 """report.html of a deployment: full, reduced and sampled loop, orders, sections."""
 
+from typing import Any
+
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.c_code import COMPILE
-from ccd_casadi.deployment.discretise import Conversion
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.sections import Root, sections_of
@@ -18,7 +19,7 @@ from ccd_casadi.lti.closed_loop import sensitivity, sigma_max
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.facts import run_name, theta_words
+from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.structured_page import structured_table
@@ -48,7 +49,7 @@ def deploy_page(
     if moved is not None:
         chapters.append(c.Chapter("A move on the machine", move_blocks(moved)))
     chapters += [
-        c.Chapter("Sampling rate", (_rates(found),)),
+        c.Chapter("Sampling rate", _words("rate", found)),
         c.Chapter("Orders", tuple(block for item in found.orders for block in _orders(item, run))),
         c.Chapter("As sections",
                 tuple(block for item in found.orders for block in _sections(item, run))),
@@ -93,12 +94,8 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
     bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
     title = f"Sensitivity and controller over frequency: {', '.join(k.label for k in drawn)}"
-    ends = (f"{with_unit(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
-    caption = (
-        "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
-        "up to half the sampling rate. The gain of the controller there amplifies sensor noise and "
-        f"unmodelled resonances. It is {', '.join(ends)}."
-    )
+    ends = ", ".join(f"{with_unit(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
+    caption = paragraph("deployment.loop", ends)
     return c.Figure(c.Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption)
 
 
@@ -106,11 +103,7 @@ def _facts(run: FinishedRun, found: Deployment) -> tuple[c.Block, ...]:
     rows = figure_rows(run, found)
     rows.append(("Slowest sampled mode", number(found.sampled.spectral_radius, 8), "below 1"))
     unstable = [r for r in np.linalg.eigvals(found.reduced.A) if r.real > 0.0]
-    words = (
-        "The controller is unstable by itself (its loop is not): close the loop at rest, and open "
-        "it when the actuator saturates."
-    )
-    return (c.Facts(tuple(rows)), *([c.Words(words)] if unstable else []))
+    return c.Facts(tuple(rows)), *(_words("unstable") if unstable else ())
 
 
 def _step(run: FinishedRun, found: Deployment) -> c.Figure:
@@ -127,23 +120,14 @@ def _step(run: FinishedRun, found: Deployment) -> c.Figure:
     return c.Figure(c.Lines(((panel,),), "Step of the reference", (3.0,)), caption)
 
 
-def _rates(found: Deployment) -> c.Words:
-    hz = "no rate" if found.needed_hz is None else f"{number(found.needed_hz, 4)} Hz"
-    if found.conversion is Conversion.TUSTIN:
-        return c.Words(f"The loop was designed for {hz} with Tustin's rule, hold and delay in it.")
-    lead = (
-        " The lead filter makes up for the phase of hold and delay, and raises the gain at half "
-        "the sampling rate."
-    )
-    return c.Words(
-        f"From {hz} on the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay included "
-        f"({found.conversion.value}).{lead if found.conversion is Conversion.LEAD else ''}"
-    )
+def _words(part: str, *known: Any) -> tuple[c.Words, ...]:
+    """Of a macro of `templates/deployment.txt`."""
+    return tuple(map(c.Words, paragraphs(f"deployment.{part}", *known)))
 
 
 def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     if item.designed is not None:
-        return (_of(item, f"{item.chosen.order} states, as designed."),)
+        return _words("orders", item)
     head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
     rows = tuple(
         (row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
@@ -151,41 +135,23 @@ def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
          f.outcome.value if not f.certified else "chosen" if row is item.chosen else "")
         for row in item.rows for f in [row.figures]
     )  # fmt: skip
-    words = (
-        f"{item.chosen.order} of {item.rows[0].order} states are enough "
-        f"({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
-        f"above twice its bound; {item.strict.order} keep S_max itself."
-    )
-    return _of(item, words), c.Table(head, rows)
-
-
-def _of(item: ChannelOrders, words: str) -> c.Words:
-    """Words about a channel, which is named where there are several."""
-    alone = item.channel.name == "all"
-    words = f"{words[0].upper()}{words[1:]}" if alone else f"Channel {item.channel.name}: {words}"
-    return c.Words(words)
+    return *_words("orders", item), c.Table(head, rows)
 
 
 def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[c.Block, ...]:
     K = item.chosen.controller
     if K.D.shape != (1, 1):
-        words = "This controller does not fall apart into scalar channels: no sections."
-        return (c.Words(words),)
+        return _words("no_sections")
     if item.designed is not None:
         structure, kappa = item.designed
-        words = f"gain {with_unit(gain_of(kappa), 'N/m', 4)}; the sections as they were designed."
-        return _of(item, words), structured_table(section_words(structure, kappa))
+        words = _words("designed", item.channel, gain_of(kappa))
+        return *words, structured_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), number(s.depth_db, 4)) for s in found.sections
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
-    words = (
-        f"gain {with_unit(found.gain, 'N/m', 4)} at s = 0, "
-        f"{with_unit(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at "
-        "s = 0. A negative ζ, or a negative frequency of a single root, is in the right half plane."
-    )
-    return _of(item, words), c.Table(head, rows)
+    return *_words("sections", item.channel, found), c.Table(head, rows)
 
 
 def _root(root: Root | None) -> tuple[str, str]:
@@ -195,15 +161,4 @@ def _root(root: Root | None) -> tuple[str, str]:
 
 
 def _code(found: Deployment) -> tuple[c.Block, ...]:
-    K = found.realisation
-    sizes = f"{K.blocks.count(1)} of one state, {K.blocks.count(2)} of two"
-    larger = len(K.blocks) - K.blocks.count(1) - K.blocks.count(2)
-    words = (
-        f"controller.c holds {len(K.system.A)} states, A block-diagonal ({sizes}"
-        f"{f', {larger} larger' if larger else ''}). Call controller_step every "
-        f"{number(1e6 * K.system.period, 6)} µs. controller_test.c compares it with forces that "
-        "the Python difference equation gave; controller.st is the same as structured text "
-        "(IEC 61131-3). controller_takeover starts without a jump, controller_forward gives the "
-        "feedforward of a setpoint:"
-    )
-    return c.Words(words), c.Source(f"{COMPILE}\n./controller_test")
+    return *_words("code", found.realisation), c.Source(f"{COMPILE}\n./controller_test")

@@ -10,10 +10,10 @@ from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.loops import S_panel, margin_words
+from ccd_casadi.reporting.facts import paragraph
+from ccd_casadi.reporting.loops import S_panel
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
-from ccd_casadi.support.units import counted, number
 
 HEIGHT = 3.0  # inches of a row
 
@@ -23,28 +23,18 @@ def glance(
 ) -> Chapter:
     """Of a design on the plants that it is made for."""
     assert isinstance(move.drawing, Lines)
-    S_max, several = problem.inner.S_max, len(view.open) > 1
+    S_max = problem.inner.S_max
     names = ("the model", "other plants") if view.scalar else ("an eigenvalue of L", "the others")
     rows: tuple[tuple[Place, ...], ...] = (
         (machine(problem, theta), S_panel(view)),
-        (nyquist_panel(view.hz, loci(view), S_max, HEIGHT, names), move.drawing.rows[-2][0]),
+        (
+            nyquist_panel(view.hz, loci(view), problem.inner.S_max, HEIGHT, names),
+            move.drawing.rows[-2][0],
+        ),
     )
     peak = float(view.sizes[0].max())
-    on = (
-        f", and its loop on {counted(len(view.open), 'plant')} of the set (blue: the model; band, "
-        "green: the others)" if several else ""
-    )  # fmt: skip
-    words = (
-        f"The machine at this design{on}. S stays out of the shaded area: its peak, "
-        f"{number(peak, 4)}, is {100.0 * peak / S_max:.4g} % of S_max, so that "
-        f"{'L' if view.scalar else 'every eigenvalue of L'} stays at least {number(1.0 / peak, 3)} "
-        f"from -1 in the Nyquist plot.{margin_words(view)} {move.caption}"
-    )
-    if isinstance(rows[0][0], Table):
-        words += (
-            " In the table of modes, driven is how strongly the actuators excite a mode and "
-            "measured how strongly the sensors see it, relative to the largest."
-        )
+    table = isinstance(rows[0][0], Table)
+    words = paragraph("report.glance", view, peak, S_max, move.caption, table)
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
     return Chapter("At a glance", (Figure(lines, words, (*tables_of(lines), move.tables[0])),))
 

@@ -11,10 +11,17 @@ from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
-from ccd_casadi.inner_problem.figure import BANDWIDTH
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.reporting.facts import cost_axis, cost_words, run_name, theta_axes, theta_words
-from ccd_casadi.reporting.front_walk import front_walk
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.reporting.facts import (
+    cost_axis,
+    cost_words,
+    paragraph,
+    paragraphs,
+    run_name,
+    theta_axes,
+    theta_words,
+)
+from ccd_casadi.reporting.glance import machine
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
 from ccd_casadi.reporting.structured_page import binding_words
@@ -22,7 +29,7 @@ from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, display_unit, number
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
-RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
+MOST = 12  # designs along the front that are drawn
 
 
 def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: str = "") -> c.Page:
@@ -30,7 +37,7 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     problem = run.problem
     bandwidth_hz = bandwidth_of(run) / HZ
     cost = float(run.result["hardware_cost"])
-    rule = rule_sentence(bandwidth_hz, natural_hz(run))
+    (rule,) = paragraphs("insight.rule", bandwidth_hz, natural_hz(run))
     verified = sum(point.verified for point in front.points)
     whole = verified == len(front.points)
     head = head_of(
@@ -46,15 +53,18 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     v = problem.figure
     own = v.factor * float(run.result.get(f"{v.entry}_of_set", bandwidth_of(run)))
     if len(front.points) == 1:
-        walk: tuple[c.Block, ...] = (c.Words(_caption(front)), _table(problem, front))
+        words = paragraphs("insight.front", front)
+        walk: tuple[c.Block, ...] = (*map(c.Words, words), _table(problem, front))
     else:
         drawn = front_figure(problem, front, (cost, own, "this run's design"))
-        walk = (drawn, *front_walk(run, front))
-    changes: list[c.Block] = [c.Words(text) for text in response_sentences(responses)]
-    changes.append(table_responses(problem, responses))
+        walk = (drawn, _walk(run, front))
+    changes: tuple[c.Block, ...] = (
+        *map(c.Words, paragraphs("insight.responses", responses)),
+        table_responses(problem, responses),
+    )
     chapters = (
         c.Chapter(f"Weight against {v.words}", walk),
-        c.Chapter("What each parameter of the case would change", tuple(changes)),
+        c.Chapter("What each parameter of the case would change", changes),
         c.Chapter("What limits the bandwidth", _limits(run, rule)),
     )
     return c.Page(head, chapters, index)
@@ -63,12 +73,8 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
 def _limits(run: FinishedRun, rule: str) -> tuple[c.Block, ...]:
     """The shares of γ; of a fixed structure, which has no γ, the bounds that hold it."""
     if run.result.get("gamma") is None:
-        held = binding_words(run.problem, run.result)
-        without = (
-            "A fixed structure has no γ, and no weights' frequencies to move: what holds ω_b are "
-            "the bounds above."
-        )
-        return c.Bullets(tuple(held)), c.Words(without), c.Words(rule)
+        held = c.Bullets(tuple(binding_words(run.problem, run.result)))
+        return held, *map(c.Words, (*paragraphs("insight.structured"), rule))
     return limit_blocks(run_view(run), rule)
 
 
@@ -102,45 +108,39 @@ def front_figure(
     )
     title = f"Hardware cost against {v.words} as the weights of J change, and the hardware there"
     lines = c.Lines(((top,), (bottom,)), title, (3.3, 2.8))
-    return c.Figure(lines, _caption(front), (_table(problem, front),))
-
-
-def _caption(front: Front) -> str:
-    """How many points, how well they are known, and what lies between them."""
-    verified = sum(point.verified for point in front.points)
-    if len(front.points) == 1:
-        return f"One point, {front.syntheses} true syntheses: the lightest design and the best."
-    between = (
-        "Local solves found no weights that lead to a design between two of them."
-        if front.whole
-        else "More points are possible between them (--points)."
-    )
-    return (
-        f"{verified} of {len(front.points)} points verified by the true inner problem, "
-        f"{front.syntheses} true syntheses. Each is the optimum of J for some weights: none found "
-        f"is lighter and better. {between}"
-    )
+    return c.Figure(lines, paragraph("insight.front", front), (_table(problem, front),))
 
 
 def front_answer(problem: CoDesignProblem, front: Front) -> str:
     """What the front says of weight against what J counts, in one sentence."""
-    efficient = [point for point in front.points if point.verified]
-    unit, v = problem.cost_unit, problem.figure
-    costs = [f"{number(p.hardware_cost)} {unit}".strip() for p in efficient]
-    values = [v.shown(p.value) for p in efficient]
-    if not efficient:
-        return "No point of the front is verified."
-    if len(efficient) == 1:
-        words = "There is nothing to trade: the design of least hardware cost"
-        best = "is also the fastest" if v is BANDWIDTH else f"has the least {v.words} too"
-        return f"{words}, {costs[0]}, {best}, {values[0]}."
-    light, fast = efficient[0], efficient[-1]
-    rate = v.factor * (fast.value - light.value) / (fast.hardware_cost - light.hardware_cost)
-    name = f"{v.words[0].upper()}{v.words[1:]}" if v is BANDWIDTH else f"Less {v.words}"
-    return (
-        f"{name} costs hardware: from {costs[0]} with {values[0]} to {costs[-1]} with "
-        f"{values[-1]}, on average {number(rate, 3)} {v.unit} for every {unit or 'unit of f'}."
-    )
+    return paragraphs("insight.answer", problem, front)[0]
+
+
+def _walk(run: FinishedRun, front: Front) -> c.Steps:
+    """The designs along a front, the machine of each behind a slider: lightest to fastest."""
+    problem, points = run.problem, front.points
+    chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
+    shown = [points[i] for i in chosen]
+    steps = []
+    for point in shown:
+        theta = dict(zip(problem.names, point.theta, strict=True))
+        named = theta_words({"theta": theta, "units": problem.parameter_units})
+        words = paragraph("insight.point", point, problem, named)
+        drawn = c.Lines(((_machine(problem, point.theta), None),), "A design of the front")
+        steps.append((words, drawn))
+    own = float(run.result["hardware_cost"])
+    first = int(np.argmin([abs(point.hardware_cost - own) for point in shown]))
+    return c.Steps(tuple(steps), first, "lightest to heaviest")
+
+
+def _machine(problem: CoDesignProblem, theta: Sequence[float]) -> c.Place:
+    drawing = plant_of(problem).drawing
+    if drawing is None:
+        return machine(problem, theta)
+    shown = drawing({"": theta}).drawing
+    if isinstance(shown, c.Lines):
+        return shown.rows[0][0]
+    return None if isinstance(shown, c.Landscape) else shown
 
 
 def _table(problem: CoDesignProblem, front: Front) -> c.Table:
@@ -195,41 +195,3 @@ def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float
         unit, factor = display_unit(problem.units[problem.names.index(variable)], value)
         return name, factor * value, factor, unit
     return name, value, 1.0, ""
-
-
-def response_sentences(found: PostOptimal) -> list[str]:
-    """What the table means, and where it ends."""
-    words = [
-        "Per unit of the parameter in the case file's unit, for the whole re-optimised design: "
-        "dJ*/dp and how ω_b, f and θ move with it. Parameters that are not listed change nothing."
-    ]
-    if not found.determined:
-        words.append(
-            "The second-order conditions do not determine how the design moves (dependent "
-            "constraints, no strict minimum, or second derivatives that are not known), so only "
-            "dJ*/dp is given."
-        )
-    if found.weak:
-        words.append(
-            f"{', '.join(found.weak)} is only touched: beyond it the responses are one-sided."
-        )
-    return words
-
-
-def rule_sentence(bandwidth_hz: float, natural_hz: Sequence[float]) -> str:
-    """The rule of thumb, first resonance 3 to 5 times the bandwidth, against what was achieved."""
-    if not natural_hz:
-        return "The plant has no flexible mode: the rule of thumb says nothing about it."
-    first = min(natural_hz)
-    ratio = first / bandwidth_hz
-    low, high = RULE
-    place, what_then = "within", ""
-    if ratio < low:
-        place, what_then = "below", ": check the robustness to that resonance"
-    elif ratio > high:
-        place, what_then = "above", ": by that rule it could be faster"
-    return (
-        f"The first resonance, {number(first, 4)} Hz, is {number(ratio, 3)} times the bandwidth, "
-        f"{place} the {low:g} to {high:g} of the rule of thumb{what_then}. By the rule this stage "
-        f"would get {number(first / high, 3)} to {number(first / low, 3)} Hz."
-    )

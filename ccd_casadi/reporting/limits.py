@@ -8,7 +8,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.drawing.content import Block, Table, Words
-from ccd_casadi.support.units import number
+from ccd_casadi.reporting.facts import paragraphs
 
 PARTS = ("|S|", "|KS|", "|T|")
 
@@ -39,29 +39,19 @@ def table_limits(loop: LoopView) -> Table:
 def limit_sentences(loop: LoopView) -> list[str]:
     """What holds ω_b, and what stands where S is largest."""
     found = shares(loop, loop.bandwidth_hz)
-    order = np.argsort(found)[::-1]
-    first, second = (f"{PARTS[i]} is at {100 * found[i]:.0f} %" for i in order[:2])
-    words = [
-        f"At ω_b = {number(loop.bandwidth_hz, 4)} Hz {first} of its bound γ/|W|, and limits "
-        f"the loop; {second} of its own."
-    ]
-    tops = [peak for peak in loop.peaks if peak[1] > 1.05]
-    if tops:
-        hz, gain = max(tops, key=lambda peak: peak[1])
+    held = [(PARTS[i], found[i]) for i in np.argsort(found)[::-1]]
+    top = max(
+        (peak for peak in loop.peaks if peak[1] > 1.05), key=lambda peak: peak[1], default=None
+    )
+    near = []
+    if top is not None:
         kinds = {"resonance": loop.resonances_hz, "transmission zero": loop.antiresonances_hz}
         near = [
-            f"the plant's nearest {kind} is at {number(nearest, 4)} Hz"
-            for kind, places in kinds.items()
-            for nearest in sorted(places, key=lambda f: abs(np.log(f / hz)))[:1]
-        ]
-        top = f"S is largest, {number(gain, 4)}, at {number(hz, 4)} Hz"
-        words.append("; ".join(filter(None, (top, " and ".join(near)))) + ".")
-    below = [f for f in loop.resonances_hz if f < loop.bandwidth_hz]
-    close = [f for f in loop.resonances_hz if loop.bandwidth_hz <= f < 2.0 * loop.bandwidth_hz]
-    if below or close:
-        listed = ", ".join(number(f, 4) for f in (*below, *close))
-        words.append(f"Controlled resonances, below twice the bandwidth: {listed} Hz.")
-    return words
+            (kind, min(places, key=lambda f: abs(np.log(f / top[0]))))
+            for kind, places in kinds.items() if places
+        ]  # fmt: skip
+    controlled = [f for f in loop.resonances_hz if f < 2.0 * loop.bandwidth_hz]
+    return paragraphs("report.limits", loop, held, top, near, controlled)
 
 
 def limit_blocks(loop: LoopView, *more: str) -> tuple[Block, ...]:

@@ -12,8 +12,9 @@ from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, 
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
+from ccd_casadi.support.units import HZ, display_unit, number, with_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
@@ -166,15 +167,7 @@ def compliance_panel(view: LoopView) -> Panel:
 
 def margin_words(view: LoopView) -> str:
     """Of one channel on the model; empty of several."""
-    if not view.scalar:
-        return ""
-    m = view.margins
-    on = "On the model the" if len(view.open) > 1 else "The"
-    return (
-        f" {on} gain may fall to {number(m.gain_down, 3)} or rise to {number(m.gain_up, 3)} times; "
-        f"the phase margin is {number(m.phase_deg, 3)}° and the delay margin "
-        f"{number(1e6 * m.delay, 3)} µs."
-    )
+    return paragraph("report.margins", view)
 
 
 def forbidden(
@@ -215,33 +208,10 @@ def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:
 
 def gains(view: LoopView) -> Figure:
     """S, KS and T of one design with their words."""
-    return Figure(figure_gains([view]), _caption(view))
-
-
-def _caption(view: LoopView) -> str:
-    """What to see, in numbers."""
-    S_max, plants = view.bounded.S_max, len(view.open)
-    tops = _high_peaks(view)
-    words = ""
-    if tops:
-        (hz, gain), on = tops[0], " on the model" if plants > 1 else ""
-        words = (
-            f" The highest peak of S{on} is {number(gain, 5)} at {number(hz, 4)} Hz, "
-            f"{100.0 * gain / S_max:.2f} % of S_max = {S_max:g}"
-        )
-        others = [f"{number(g, 3)} at {number(h, 4)} Hz" for h, g in tops[1:3]]
-        words += f"; further local peaks {', '.join(others)}." if others else "."
-    band = f"The band spans {counted(plants, 'plant')} of the set. " if plants > 1 else ""
-    first = (
-        f"The least ω_b of them is {number(view.bandwidth_hz, 5)} Hz." if plants > 1
-        else f"{view.named('S')} first crosses -3 dB at ω_b = {number(view.bandwidth_hz, 5)} Hz."
-    )  # fmt: skip
     near = [
-        f"{view.named(name)} reaches {100.0 * share[i]:.4g} % of {view.bounded.words[k]} at "
-        f"{number(float(view.hz[i]), 3)} Hz"
+        (view.named(name), 100.0 * share[i], view.bounded.words[k], float(view.hz[i]))
         for k, (name, share) in enumerate(zip(NAMES, view.shares, strict=True))
         if np.isfinite(share).any()
         for i in [int(np.nanargmax(share))]
     ]
-    closest = f" {'; '.join(near)}." if near else ""
-    return f"{band}{first}{words}{closest} Shaded: beyond a bound."
+    return Figure(figure_gains([view]), paragraph("report.gains", view, _high_peaks(view), near))

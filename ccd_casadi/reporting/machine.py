@@ -14,6 +14,7 @@ from ccd_casadi.drawing.turntable import REACH
 from ccd_casadi.plants.facts import modes_of
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.package_text import template
 from ccd_casadi.support.units import HZ, number
@@ -112,29 +113,10 @@ def modes_table(modal: ModalPlant) -> Table:
 
 def mode_shape_figure(shapes: ModeShapes) -> Figure:
     """The modes with their frequencies in Hz, to be turned."""
-    return Figure(Modes(shapes, turning=True), _caption(shapes), (table_modes(shapes),))
-
-
-def _caption(shapes: ModeShapes) -> str:
-    """Which modes are shown, what limits the loop first, and how to turn them."""
-    first, last = shapes.modes[0], shapes.modes[-1]
-    words = (
-        f"The first {last.numbers[-1]} flexible modes, {number(first.frequency)} to "
-        f"{number(last.frequency)} Hz"
-    )
-    words += f", seen from {shapes.view}" if shapes.view else ""
-    named = any(mode.words != first.words for mode in shapes.modes)
-    more = [f"the {first.words}"] if named else []
-    if len(shapes.modes) > 1:
-        factor = number(shapes.modes[1].frequency / first.frequency, 3)
-        more.append(f"a factor {factor} below the next")
-    words += f". The lowest is {', '.join(more)}" if more else ""
-    if any(len(mode.numbers) > 1 for mode in shapes.modes):
-        words += "; a pair has one frequency and two shapes, the other a quarter turn of this one"
-    return words + (
-        f". Displacements are exaggerated: the largest is drawn as {100 * REACH:.0f} % of the side."
-        " On screen, drag a picture or use the sliders to turn all of them."
-    )
+    named = len({mode.words for mode in shapes.modes}) > 1
+    paired = any(len(mode.numbers) > 1 for mode in shapes.modes)
+    words = paragraph("report.modes", shapes, named, paired, REACH)
+    return Figure(Modes(shapes, turning=True), words, (table_modes(shapes),))
 
 
 def table_modes(shapes: ModeShapes) -> Table:

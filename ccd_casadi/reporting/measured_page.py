@@ -13,12 +13,12 @@ from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.fixed_structure.measured_loop import between, controller_response
 from ccd_casadi.lti.closed_loop import equivalent_open_loop, sensitivity, sigma_max
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.reporting.facts import Fact, loop_facts
+from ccd_casadi.reporting.facts import facts
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, with_unit
+from ccd_casadi.support.units import HZ, number
 
 HEIGHT = 3.0  # inches of a row
 
@@ -41,7 +41,7 @@ def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[st
         answer["reason"], f"{case.path.name} · {lines}", lead, answer,
     )  # fmt: skip
     figures = (
-        c.Facts(tuple(_facts(case, answer))),
+        c.Facts(tuple(facts("measured", case, answer))),
         c.Words(f"What this rests on: {answer['words']}."),
     )
     chapters = (
@@ -97,26 +97,3 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
         )
     lines = c.Lines(rows, "The loop on the measured lines", (HEIGHT, 2.6, 2.6))
     return c.Figure(lines, words)
-
-
-def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
-    bounds, shares = case.bounds, answer["certificate"]["figures_over_bounds"]
-    runs = "continuous" if case.period is None else (
-        f"sampled at {number(1.0 / case.period)} Hz; hold and delay are in the response"
-    )  # fmt: skip
-    found = [
-        ("Bandwidth", f"{number(answer['bandwidth_hz'])} Hz", runs),
-        ("Peak of S", number(answer["sensitivity_peak"]),
-         f"at {number(answer['sensitivity_peak_hz'], 4)} Hz, S_max {bounds.S_max:g}" + (
-             "" if answer.get("models") else
-             f"; between lines at most {number(answer['sensitivity_peak_between_lines'])}")),
-        ("|S| at ω_low", number(answer["sensitivity_low"]),
-         f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
-        ("Compliance", f"{with_unit(answer['compliance_max'], 'm', 4)}/N", "the largest |GS|"),
-        *loop_facts(answer),
-        ("Largest |KS|", with_unit(answer["KS_max"], "N/m", 4), ""),
-    ]  # fmt: skip
-    names = {"S_max": "S_max", "S_low": "S_low", "KS": "weighted KS", "T": "weighted T",
-             "GS": "compliance_max"}  # fmt: skip
-    over = ", ".join(f"{names[key]} {number(share, 4)}" for key, share in shares.items())
-    return [*found, ("Figures over bounds", over, "1 is on the bound")]

@@ -21,9 +21,10 @@ from ccd_casadi.inner_problem.move_figures import FREE, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, display_unit, number, with_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, with_unit
 
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
@@ -60,14 +61,9 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
     found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
     end, model = profile.duration, found[0][0]
-    several = " The band spans every plant of the set, and the numbers are of the worst."
-    words = (
-        f"The move is {number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in "
-        f"{number(1e3 * end, 4)} ms{other}, "
-        f"{'with rigid bodies free' if model.free else 'on the soft suspension'} and "
-        f"{'without hold and delay' if loops[0].sampling is None else 'hold and delay exact'}."
-        f"{several if len(loops) > 1 else ''}"
-    )
+    mm = 1e3 * float(profile.at(np.array([end]))[0, 0])
+    made = (mm, 1e3 * end, other, model.free, loops[0].sampling is not None, len(loops) > 1)
+    words = paragraph("report.move", *made)
     return ways_figure(dict(zip(ways, found, strict=True)), words)
 
 
@@ -101,19 +97,10 @@ def cycle_chapter(
         here = c.Level(told["power"], "this design", vertical=True)
         panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,),
                               levels=(here,)))  # fmt: skip
-    share = f"{number(100.0 * told['heat_share'], 3)} % of the heat"
-    if motor.peak_current[0] < UNLIMITED:
-        share += f" and {number(100.0 * told['peak_share'], 3)} % of the peak force"
-    settling = "it does not settle on the whole set" if settled is None else (
-        f"on every plant of the set it has settled {number(1e3 * late, 3)} ms after that"
-    )  # fmt: skip
-    words = (
-        f"A cycle of {number(ms[-1], 4)} ms: {number(told['peak_force'], 4)} N and "
-        f"{number(told['peak_current'], 3)} A at most, {number(told['rms_force'], 4)} N RMS, "
-        f"{number(told['power'], 4)} W: {share} that the motor allows. The setpoint takes "
-        f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
-        f"{settling}.{'' if own.required else ' The last curve has the settling of this design.'}"
-    )
+    settling = None if settled is None else late
+    limited_force = motor.peak_current[0] < UNLIMITED
+    known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required)
+    words = paragraph("report.cycle", told, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))
     return [c.Chapter("The motor", (c.Figure(lines, words),))]
 
@@ -139,7 +126,9 @@ def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     ways = {words: [move] for words, move in found.ways.items()}
     words = "The plant has its soft suspension. Hold and delay are exact."
-    return ways_figure(ways, words), c.Words(_limit_words(found))
+    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
+    limit = c.Words(paragraph("report.least_force", found, peak))
+    return ways_figure(ways, words), limit
 
 
 def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
@@ -211,24 +200,3 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     if not after.size or settled <= until:
         return words
     return f"{words}, after the figure's end {with_unit(float(after.max()), 'm')}"
-
-
-def _limit_words(found: OnHardware) -> str:
-    words = "" if found.forward is not None else "The plant holds no position: no feedforward. "
-    if len(found.ways) < 3:
-        return words + "With --saturation the move is simulated with a limited force too."
-    if np.isnan(found.least_limit):
-        return words + (
-            "The unlimited move itself does not end in its window within the time watched: ask for "
-            "more stiffness at low frequencies (compliance_max, S_low), or widen the window."
-        )
-    peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
-    if found.least_limit == 1.0:
-        return (
-            words + "Of the limits tried none below the peak force lets the move end in its window."
-        )
-    return words + (
-        "With back-calculation the move ends in its window down to "
-        f"{100 * found.least_limit:.3g} % of the peak force, {number(found.least_limit * peak)} N "
-        "(tried in steps)."
-    )

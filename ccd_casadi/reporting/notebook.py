@@ -13,19 +13,18 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
-from ccd_casadi.drawing.page import CSS
-from ccd_casadi.drawing.paint import block_html
+from ccd_casadi.drawing.paint import CSS, block_html
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.reporting.facts import conclusion, theta_axes, theta_table
+from ccd_casadi.reporting.facts import conclusion, facts, theta_axes, theta_table
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.package_text import template
-from ccd_casadi.support.units import HZ, number, with_unit
+from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
@@ -63,27 +62,15 @@ def _(item: Case) -> str:
 
 @html_of.register
 def _(item: CoDesignProblem) -> str:
-    inner, figure = item.inner, item.figure
-    J = f"min {item.w1:g} f(θ) + ({item.w2:g}) {figure.symbol}"
     rows = []
     for i, (name, unit, factor) in enumerate(theta_axes(item)):
         numbers = (factor * value for value in (item.lower[i], item.upper[i], item.start[i]))
         rows.append((name, unit or "–", *numbers))
-    facts = [
-        ("Objective", J, f"{figure.symbol} in {figure.si_unit}"),
-        ("Peak of S", f"≤ {inner.S_max:g}", ""),
-        (f"|S| at {number(inner.omega_low / HZ)} Hz", f"≤ {inner.S_low:g}", ""),
-    ]
-    if inner.compliance_max is not None:
-        facts.append(("Compliance |GS|", f"≤ {with_unit(inner.compliance_max, 'm')}/N", ""))
-    facts.append(("Controller", *kind_of(item).described()))
-    if item.robust is not None:
-        shifts = f"resonances ±{100.0 * item.robust.shift:g} %"
-        facts.append(("Robust set", shifts, f"made on the plant: {item.robust.design_at}"))
     source = item.source
     name = source.model or f"{source.file}:{source.function}"
     table = Table(("θ", "unit", "lower", "upper", "start"), tuple(rows))
-    return _cell(Heading(f"A co-design problem: {name}"), table, Facts(tuple(facts)))
+    found = facts("problem", item, *kind_of(item).described())
+    return _cell(Heading(f"A co-design problem: {name}"), table, Facts(tuple(found)))
 
 
 @html_of.register
@@ -137,16 +124,4 @@ def _design(title: str, figures: DesignFigures, words: str = "") -> tuple[Head |
     head = Head(title, badge, figures.outcome.value, "", "", "")
     if not figures.certified:
         return head, Words(words)
-    certificate = figures.certificate
-    norm = f"{number(certificate.norm, 6)} ≤ {number(certificate.norm_bound, 6)}"
-    peak = f"at {number(figures.sensitivity_peak_frequency / HZ)} Hz"
-    facts = (
-        ("Bandwidth ω_b", f"{number(figures.bandwidth / HZ)} Hz", ""),
-        ("Weights", f"ω_S {number(figures.omega_S / HZ)} Hz",
-         f"ω_T {number(figures.omega_T / HZ)} Hz"),
-        ("Peak of S", number(figures.sensitivity_peak), peak),
-        ("|S| at ω_low", number(figures.sensitivity_low), ""),
-        ("Norm against its bound", norm, f"γ_opt {number(figures.gamma_opt, 6)}"),
-        ("Slowest pole", f"{number(certificate.max_real_pole, 4)} 1/s", ""),
-    )  # fmt: skip
-    return head, Facts(facts), Words(words)
+    return head, Facts(tuple(facts("synthesis", figures))), Words(words)

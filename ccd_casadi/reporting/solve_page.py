@@ -22,9 +22,8 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_chapter import budget_chapter
-from ccd_casadi.reporting.facts import binding, conclusion, design_facts, run_name, theta_table
+from ccd_casadi.reporting.facts import binding, conclusion, facts, run_name, theta_table
 from ccd_casadi.reporting.glance import glance
-from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.landscape import (
     Truths,
@@ -33,21 +32,20 @@ from ccd_casadi.reporting.landscape import (
     caption_landscape,
     landscape_data,
     read_truths,
+    slices_figure,
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
 from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_figure
-from ccd_casadi.reporting.slices import slices_figure
+from ccd_casadi.reporting.prediction import history_blocks, table_trust, trust_figure
 from ccd_casadi.reporting.start import start_chapter
 from ccd_casadi.reporting.structured_page import (
     bandwidths_table,
     binding_words,
     controller_blocks,
     limits_blocks,
-    structured_facts,
 )
-from ccd_casadi.reporting.trust import table_trust, trust_figure
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.progress import Progress
 
@@ -151,13 +149,11 @@ def design_parts(
 
 def design_chapter(problem: CoDesignProblem, result: Mapping[str, Any]) -> c.Chapter:
     """What result.json says of the design."""
-    words, facts = (
-        (binding_words, structured_facts) if "proof" in result else (binding, design_facts)
-    )
-    binds = words(problem, result)
+    structured = "proof" in result
+    binds = (binding_words if structured else binding)(problem, result)
     body = (
         theta_table(problem, result),
-        c.Facts(tuple(facts(problem, result))),
+        c.Facts(tuple(facts("structured" if structured else "design", problem, result))),
         c.Heading("What binds"),
         c.Bullets(tuple(binds)) if binds else c.Words("Nothing binds: an interior optimum."),
         *(c.Words(f"Note: {words}.") for words in result.get("notes", ())),

@@ -12,9 +12,9 @@ from ccd_casadi.drawing.svg import CYCLE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
 from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.reporting.facts import theta_axes
+from ccd_casadi.reporting.facts import paragraph, theta_axes
 from ccd_casadi.reporting.loops import gain_panels, over_hz, synthesised_loop, view_of
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:
     from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -43,14 +43,10 @@ def start_chapter(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
     costs = [hardware_cost(plant_of(problem), theta) for theta in thetas]
     poles = [_roots(loop) for loop in loops]
     lines = Lines(_panels(loops[::-1]), HEADING, HEIGHTS)
-    least = [number(float(damping.min()), 2) for _, damping in poles]
+    least = [float(damping.min()) for _, damping in poles]
     gained = 100.0 * (loops[1].bandwidth_hz / start.bandwidth_hz - 1.0)
-    spared = f", f changes by {100.0 * (costs[1] / costs[0] - 1.0):+.3g} %" if costs[0] else ""
-    words = (
-        f"Each hardware with its own best controller. From the start to the optimum the bandwidth "
-        f"changes by {gained:+.3g} %{spared}. Poles of the closed loops by size and damping "
-        f"ratio; the least damped one has {least[0]} at the start and {least[1]} at the optimum."
-    )
+    spared = 100.0 * (costs[1] / costs[0] - 1.0) if costs[0] else None
+    words = paragraph("report.start", gained, spared, least)
     beside = _table(problem, thetas, loops, costs)
     return [Chapter(HEADING, (Figure(lines, words), beside))]
 

@@ -8,10 +8,10 @@ from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words, gain_words
+from ccd_casadi.inner_problem.sections_words import SectionWords, gain_words
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
-from ccd_casadi.reporting.facts import Fact, binding, loop_facts, sensitivity_facts, value_facts
-from ccd_casadi.support.units import HZ, counted, number, with_unit
+from ccd_casadi.reporting.facts import binding, paragraph
+from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
@@ -81,76 +81,17 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
         *([("sections", whole, "continuous", hz(costs["continuous_hz"]))] if sampled else []),
         (f"sections: the design{least}", whole, loop, hz(result["bandwidth_hz"])),
     ]
-    words = (
-        "The first row is a certified bound under the same bounds on S, KS, T and GS. The others "
-        "are local searches that began at the design: at least these bandwidths are reached."
-    )
-    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), Words(
-        f"{words}{tolerance_words(costs.get('tolerances_hz', {}))}"
-    )
-
-
-def tolerance_words(hz: Mapping[str, float]) -> str:
-    """Which tolerances cost most, by the change of ω_b in Hz where each grows by 1 %."""
-    most = sorted(hz.items(), key=lambda item: item[1])[:MOST_TOLERANCES]
-    gains = [f"{number(-10.0 * value, 3)} Hz ({name})" for name, value in most if value < -LEAST_HZ]
-    if not gains:
-        return ""
-    return f" A tolerance narrower by a tenth would gain, to first order, {', '.join(gains)}."
-
-
-def structured_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
-    certificate, robust = r["certificate"], r["robust"]
-    optima = ", ".join(f"{number(o['bandwidth_hz'], 5)} Hz ({o['searches']}×)" for o in r["race"])
-    sampling = structured_of(problem).sampling
-    runs = "continuous" if sampling is None else (
-        f"{number(sampling.rate_hz)} Hz, {number(sampling.delay_us)} µs from measurement to force"
-    )  # fmt: skip
-    on = counted(certificate["plants"], "plant")
-    worst = f"largest of {counted(robust['plants'], 'plant')} of the box"
-    kkt = r["kkt"]["stationarity"]
-    return [
-        *value_facts(problem, r, "on every plant of the set"),
-        ("Loop", runs, ""),
-        *sensitivity_facts(problem, r),
-        *(("Channel", own["name"], channel_words(own)) for own in r.get("channel_bounds", ())),
-        ("Peak of S over the box", number(robust["worst_sensitivity_peak"], 6), worst),
-        ("Compliance |GS|", f"{with_unit(r['compliance_max'], 'm', 4)}/N", r["compliance_words"]),
-        *loop_facts(r),
-        ("Largest |KS|", with_unit(r["KS_max"], "N/m", 4), ""),
-        ("Certificate", "passed" if certificate["passed"] else "FAILED",
-         f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
-         f"at most {number(certificate['norm'], 6)} of a bound"),
-        ("Over the box", "passed" if robust["passed"] else "FAILED",
-         f"{robust['words']}; the worst plant that a search found is at "
-         f"{100.0 + 100.0 * robust['worst_excess']:.6g} % of a bound; "
-         f"{r['proof']['words']}"),
-        ("Optimality (KKT residual)", number(kkt, 3),
-         f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
-         "controller"),
-        ("A multi-start search at this θ", optima or "–",
-         f"local optima of ω_b (searches); {counted(r['rounds'], 'round')} of the outer problem"),
-        ("Cost", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
-    ]  # fmt: skip
-
-
-def _over(kkt: Mapping[str, Any]) -> str:
-    """Of what the residual is; runs from before kinks were known have no word of them."""
-    kink = kkt.get("kink")
-    if kink is None:
-        return "θ"
-    alone = number(kink["one_gradient"], 2)
-    return f"θ and controller together, at a kink of J ({alone} by the gradient of one side)"
+    most = sorted(costs.get("tolerances_hz", {}).items(), key=lambda item: item[1])
+    told = [item for item in most[:MOST_TOLERANCES] if item[1] < -LEAST_HZ]
+    words = Words(paragraph("report.costs", told))
+    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), words
 
 
 def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     """Gain and sections in Hz and damping; of `result` only `controller` is read."""
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
-    words = (
-        f"Gain {gain_words(controller)}, order {controller['order']}. Apart from the integrator, K "
-        "is stable. Every section has the gain 1 at s = 0 (the integrator's: at high frequency)."
-    )
+    words = paragraph("report.sections", controller, gain_words(controller))
     return Words(words), structured_table(found)
 
 

@@ -4,7 +4,7 @@ import argparse
 from dataclasses import dataclass
 
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW, MoveLimits
-from ccd_casadi.support.options import positive
+from ccd_casadi.support.options import positive, valued
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,10 @@ _MOVE = (
     ("snap", _DEFAULT.limits.snap, "m/s⁴"),
     ("window", _DEFAULT.window, "m; the error has to stay within it"),
 )
-
-
-def add_move_options(arguments: argparse.ArgumentParser) -> None:
-    """--stroke, --velocity, --acceleration, --jerk, --snap and --window."""
-    for name, default, unit in _MOVE:
-        arguments.add_argument(
-            f"--{name}", type=positive, default=default, metavar="X",
-            help=f"{name} of the move, {unit}; default {default:g}",
-        )  # fmt: skip
+MOVE_OPTIONS = [
+    valued(f"--{name}", "X", positive, f"{name} of the move, {unit}", default)
+    for name, default, unit in _MOVE
+]
 
 
 def move_limits(options: argparse.Namespace) -> MoveLimits:

@@ -8,7 +8,7 @@ from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.sampling.rows import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.plain_values import restored
+from ccd_casadi.support.json_files import restored
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
 

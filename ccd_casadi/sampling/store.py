@@ -15,7 +15,7 @@ from typing import Any, Self, TypeVar
 
 from ccd_casadi.sampling.rows import COLUMNS, DAMAGED, Sample, decoded, from_row, numbers_of, to_row
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.plain_values import plain, restored
+from ccd_casadi.support.json_files import plain, restored
 
 T = TypeVar("T")
 SCHEMA = 1

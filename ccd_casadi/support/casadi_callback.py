@@ -9,13 +9,15 @@ import numpy as np
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.interrupts import ctrl_c_pending
 
+Map = Callable[[Array], Array]
+
 
 class _Dense(ca.Callback):
     """The first of some inputs -> a dense output."""
 
     def __init__(
         self, name: str, inputs: Sequence[ca.Sparsity], output: ca.Sparsity,
-        values: Callable[[Array], Array], options: Mapping[str, Any],
+        values: Map, options: Mapping[str, Any],
     ) -> None:  # fmt: skip
         ca.Callback.__init__(self)
         self._inputs, self._output, self._values = inputs, output, values
@@ -43,14 +45,9 @@ class VectorCallback(_Dense):
     """
 
     def __init__(
-        self,
-        name: str,
-        inputs: int,
-        outputs: int,
-        values: Callable[[Array], Array],
-        jacobian: Callable[[Array], Array],
+        self, name: str, inputs: int, outputs: int, values: Map, jacobian: Map,
         hessians: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         column, out = (ca.Sparsity.dense(size, 1) for size in (inputs, outputs))
         super().__init__(name, [column], out, values, {})
         self._sizes, self._jacobian, self._hessians = (outputs, inputs), jacobian, hessians

@@ -4,18 +4,20 @@ import argparse
 import gc
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
-from ccd_casadi.support.options import DEFAULT_CASE, Parser, integer, one_line, usable_cores
+from ccd_casadi.support.options import DEFAULT_CASE, Option, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
+from ccd_casadi.support.options import option as option
 from ccd_casadi.support.terminal import kept_quiet, say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
@@ -23,9 +25,12 @@ from ccd_casadi.support.worker_process import WorkerLost
 
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
-Body = Callable[[argparse.Namespace], ExitCode]  # what a command does with its options
-Option = Callable[[argparse.ArgumentParser], object]  # adds one
+Body = Callable[[argparse.Namespace], ExitCode]  # what a command does; `seconds()`: since it began
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
+# What a command is about, as argparse takes its positional.
+CASE = {"dest": "case", "metavar": "CASE.toml", "nargs": "?", "default": Path(DEFAULT_CASE),
+        "help": f"the case file (default: {DEFAULT_CASE})"}  # fmt: skip
+RUN = {"dest": "run", "metavar": "RUN_DIR", "help": "the folder of a finished solve"}
 
 
 def program(command: str) -> str:
@@ -35,33 +40,20 @@ def program(command: str) -> str:
 
 
 def parser(
-    command: str, description: str, *, without_effect: Sequence[str] = ()
-) -> argparse.ArgumentParser:
-    """As `run_parser`, with the positional CASE of a case file."""
-    return run_parser(
-        command, description, name="case", metavar="CASE.toml", nargs="?",
-        about=f"the case file (default: {DEFAULT_CASE})", default=Path(DEFAULT_CASE),
-        without_effect=without_effect,
-    )  # fmt: skip
-
-
-def run_parser(
     command: str,
     description: str,
+    place: Mapping[str, Any] = CASE,
     *,
-    name: str = "run",
-    metavar: str = "RUN_DIR",
-    about: str = "the folder of a finished solve",
     without_effect: Sequence[str] = (),
-    **how: Any,
 ) -> argparse.ArgumentParser:
-    """A parser with the positional RUN_DIR and --out, --workers, --seed, --quiet, --no-user-code.
+    """A parser with the positional `place` and --out, --workers, --seed, --quiet, --no-user-code.
 
     What is `without_effect` is accepted, as scripts give every command the same options, and is
-    not in --help. `how` goes to argparse with the positional.
+    not in --help.
     """
-    result = Parser(prog=program(command), description=description)
-    result.add_argument(name, metavar=metavar, type=Path, help=about, **how)
+    codes = "Exit codes: " + ", ".join(f"{code:d} {code.words}" for code in ExitCode)
+    result = Parser(prog=program(command), description=description, epilog=codes)
+    result.add_argument(type=Path, **place)
 
     def add(name: str, words: str, **how: Any) -> None:
         words = argparse.SUPPRESS if name in without_effect else words
@@ -81,11 +73,6 @@ def run_parser(
     return result
 
 
-def option(*names: str, **how: Any) -> Option:
-    """An option of a command, as argparse takes it."""
-    return lambda arguments: arguments.add_argument(*names, **how)
-
-
 SCHEDULER = option(
     "--scheduler", metavar="ADDRESS",
     help="sample on the Dask cluster at tcp://host:port; --workers then has no effect",
@@ -93,17 +80,15 @@ SCHEDULER = option(
 
 
 def command(
-    name: str, description: str, *options: Option, needs: Sequence[str],
-    make: Callable[..., argparse.ArgumentParser] = parser, **how: Any,
-) -> Callable[[Body], Callable[..., int]]:  # fmt: skip
+    name: str, description: str, *options: Option, needs: Sequence[str], **how: Any
+) -> Callable[[Body], Callable[..., int]]:
     """Makes the entry point of a command, which takes words and gives an exit code, of what it does
-    with its options; `make` and `how` give the parser that `options` are added to, `needs` as in
-    `run`."""
+    with its options; `how` as in `parser`, which `options` are added to, `needs` as in `run`."""
 
     def entry_of(body: Body) -> Callable[..., int]:
         @wraps(body)
         def main(argv: Sequence[str] | None = None) -> int:
-            arguments = make(name, description, **how)
+            arguments = parser(name, description, **how)
             for add in options:
                 add(arguments)
             return run(body, arguments, argv, needs=needs)
@@ -146,6 +131,8 @@ def run(
             kept_quiet(options.quiet),
             ctrl_c_noticed(),
         ):
+            began = perf_counter()
+            options.seconds = lambda: perf_counter() - began
             code = main(options)
         sys.stdout.flush()  # here, where a reader that went away can still be dealt with
     except PlantError as error:  # at some θ: what evaluates a plant knows of no case file

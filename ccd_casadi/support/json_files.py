@@ -1,14 +1,22 @@
-"""Plain values as JSON files that any reader takes."""
+"""Plain values as JSON: files that any reader takes, and dataclasses back from it, exact in every
+bit of a number."""
 
 import json
 import math
-from dataclasses import is_dataclass
+from base64 import b64decode, b64encode
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from itertools import repeat
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from surrogates.files import write_whole
+
+DIGITS = 7  # of the numbers of an array that is listed
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -35,3 +43,83 @@ def json_values(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def plain(value: Any, listed: bool = False) -> Any:
+    """What JSON holds of a value: of a dataclass its name and fields, of an array (of float64)
+    shape and bytes, of an enumeration the name, of NaN and infinity their words.
+
+    `listed`: of an array the numbers, to seven digits, None for those that are not finite.
+
+    >>> plain((1.5, float("inf"), {"x": np.array([0.0])}))
+    [1.5, 'inf', {'x': [[1], 'AAAAAAAAAAA=']}]
+    >>> plain(np.array([1.0, 2.0 / 3.0, np.nan]), listed=True)
+    [1.0, 0.6666667, None]
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, np.ndarray) and listed:
+        return [_rounded(item) for item in value.tolist()]
+    if isinstance(value, np.ndarray):
+        return [list(value.shape), b64encode(value.astype("<f8").tobytes()).decode()]
+    if isinstance(value, Enum):
+        return value.name
+    if is_dataclass(value):
+        found = {item.name: plain(getattr(value, item.name), listed) for item in fields(value)}
+        return {"": type(value).__name__, **found}
+    if isinstance(value, Mapping):
+        return {key: plain(item, listed) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return [plain(item, listed) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else repr(float(value))
+    return value
+
+
+def _rounded(item: Any) -> Any:
+    if isinstance(item, list):
+        return [_rounded(each) for each in item]
+    if isinstance(item, float):
+        return float(f"{item:.{DIGITS}g}") if math.isfinite(item) else None
+    return item
+
+
+def restored(kind: Any, data: Any) -> Any:
+    """Its inverse for a type as it is annotated; a field that is not there has its default.
+
+    Raises KeyError, TypeError or ValueError where `plain` cannot have written that.
+
+    >>> restored(tuple[float, ...], [1.5, "inf"])
+    (1.5, inf)
+    """
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any or origin is Literal:
+        return data
+    if np.ndarray in (kind, origin) and not (len(data) == 2 and isinstance(data[1], str)):
+        return np.array(data, float if origin else None)
+    if origin is np.ndarray:
+        return np.frombuffer(b64decode(data[1]), "<f8").astype(float).reshape(data[0])
+    if origin in (Union, UnionType):
+        named = {cast(Any, item).__name__: item for item in args if is_dataclass(item)}
+        if data is None and NoneType in args:
+            return None
+        alone = len(named) < 2  # then its name is not looked at: it may have had another
+        one = next(item for item in args if item is not NoneType) if alone else named[data[""]]
+        return restored(one, data)
+    if origin is tuple:
+        endless = args[1:] == (...,)
+        kinds = repeat(args[0], len(data)) if endless else args
+        return tuple(restored(*item) for item in zip(kinds, data, strict=True))
+    if origin in (dict, Mapping):
+        return {str(key): restored(args[1], item) for key, item in dict(data).items()}
+    if is_dataclass(kind):
+        hints, build = get_type_hints(kind), cast(Any, kind)
+        there = [f for f in fields(kind) if f.name in data or f.default is MISSING]
+        return build(**{f.name: restored(hints[f.name], data[f.name]) for f in there})
+    if issubclass(kind, Enum):
+        return kind[data]
+    if kind is float:
+        return float(data)
+    if type(data) is not kind:
+        raise TypeError(f"{data!r} is not a {kind.__name__}")
+    return data

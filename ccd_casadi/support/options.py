@@ -5,12 +5,13 @@ import math
 import os
 from collections.abc import Callable
 from enum import IntEnum
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
+Option = Callable[[argparse.ArgumentParser], object]  # adds one
 LONGEST = 1000  # characters of a line: somebody else's message in it may have millions
 
 
@@ -54,13 +55,7 @@ def usable_cores() -> int:
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, as every other bad input, without the usage;
-    its help ends with the exit codes."""
-
-    def format_help(self) -> str:
-        """The help with the exit codes below."""
-        self.epilog = "Exit codes: " + ", ".join(f"{code:d} {code.words}" for code in ExitCode)
-        return super().format_help()
+    """An argument parser whose errors are one line, as every other bad input, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         """Leave with BAD_INPUT."""
@@ -114,13 +109,21 @@ def real(
 positive = real(strict=True)
 
 
-def add_break_frequencies(words: str, arguments: argparse.ArgumentParser) -> None:
-    """Add --omega-s-hz and --omega-t-hz, which `break_frequencies` reads."""
-    for name in ("S", "T"):
-        arguments.add_argument(
-            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
-            help=words,
-        )  # fmt: skip
+def option(*names: str, **how: Any) -> Option:
+    """An option of a command, as argparse takes it."""
+    return lambda arguments: arguments.add_argument(*names, **how)
+
+
+def valued(name: str, metavar: str, kind: Callable[[str], Any], words: str, default: Any) -> Option:
+    """An option with a value; its default is told behind the words."""
+    words += f" (default: {default:g})"
+    return option(name, metavar=metavar, type=kind, default=default, help=words)
+
+
+def break_frequency_options(words: str) -> list[Option]:
+    """--omega-s-hz and --omega-t-hz, which `break_frequencies` reads."""
+    how: dict[str, Any] = {"type": positive, "metavar": "X", "help": words}
+    return [option(f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", **how) for name in "ST"]
 
 
 def break_frequencies(options: argparse.Namespace) -> tuple[float, float] | None:

@@ -11,17 +11,11 @@ from reprlib import Repr
 from typing import Any, Protocol, Self, TypeVar
 
 from ccd_casadi.support.interrupts import raise_dropped
-from ccd_casadi.support.worker_process import (
-    R,
-    T,
-    WorkerLost,
-    WorkerProcess,
-    interrupts_held,
-    track_resources,
-)
+from ccd_casadi.support.worker_process import R, T, WorkerLost, WorkerProcess, interrupts_held
 
 K = TypeVar("K")
 PATIENCE = 2.0  # s of work that is not worth starting processes for
+Running = dict[connection.Connection, tuple[WorkerProcess, int]]  # by pipe, and the task's number
 _SHORT = Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
 
@@ -87,24 +81,23 @@ class Workers:
         A worker holds one task, and has its next before a result is handed out. Raises RuntimeError
         where another map is not yet finished.
         """
-        if self.count == 1 or len(tasks) <= 1:
-            for task in tasks:
-                raise_dropped()
-                yield function(task)
-            return
         began, done_here = time.monotonic(), 0
-        while not self._workers and done_here < len(tasks):
-            each = (time.monotonic() - began) / done_here if done_here else 0.0
+        alone = self.count == 1 or len(tasks) <= 1
+        while done_here < len(tasks) and (alone or not self._workers):
             raise_dropped()
-            if self.patience == 0.0 or each * (len(tasks) - done_here) > self.patience:
+            each = (time.monotonic() - began) / done_here if done_here else 0.0
+            left = each * (len(tasks) - done_here)
+            if not alone and (self.patience == 0.0 or left > self.patience):
                 break
             yield function(tasks[done_here])
             done_here += 1
+        if done_here == len(tasks):
+            return
         if self._mapping:
             raise RuntimeError("these workers are busy with another map: finish or close that one")
         self._mapping = True
         waiting, retried = deque(range(done_here, len(tasks))), set[int]()
-        running: dict[connection.Connection, tuple[WorkerProcess, int]] = {}
+        running: Running = {}
         try:
             while waiting or running:
                 raise_dropped()
@@ -138,30 +131,20 @@ class Workers:
             self._end([worker for worker, _ in running.values()])
 
     def _feed(
-        self,
-        function: Callable[[T], R],
-        tasks: Sequence[T],
-        waiting: deque[int],
-        running: dict[connection.Connection, tuple[WorkerProcess, int]],
+        self, function: Callable[[T], R], tasks: Sequence[T], waiting: deque[int], running: Running
     ) -> None:
         """Give every idle worker a task, starting processes up to `count`."""
         while waiting and len(running) < self.count:
-            worker, index = self._idle(running), waiting[0]
+            idle = [worker for worker in self._workers if worker.pipe not in running]
+            dead = [worker for worker in idle if not worker.process.is_alive()]
+            self._end(dead)  # between two tasks: no task is to blame
+            if len(idle) == len(dead):
+                with interrupts_held():
+                    self._workers.append(WorkerProcess())
+                idle = self._workers[-1:]
+            worker, index = next(one for one in idle if one not in dead), waiting[0]
             running[worker.pipe] = (worker, waiting.popleft())
             worker.begin(function, tasks[index])
-
-    def _idle(
-        self, running: dict[connection.Connection, tuple[WorkerProcess, int]]
-    ) -> WorkerProcess:
-        for worker in list(self._workers):
-            if worker.pipe not in running:
-                if worker.process.is_alive():
-                    return worker
-                self._end([worker])  # died between two tasks: no task is to blame
-        track_resources()
-        with interrupts_held():
-            self._workers.append(WorkerProcess())
-        return self._workers[-1]
 
     def _end(self, workers: list[WorkerProcess]) -> None:
         with interrupts_held():

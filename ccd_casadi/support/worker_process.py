@@ -41,7 +41,6 @@ class WorkerProcess:
     """One spawned process and the parent's end of its pipe; it imports `module` at once."""
 
     def __init__(self, module: str = "ccd_casadi") -> None:
-        track_resources()
         with interrupts_held(), _one_thread_each():
             self.pipe, theirs = _SPAWN.Pipe()
             # A daemon: it is ended at exit even where the pool was not left properly.
@@ -152,12 +151,6 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def track_resources() -> None:
-    """Start what multiprocessing starts by itself later, unblocking SIGINT; Windows has none."""
-    if os.name == "posix":
-        resource_tracker.ensure_running()
-
-
 @contextmanager
 def interrupts_held() -> Iterator[None]:
     """Ctrl-C comes at the end of the block; processes started in it are born with it blocked.
@@ -167,6 +160,7 @@ def interrupts_held() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    resource_tracker.ensure_running()  # else it starts later by itself, and unblocks SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -184,8 +178,18 @@ def tell(words: str) -> None:
 
 
 def _serve(pipe: connection.Connection, module: str) -> None:
-    """A worker's life: answer tasks until the pipe or the parent ends."""
-    become_worker()
+    """A worker's life: answer tasks until the pipe or the parent ends, even by SIGKILL in mid-task;
+    Ctrl-C is the parent's."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    parent: Any = multiprocessing.parent_process()
+
+    def leave() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=leave, daemon=True).start()
     _to_parent.append(pipe)
     import_module(module)
     with suppress(EOFError, OSError):
@@ -207,17 +211,3 @@ def answer_message(message: bytes) -> bytes:
             return answer
         except Exception:
             return pickle.dumps((False, RuntimeError(text)))
-
-
-def become_worker() -> None:
-    """Leave Ctrl-C to the parent and end as soon as it has ended, even by SIGKILL in mid-task."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    parent: Any = multiprocessing.parent_process()
-
-    def leave() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=leave, daemon=True).start()

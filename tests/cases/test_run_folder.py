@@ -48,8 +48,12 @@ def test_the_design_is_measured_again_as_it_was_written(two_mass_run: Path) -> N
         ("result.json", lambda r: r["theta"].update(m1=1.0), "theta.m1: is outside"),
         ("result.json", lambda r: r["theta"].update(m1="x"), "theta.m1"),
         ("result.json", lambda r: r["theta"].pop("m1"), "theta: does not name m1, m2"),
-        ("result.json", lambda r: r.update(gamma=float("nan")), "gamma: is not a number"),
-        ("result.json", lambda r: r.update(omega_S_hz=-1.0), "omega_S_hz: is not positive"),
+        ("result.json", lambda r: r.update(gamma=float("nan")), "gamma: is not a positive number"),
+        (
+            "result.json",
+            lambda r: r.update(omega_S_hz=-1.0),
+            "omega_S_hz: is not a positive number",
+        ),
     ],
 )
 def test_what_was_changed_is_named(

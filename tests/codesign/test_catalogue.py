@@ -35,7 +35,7 @@ from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import SynthesisCounts
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.plain_values import plain
+from ccd_casadi.support.json_files import plain
 from ccd_casadi.support.process_pool import Workers
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"

@@ -18,7 +18,7 @@ from ccd_casadi.explorer.known_plant import KnownPlant, frequency_error
 from ccd_casadi.explorer.landscape import landscape_of, steepest_axes
 from ccd_casadi.explorer.panels import FIGURES, drawn
 from ccd_casadi.explorer.session import Session
-from ccd_casadi.explorer.words import machine_html, move_words, standing_html, survival_words
+from ccd_casadi.explorer.words import machine_html, move_words, standing_html
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.places import Places
@@ -186,7 +186,7 @@ def test_another_plant_than_the_models_own_certifies_nothing(session, searched_l
 
 
 def test_the_margins_told_are_where_stability_ends(session, searched_look):
-    assert "K by itself is stable" in survival_words(curves_of(searched_look))
+    assert "K by itself is stable" in standing_html(searched_look, curves_of(searched_look), None)
     look = session.full(replace(session.start, theta=(55.0, 55.0)))  # K is unstable there
     c, G, K = curves_of(look), look.plant.plant_si(), look.controller
 
@@ -200,7 +200,7 @@ def test_the_margins_told_are_where_stability_ends(session, searched_look):
     ):
         assert stable(gain * inwards)
         assert not stable(gain / inwards)
-    assert "UNSTABLE (poles at 143.1 Hz)" in survival_words(c)
+    assert "UNSTABLE (poles at 143.1 Hz)" in standing_html(look, c, None)
     assert "feedforward" in move_words(c)
     alone = replace(c, move=replace(c.move, feedforward=False))
     assert "without feedforward" in move_words(alone)

@@ -16,12 +16,12 @@ from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.reporting.facts import conclusion, theta_table, theta_words
-from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
 from ccd_casadi.reporting.nyquist import nyquist_panel
-from ccd_casadi.reporting.robustness_figures import shown_peak
+from ccd_casadi.reporting.prediction import history_blocks
+from ccd_casadi.reporting.robustness_page import shown_peak
 from ccd_casadi.reporting.verdict import LINES, advice, head_of, run_head
 from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.support.units import HZ

@@ -218,8 +218,10 @@ def test_pictures_show_the_modes_on_a_closed_surface(held: tuple[str, ...]) -> N
     volume = np.einsum("qi,qi->", one, np.cross(two, three)) / 6.0
     assert volume == pytest.approx(stage.mass(theta) / MATERIAL.density, rel=1e-12)
     hertz = [mode.frequency for mode in found.modes]
-    np.testing.assert_allclose(hertz, stage.frequencies(theta), rtol=1e-9)
-    read = stage.mechanics(theta, derivatives=False).C[:, -4:]
+    modal = stage.mechanics(theta, derivatives=False)
+    known = np.sqrt(np.diag(modal.K)[-4:]) / (2.0 * np.pi)
+    np.testing.assert_allclose(hertz, known, rtol=1e-9)
+    read = modal.C[:, -4:]
     far, near = (np.isclose(found.points[:, 0], x) for x in (found.points[:, 0].max(), 0.0))
     for i, mode in enumerate(found.modes):
         size = np.abs(mode.displacement).max()

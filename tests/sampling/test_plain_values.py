@@ -10,7 +10,7 @@ import pytest
 
 from ccd_casadi.sampling.store import SampleStore, SampleStoreError
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.plain_values import plain, restored
+from ccd_casadi.support.json_files import plain, restored
 
 
 class Colour(Enum):

@@ -52,7 +52,7 @@ def test_joint_covariance_is_symmetric_and_positive(
     K = covariance(kernel, X, X, p.length_scales, gradients_of_a=True, gradients_of_b=True)
     np.testing.assert_allclose(K, K.T, atol=1e-13 * np.abs(K).max())
     assert np.linalg.eigvalsh(K)[0] > -1e-12 * np.trace(K)
-    noisy = observed_covariance(kernel, X, p, True, 0.0)
+    noisy = observed_covariance(K, len(X), p, 0.0)
     assert np.linalg.eigvalsh(noisy)[0] > 0.9 * p.noise_variance
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import casadi as ca
 
@@ -14,8 +15,8 @@ from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.plants.eigenpairs import StageError
-from ccd_casadi.plants.fixed import Ordered
-from ccd_casadi.plants.plant import Plant
+from ccd_casadi.plants.fixed import remembered, with_fixed
+from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
@@ -72,39 +73,39 @@ def rib_stage(
 def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     """Any RibStage as the plant that the design loop asks for."""
 
-    def evaluator(variant: RibStage, derivatives: bool = False) -> Ordered:
-        return Ordered(variant.mechanics, NAMES, names, derivatives)
-
-    def nearby(known: Sequence[Sequence[float]]) -> Ordered:
-        made = reduced.bases(stage, tuple(map(evaluate.own, known)))
-        return Ordered(lambda theta, _: reduced.mechanics(stage, made, theta), NAMES, names)
+    def nearby(known: Sequence[Sequence[float]]) -> Evaluate:
+        made = reduced.bases(stage, tuple(map(tuple, known)))
+        return remembered(lambda theta, _: reduced.mechanics(stage, made, theta))
 
     def drawing(thetas: Mapping[str, Sequence[float]]) -> Figure:
         from ccd_casadi.case_studies.rib_stage import drawing  # matplotlib is slow to import
 
-        return drawing.drawing(stage.geometry, {k: evaluate.own(v) for k, v in thetas.items()})
+        return drawing.drawing(stage.geometry, thetas)
 
-    evaluate, theta = evaluator(stage, True), ca.SX.sym("theta", len(NAMES))
-    mass, constraints = stage.hardware([theta[list(names).index(name)] for name in NAMES])
+    theta = ca.SX.sym("theta", len(NAMES))
+    mass, constraints = stage.hardware(ca.vertsplit(theta))
     count = ROWS.get(stage.outputs)
     references = {}
     if stage.modes != TWENTY:
         references["20 flexible modes"] = replace(stage, modes=TWENTY)
     if stage.order != FINE:
         references["a finer mesh"] = replace(stage, order=FINE)
-    return Plant(
-        names=tuple(names),
+    plant = Plant(
+        names=NAMES,
         constraint_names=tuple(constraints),
-        evaluate=evaluate,
+        evaluate=remembered(stage.mechanics),
         hardware=ca.Function("hardware", [theta], [mass, ca.vertcat(*constraints.values())]),
         outputs=count or len(stage.sensor_points),
         inputs=count or len(stage.actuator_points),
-        references={name: evaluator(variant) for name, variant in references.items()},
-        values=evaluator(stage),
+        references={
+            name: remembered(variant.mechanics, False) for name, variant in references.items()
+        },
+        values=remembered(stage.mechanics, False),
         nearby=nearby if reduced.applies(stage) else None,
-        shapes=lambda theta, count: mode_shapes(stage, evaluate.own(theta), count),
+        shapes=partial(mode_shapes, stage),
         drawing=drawing,
     )
+    return with_fixed(plant, {}, names)
 
 
 def _points(points: Points) -> tuple[Point, ...] | None:

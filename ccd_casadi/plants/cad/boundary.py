@@ -84,13 +84,9 @@ def matched(old: Boundary, new: Boundary) -> Pairing:
     corners = {numbers[0][i]: numbers[1][j] for i, j in zip(rows, columns, strict=True)}
     edges = _pieces("edge", old.edges, new.edges, corners)
     faces = _pieces("face", old.faces, new.faces, edges)
-    turned = [
-        tag
-        for tag, other in edges.items()
-        if _distance(old.edges[tag].points, new.edges[other].points[::-1])
-        < _distance(old.edges[tag].points, new.edges[other].points)
-    ]
-    return Pairing(corners, edges, faces, frozenset(turned))
+    away = {tag: _distances(old.edges[tag], new.edges[other]) for tag, other in edges.items()}
+    turned = frozenset(tag for tag, (straight, back) in away.items() if back < straight)
+    return Pairing(corners, edges, faces, turned)
 
 
 REMEDY = "narrow the bounds so that no face or edge appears, vanishes or merges"
@@ -111,7 +107,7 @@ def _pieces(
             x, y, z = 1e3 * piece.points.mean(axis=0)
             words = f"the {word} ({piece.kind}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm of the meshed one"
             raise PlantError(f"{words} has no counterpart with the same neighbours; {REMEDY}")
-        found[tag] = min(alike, key=lambda other: _shape_distance(piece, new[other]))
+        found[tag] = min(alike, key=lambda other: min(_distances(piece, new[other])))
     if len(set(found.values())) != len(old):
         raise PlantError(f"two {word}s of the meshed solid are one here; {REMEDY}")
     return found
@@ -121,9 +117,8 @@ def _stack(corners: Mapping[int, Array]) -> Array:
     return np.array(list(corners.values())).reshape(-1, 3)
 
 
-def _distance(one: Array, other: Array) -> float:
-    return float(np.linalg.norm(one - other))
-
-
-def _shape_distance(one: Piece, other: Piece) -> float:
-    return min(_distance(one.points, other.points), _distance(one.points, other.points[::-1]))
+def _distances(one: Piece, other: Piece) -> tuple[float, float]:
+    """How far the points are from each other, and from those in the other order."""
+    gaps = (one.points - points for points in (other.points, other.points[::-1]))
+    straight, back = (float(np.linalg.norm(gap)) for gap in gaps)
+    return straight, back

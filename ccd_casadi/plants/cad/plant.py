@@ -14,7 +14,7 @@ from ccd_casadi.plants.cad.elements import Body, Material
 from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced, surface
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
-from ccd_casadi.plants.fixed import Ordered
+from ccd_casadi.plants.fixed import remembered, with_fixed
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
@@ -136,11 +136,6 @@ class CadStage:
         surfaces = {name: self.morph.points(theta)[used] for name, theta in thetas.items()}
         return surface_figure(surfaces, faces, [self.mass(theta) for theta in thetas.values()])
 
-    def frequencies(self, theta: Sequence[float]) -> Array:
-        """Of the flexible modes, in Hz."""
-        found = self.modal_model(theta, self.sensors, False)
-        return np.sqrt(np.diag(found.K)[-self.modes :]) / (2.0 * np.pi)
-
     def mass(self, theta: Sequence[float] | Array) -> float:
         """In kg."""
         return float(
@@ -170,30 +165,29 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
         lambda unit: (half * stage.mass_slope(middle + half * unit))[None],
         hessians=True,
     )  # fmt: skip
-    theta, evaluate = ca.MX.sym("theta", len(names)), Ordered(stage.mechanics, morph.names, names)
-    own = ca.vertcat(*(theta[list(names).index(name)] for name in morph.names))
-    finer = replace(stage, modes=2 * stage.modes)
-    evaluate.keep = mass  # CasADi holds no reference to it
+    theta, finer = ca.MX.sym("theta", len(names)), replace(stage, modes=2 * stage.modes)
     notes = (
         f"the stage is the mesh of {file} moved with theta, {len(morph.tets)} tetrahedra, within "
         f"{morph.error:.1e} m of the drawing where that was checked; its first "
         f"{stage.modes} flexible modes",
     )
-    return Plant(
-        names=tuple(names),
+    plant = Plant(
+        names=morph.names,
         constraint_names=(),
-        evaluate=evaluate,
-        hardware=ca.Function("hardware", [theta], [mass((own - middle) / half), ca.MX(0, 1)]),
+        evaluate=remembered(stage.mechanics),
+        hardware=ca.Function("hardware", [theta], [mass((theta - middle) / half), ca.MX(0, 1)]),
         outputs=len(stage.sensors),
         inputs=len(stage.forces),
-        references={"twice as many modes": Ordered(finer.mechanics, morph.names, names, False)},
+        references={"twice as many modes": remembered(finer.mechanics, False)},
         exact_hessian=False,
-        values=Ordered(stage.mechanics, morph.names, names, False),
+        values=remembered(stage.mechanics, False),
         notes=lambda theta: notes,
-        domain=(morph.lower[evaluate.place], morph.upper[evaluate.place]),
-        shapes=lambda theta, count: stage.shapes(evaluate.own(theta), count),
-        drawing=lambda thetas: stage.drawing({k: evaluate.own(v) for k, v in thetas.items()}),
+        domain=(morph.lower, morph.upper),
+        shapes=stage.shapes,
+        drawing=stage.drawing,
+        callback=mass,
     )
+    return with_fixed(plant, {}, names)
 
 
 def _ports(key: str, texts: Sequence[str], morph: Morph) -> tuple[Port, ...]:

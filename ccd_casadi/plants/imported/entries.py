@@ -10,7 +10,7 @@ leave-one-out in closed form.
 
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from math import comb
+from math import comb, prod
 
 import casadi as ca
 import numpy as np
@@ -64,7 +64,8 @@ def fit_entries(theta: Array, Y: Array) -> Entries:
         raise PlantError(f"the samples cannot be interpolated: {words}; add samples")
     x = ca.MX.sym("theta", p)
     scaled = 2.0 * (x - lower) / width - 1.0
-    terms = [ca.MX(1.0), *(_product(scaled, row) for row in powers[1:].astype(int))]
+    terms = [prod((scaled[j] ** int(k) for j, k in enumerate(row) if k), start=ca.MX(1.0))
+             for row in powers]  # fmt: skip
     y = ca.vertsplit(ca.mtimes(ca.DM(coefficients.T), ca.vertcat(*terms)))
     rms = np.sqrt((left_out**2).mean(axis=0))
     enough = len(theta) >= 2 * comb(p + 3, 3)
@@ -76,11 +77,3 @@ def fit_entries(theta: Array, Y: Array) -> Entries:
         if process.loo.rms < rms[i]:
             y[i], left_out[:, i] = to_casadi(process, std=False)(x), process.left_out
     return Entries(ca.Function("entries", [x], [ca.vertcat(*y)]), left_out)
-
-
-def _product(scaled: ca.MX, powers: np.ndarray) -> ca.MX:
-    factors = [scaled[j] ** int(power) for j, power in enumerate(powers) if power]
-    found = factors[0]
-    for factor in factors[1:]:
-        found *= factor
-    return found

@@ -70,24 +70,20 @@ def _tree(theta: Array) -> tuple[Index, Index]:
     return order.astype(np.int64), parents.astype(np.int64)
 
 
-def mac(one: Array, other: Array) -> Array:
-    """(r, r') MAC of the rows of two sets of shapes; 0 where a shape vanishes at every point."""
-    sizes = np.outer((one**2).sum(axis=1), (other**2).sum(axis=1))
-    return np.divide((one @ other.T) ** 2, sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
-
-
 def _matched(table: ModalTable, shapes: Array, order: Index, parents: Index, rigid: int) -> Index:
     """(N, r) which mode of each sample is the reference's i-th; flexible modes only move."""
     count = table.omega.shape[1]
     found = np.tile(np.arange(count), (len(table.theta), 1))
     for s in order[1:]:
         before = found[parents[s]][rigid:]
-        reference = shapes[parents[s]][before]
+        one, other = shapes[parents[s]][before], shapes[s][rigid:]
+        sizes = np.outer((one**2).sum(axis=1), (other**2).sum(axis=1))
+        # 0 where a shape vanishes at every point
+        mac = np.divide((one @ other.T) ** 2, sizes, out=np.zeros_like(sizes), where=sizes > 0.0)
         gap = np.abs(
             np.log(table.omega[parents[s]][before][:, None] / table.omega[s][rigid:][None, :])
         )
-        cost = 1.0 - mac(reference, shapes[s][rigid:]) + FREQUENCY_WEIGHT * gap
-        found[s, rigid:] = rigid + linear_sum_assignment(cost)[1]
+        found[s, rigid:] = rigid + linear_sum_assignment(1.0 - mac + FREQUENCY_WEIGHT * gap)[1]
     return found
 
 

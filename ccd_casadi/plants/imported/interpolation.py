@@ -50,9 +50,8 @@ class InterpolatedModes:
             )
         self.table, self.rigid = table, int(counts[0])
         self.ratio = _common_ratio(table, self.rigid)
-        tried = [self._fitted(frame) for frame in frames(table, self.rigid)]
-        best = min(range(len(tried)), key=lambda i: tried[i][2].response)
-        self.frame, entries, self.left_out = tried[best]
+        tried = map(self._fitted, frames(table, self.rigid))
+        self.frame, entries, self.left_out = min(tried, key=lambda one: one[2].response)
         theta = ca.MX.sym("theta", len(table.names))
         y = entries.at(theta)
         self._entries = ca.Function("entries", [theta], [y, ca.jacobian(y, theta)])
@@ -84,10 +83,13 @@ class InterpolatedModes:
         entries = fit_entries(table.theta, Y)
         return frame, entries, self._left_out(Y, Y - entries.left_out, frame)
 
-    def _pairs(self, frame: Frame) -> list[tuple[int, int]]:
-        """Entries of ln K that are not zero in the frame, upper triangle."""
-        groups = [group for group in frame.groups if group[0] >= self.rigid]
-        return [(i, j) for group in groups for i in group for j in group if i <= j]
+    def _pairs(self, frame: Frame) -> tuple[np.ndarray, ...]:
+        """Rows and columns of the entries of ln K that are not zero, upper triangle."""
+        label = np.zeros(self.table.omega.shape[1], int)
+        for number, group in enumerate(frame.groups):
+            label[list(group)] = number
+        own = label[self.rigid :]
+        return np.nonzero(np.triu(own[:, None] == own))
 
     def _vector(self, s: int, frame: Frame) -> Array:
         """Sample s in the frame as one vector: ln K, ln D where it is not modal, B, C."""
@@ -96,27 +98,21 @@ class InterpolatedModes:
         logarithms = [2.0 * np.log(omega)]
         if self.ratio is None:
             logarithms.append(np.log(2.0 * zeta * omega))
-        parts = []
-        for values in logarithms:
-            full = (Q[flexible, flexible] * values) @ Q[flexible, flexible].T
-            parts.append([full[i - self.rigid, j - self.rigid] for i, j in self._pairs(frame)])
-        parts += [(Q @ table.inputs[s]).ravel(), (Q @ table.outputs[s]).ravel()]
-        return np.concatenate(parts)
+        own = Q[flexible, flexible]
+        parts = [((own * values) @ own.T)[self._pairs(frame)] for values in logarithms]
+        return np.concatenate([*parts, *(np.ravel(Q @ part[s]) for part in
+                                         (table.inputs, table.outputs))])  # fmt: skip
 
     def _matrices(self, y: Array, frame: Frame) -> tuple[Array, Array, Array, Array]:
         """ln K, ln D (flexible modes), B and C of such a vector."""
-        pairs, r = self._pairs(frame), self.table.omega.shape[1]
+        rows, columns = self._pairs(frame)
+        r, m, start = self.table.omega.shape[1], self.table.inputs.shape[2], 0
         logarithms = np.zeros((2, r - self.rigid, r - self.rigid))
-        start = 0
-        for k in range(1 if self.ratio is not None else 2):
-            for (i, j), value in zip(pairs, y[start : start + len(pairs)], strict=True):
-                logarithms[k, i - self.rigid, j - self.rigid] = value
-                logarithms[k, j - self.rigid, i - self.rigid] = value
-            start += len(pairs)
-        m = self.table.inputs.shape[2]
+        for L in logarithms[: 1 if self.ratio is not None else 2]:
+            L[rows, columns] = L[columns, rows] = y[start : start + len(rows)]
+            start += len(rows)
         B = y[start : start + r * m].reshape(r, m)
-        C = y[start + r * m :].reshape(r, -1).T
-        return logarithms[0], logarithms[1], B, C
+        return *logarithms, B, y[start + r * m :].reshape(r, -1).T
 
     def _exponential(self, L: Array, dL: Array) -> tuple[Array, Array]:
         """exp(L) and its derivatives on the flexible modes, zero on the rigid ones."""

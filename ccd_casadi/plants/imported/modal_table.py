@@ -7,17 +7,18 @@ only), `modal_mass` (1 where mode shapes are mass-normalised), `hardware_cost`, 
 """
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.plants.imported.csv_rows import number_in, read_rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 KNOWN = ("mode", "frequency_hz", "damping", "modal_mass", "hardware_cost")
+Rows = dict[str, dict[str, str]]  # cells by column, by the row's place: `FILE: line N`
 PREFIXES = ("in:", "out:", "shape:", "constraint:")
 
 
@@ -68,31 +69,33 @@ def read_modal_table(path: Path) -> ModalTable:
         )
     ordered = [sorted(modes, key=lambda row: row["frequency_hz"]) for modes in samples.values()]
 
-    def block(names: Sequence[str]) -> Array:
-        values = np.array([[[row[name] for name in names] for row in modes] for modes in ordered])
-        values = values.reshape(len(ordered), len(ordered[0]), len(names))
-        masses = np.array([[row.get("modal_mass", 1.0) for row in modes] for modes in ordered])
-        return np.asarray(values / np.sqrt(masses)[:, :, None])
+    at = {name: np.array([[row[name] for row in modes] for modes in ordered]) for name in header}
+    shape = len(ordered), len(ordered[0])
+    masses = at.get("modal_mass", np.ones(shape))
 
-    def of_sample(name: str, default: float) -> Array:
-        table = np.array([[row.get(name, default) for row in modes] for modes in ordered])
+    def block(names: Sequence[str]) -> Array:
+        values = np.array([at[name] for name in names]).reshape(-1, *shape)
+        return np.asarray(np.moveaxis(values / np.sqrt(masses), 0, -1))
+
+    def of_sample(name: str) -> Array:
+        table = at.get(name, np.zeros(shape))
         if (np.abs(table - table[:, :1]) > 1e-9 * np.abs(table[:, :1])).any():
             raise PlantError(f"{path}: {name} differs between the modes of a sample; give one")
         return np.asarray(table[:, 0])
 
-    columns = [of_sample(name, 0.0) for name in groups["constraint:"]]
+    columns = [of_sample(name) for name in groups["constraint:"]]
     return ModalTable(
         names=tuple(theta_names),
         input_names=_stripped(groups["in:"]),
         output_names=_stripped(groups["out:"]),
         constraint_names=_stripped(groups["constraint:"]),
         theta=np.array(list(samples)),
-        omega=2.0 * np.pi * np.array([[row["frequency_hz"] for row in modes] for modes in ordered]),
-        zeta=np.array([[row["damping"] for row in modes] for modes in ordered]),
+        omega=2.0 * np.pi * at["frequency_hz"],
+        zeta=at["damping"],
         inputs=block(groups["in:"]),
         outputs=block(groups["out:"]),
         shapes=block(groups["shape:"]),
-        cost=of_sample("hardware_cost", 0.0),
+        cost=of_sample("hardware_cost"),
         constraints=np.array(columns).T.reshape(len(samples), len(columns)),
     )
 
@@ -131,3 +134,42 @@ def _mode(place: str, cells: dict[str, str]) -> dict[str, float]:
 
 def _stripped(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name.split(":", 1)[1] for name in names)
+
+
+def read_rows(path: Path) -> Rows:
+    """The rows under a header; lines that start with # are remarks.
+
+    Raises PlantError where it cannot be read, holds no rows, or a row has not the header's columns.
+    """
+    try:
+        lines = enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1)
+        kept = [(i, line) for i, line in lines if line.strip() and not line.startswith("#")]
+        parsed = list(csv.reader((line for _, line in kept), skipinitialspace=True))
+    except (OSError, UnicodeDecodeError) as error:
+        raise PlantError(f"{path}: cannot be read: {error}; name a CSV file in UTF-8") from None
+    except csv.Error as error:
+        raise PlantError(f"{path}: is not a CSV: {error}; separate cells by commas") from None
+    if len(parsed) < 2:
+        raise PlantError(f"{path}: holds no rows; give a header and rows below it")
+    header, *rows = ([cell.strip() for cell in cells] for cells in parsed)
+    if len(set(header)) < len(header) or not all(header):
+        raise PlantError(f"{path}: line {kept[0][0]}: a column's name is empty or twice there")
+    found = {}
+    for (number, _), cells in zip(kept[1:], rows, strict=False):
+        place = f"{path}: line {number}"
+        if len(cells) != len(header):
+            words = f"has {len(cells)} columns, the header {len(header)}"
+            raise PlantError(f"{place}: {words}; correct it")
+        found[place] = dict(zip(header, cells, strict=True))
+    return found
+
+
+def number_in(place: str, key: str, text: str) -> float:
+    """A cell as a finite number. Raises PlantError."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise PlantError(f"{place}: {key}: {text[:40]!r} is not a number; give one") from None
+    if not math.isfinite(value):
+        raise PlantError(f"{place}: {key}: {text[:40]!r} is not finite; give a number")
+    return value

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -54,44 +55,33 @@ def plant_of_table(
             f"{source} has the parameters {', '.join(table.names)}, the case "
             f"{', '.join(names)}; make them agree"
         )
-    if not names:
-        return _one_sample(table, rigid_below_hz)
     order = [table.names.index(name) for name in names]
     table = replace(table, names=tuple(names), theta=table.theta[:, order])
-    try:
-        modes = InterpolatedModes(table, 2.0 * np.pi * rigid_below_hz)
-    except PlantError as error:
-        raise PlantError(f"{source}: {error}") from error
-    scalars = fit_entries(table.theta, np.column_stack([table.cost, table.constraints]))
-    theta = ca.MX.sym("theta", len(names))
-    both = scalars.at(theta)
-    lam = both[1:] if both.numel() > 1 else ca.MX(0, 1)
+    theta, rigid_below = ca.MX.sym("theta", len(names)), 2.0 * np.pi * rigid_below_hz
+    numbers, between = np.column_stack([table.cost, table.constraints]), dict[str, Any]()
+    if names:
+        try:
+            modes = InterpolatedModes(table, rigid_below)
+        except PlantError as error:
+            raise PlantError(f"{source}: {error}") from error
+        scalars = fit_entries(table.theta, numbers).at(theta)
+        between = {
+            "evaluate": modes,
+            "references": {NEAREST: lambda at: row_of(table, modes.rigid, modes.nearest(at)[0])},
+            "notes": lambda at: _notes(modes, source, at),
+            "domain": (table.theta.min(axis=0), table.theta.max(axis=0)),
+        }
+    else:  # one model, whose forces and sensors [places] may move
+        found = row_of(table, int((table.omega[0] < rigid_below).sum()), 0)
+        scalars, between = ca.MX(ca.DM(numbers[0])), {"evaluate": lambda theta: found}
+    lam = scalars[1:] if scalars.numel() > 1 else ca.MX(0, 1)
     return Plant(
         names=tuple(names),
         constraint_names=table.constraint_names,
-        evaluate=modes,
-        hardware=ca.Function("hardware", [theta], [both[0], lam]),
+        hardware=ca.Function("hardware", [theta], [scalars[0], lam]),
         outputs=table.outputs.shape[2],
         inputs=table.inputs.shape[2],
-        references={NEAREST: lambda at: row_of(table, modes.rigid, modes.nearest(at)[0])},
-        notes=lambda at: _notes(modes, source, at),
-        domain=(table.theta.min(axis=0), table.theta.max(axis=0)),
-    )
-
-
-def _one_sample(table: ModalTable, rigid_below_hz: float) -> Plant:
-    """A table without parameters: one model, whose forces and sensors [places] may move."""
-    rigid = int((table.omega[0] < 2.0 * np.pi * rigid_below_hz).sum())
-    found, none = row_of(table, rigid, 0), ca.MX.sym("theta", 0)
-    return Plant(
-        names=(),
-        constraint_names=table.constraint_names,
-        evaluate=lambda theta: found,
-        hardware=ca.Function(
-            "hardware", [none], [float(table.cost[0]), ca.DM(table.constraints[0])]
-        ),
-        outputs=table.outputs.shape[2],
-        inputs=table.inputs.shape[2],
+        **between,
     )
 
 

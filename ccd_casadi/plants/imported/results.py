@@ -15,9 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.plants.imported.csv_rows import Rows, number_in
 from ccd_casadi.plants.imported.matrices import read_dofs, read_index, table_of_samples
-from ccd_casadi.plants.imported.modal_table import ModalTable
+from ccd_casadi.plants.imported.modal_table import ModalTable, Rows, number_in
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
