@@ -5,12 +5,13 @@
 At each stage and layout below every channel's largest bandwidth is searched by itself, with the
 structure and bounds of runs/rib_stage_built.toml, on the stage with twenty flexible modes, with and
 without payload: as it is and all modes 2 % lower and higher, at half the damping. ω_b is that of
-the slowest channel. Each actuator has a sensor at its place. Layouts keep the symmetry of the
-square, so that lift, tip (as tilt) and twist are channels of their own:
+the slowest channel. Each actuator has a sensor at its place. Layouts keep both axes as mirrors, so
+that lift, tip, tilt and twist are channels of their own; tilt is as tip where the square does:
 
-    0.09        four, at (±r, ±r)
-    0.09+0      five: one in the centre too, for lift alone
-    0.08+0.15   eight: four on each of two squares
+    0.09          four, at (±r, ±r)
+    0.09+0        five: one in the centre too, for lift alone
+    0.09+x0.12    six: two at (±x, 0) too, for lift and tilt; with +0 seven
+    0.08+0.15     eight: four on each of two squares
 
 **Equal force**: n actuators share the copper of four, so that forces f cost |f|² n/4 of what they
 cost there. KS is that force for a displacement of the corners, GS the displacement of the corners
@@ -72,10 +73,13 @@ HALF = 0.15  # m
 RADII = tuple(np.round(np.arange(0.05, 0.1501, 0.01), 3).tolist())
 SHIFT, DAMPING = 0.02, 0.5
 PAYLOAD = ((0.03, 0.0, 0.05),)  # m, m, kg: that of the case's set
-CHANNELS = ("z", "tip", "twist")
+CHANNELS = ("z", "tip", "tilt", "twist")
 RING = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])  # signs; as the case's corners
-POINTS = np.vstack([[(0.0, 0.0)], *(r * RING for r in RADII)])
-MOTIONS = {"z": np.ones(len(POINTS)), "tip": POINTS[:, 1], "twist": POINTS.prod(axis=1)}
+PAIR = np.array([(1, 0), (-1, 0)])
+POINTS = np.vstack([[(0.0, 0.0)], *(r * RING for r in RADII), *(r * PAIR for r in RADII)])
+MOTIONS = {"z": np.ones(len(POINTS)), "tip": POINTS[:, 1], "tilt": POINTS[:, 0],
+           "twist": POINTS.prod(axis=1)}  # fmt: skip
+Parts = Sequence[float | str]  # of a layout: r of a square, 0 the centre, "x0.12" two on the x axis
 
 
 @dataclass(frozen=True)
@@ -106,13 +110,23 @@ def problem() -> CoDesignProblem:
     return problem_of(load_case(CASE))
 
 
-def ring(r: float) -> list[int]:
-    return [1 + 4 * RADII.index(r) + i for i in range(4)] if r else [0]
+def rows_of(part: float | str) -> list[int]:
+    """Its rows of POINTS."""
+    if isinstance(part, str):
+        first = 1 + 4 * len(RADII) + 2 * RADII.index(float(part.removeprefix("x")))
+        return [first, first + 1]
+    return [1 + 4 * RADII.index(part) + i for i in range(4)] if part else [0]
 
 
-def layout(radii: Sequence[float]) -> Layout:
-    """Actuators at (±r, ±r) of each; every channel by the least forces that do its work."""
-    rows = [row for r in radii for row in ring(r)]
+def channels_of(radii: Parts) -> tuple[str, ...]:
+    """Those to search: tilt is as tip on a square."""
+    own = any(isinstance(part, str) for part in radii)
+    return CHANNELS if own else tuple(c for c in CHANNELS if c != "tilt")
+
+
+def layout(radii: Parts) -> Layout:
+    """Actuators at all parts; every channel by the least forces that do its work."""
+    rows = [row for part in radii for row in rows_of(part)]
     motions = {name: motion[rows] for name, motion in MOTIONS.items()}
     return Layout(tuple(rows), {name: v / np.linalg.norm(v) for name, v in motions.items()})
 
@@ -178,18 +192,22 @@ def on_the_whole_set(row: dict[str, Any]) -> dict[str, Any]:
     Inputs are loads at the corners: M_K of each channel makes its bound on KS one on equal force.
     """
     text = CASE.read_text()
-    points = [point for r in row["radii"] for point in ((r * RING).tolist() if r else [[0.0, 0.0]])]
+    points = POINTS[[i for part in row["radii"] for i in rows_of(part)]].tolist()
     edge = [[HALF, 0.0], [0.0, HALF], [-HALF, 0.0], [0.0, -HALF]]
-    nodes = f"{[*POINTS.tolist(), *edge]}"
+    edge = edge[1::2] if any(isinstance(part, str) for part in row["radii"]) else edge
+    among = POINTS if len(edge) < 4 else POINTS[: 1 + 4 * len(RADII)]
+    nodes = f"{[*among.tolist(), *edge]}"
     places = f"nodes = {nodes}\nactuators = {points}\nsensors = {points}\n"
     places = f"[places]\n{places}reference = {(HALF * RING).tolist()}\n\n[theta.h]"
     text = text.replace('outputs = "corners"', f'actuators = {nodes}\noutputs = "corners"')
     text = text.replace("[theta.h]", places, 1)
-    M_K = {c: 4.5e4 * row["levers"][c] for c in CHANNELS}
+    M_K = {c: 4.5e4 * row["levers"][c] for c in row["levers"]}
     text = text.replace("M_K = 4.5e4", f"M_K = {max(M_K.values()):.9g}")
-    for c in CHANNELS:
+    for c in M_K:
         table = f"[controller.channel.{c}]\n"
         text = text.replace(table, f"{table}M_K = {M_K[c]:.9g}\n")
+    if "tilt" in M_K:
+        text = "\n".join(line for line in text.splitlines() if not line.startswith("like = "))
     text = text.replace('"rib_stage_plants/', f'"{CASE.parent}/rib_stage_plants/')
     with TemporaryDirectory() as folder:
         path = Path(folder) / "case.toml"
@@ -247,7 +265,14 @@ def keep(row: dict[str, Any]) -> None:
 
 def count(row: dict[str, Any]) -> int:
     """Its actuators."""
-    return len([i for r in row["radii"] for i in ring(r)])
+    return len([i for part in row["radii"] for i in rows_of(part)])
+
+
+def _mm(part: float | str) -> str:
+    """A part of a layout in mm."""
+    if isinstance(part, str):
+        return f"x{1e3 * float(part.removeprefix('x')):.0f}"
+    return f"{1e3 * part:.0f}"
 
 
 def draw(name: str) -> None:
@@ -270,19 +295,20 @@ def draw(name: str) -> None:
         ax.tricontourf(x, y, z, levels=np.linspace(-1, 1, 15), cmap="RdBu_r", alpha=0.75)
         ax.tricontour(x, y, z, levels=[0.0], colors="k", linewidths=0.8)
         ax.plot(*(1e3 * HALF * RING.T), "k+", markersize=10, label="corners", clip_on=False)
-        for (n, row), marker in zip(shown.items(), "o^s", strict=False):
-            at = 1e3 * POINTS[[i for r in row["radii"] for i in ring(r)]].T
+        for (n, row), marker in zip(shown.items(), "o^sDv", strict=False):
+            at = 1e3 * POINTS[[i for part in row["radii"] for i in rows_of(part)]].T
             ax.plot(*at, marker, mec="w", ms=9, label=f"{n} placed")
         title = f"first mode in {words}: {modal.natural[k] / HZ:.0f} Hz"
         ax.set(aspect="equal", xlabel="x (mm)", ylabel="y (mm)", title=title)
     axes[0].legend(loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.42), frameon=False)
-    rows.sort(key=lambda row: (count(row), row["radii"]))
-    names = [" + ".join(f"{1e3 * r:.0f}" for r in row["radii"]) for row in rows]
-    for c, marker in zip(CHANNELS, "os^", strict=True):
-        axes[2].plot(names, [row["hz"][c] for row in rows], marker, label=c)
+    rows.sort(key=lambda row: (count(row), [str(part) for part in row["radii"]]))
+    names = [f"{count(row)}: " + "+".join(map(_mm, row["radii"])) for row in rows]
+    for c, marker in zip(CHANNELS, "osv^", strict=True):
+        axes[2].plot(names, [row["hz"].get(c, row["hz"]["tip"]) for row in rows], marker, label=c)
     whole = [row.get("whole", {}).get("bandwidth_hz", np.nan) for row in rows]
     axes[2].plot(names, whole, "kD", mfc="none", label="all, on the whole set")
-    axes[2].set(xlabel="r (mm)", ylabel="Hz", title=f"bandwidth, stage of {rows[0]['mass']:.3f} kg")
+    axes[2].set(ylabel="Hz", title=f"bandwidth, stage of {rows[0]['mass']:.3f} kg")
+    axes[2].tick_params(axis="x", rotation=45)
     axes[2].legend(frameon=False)
     axes[2].grid(alpha=0.3)
     fig.tight_layout()
@@ -298,7 +324,10 @@ def main() -> None:
     parser.add_argument("--whole", action="store_true", help="of the rows that are kept")
     parser.add_argument("--draw", action="store_true")
     given = parser.parse_args()
-    layouts = [[float(r) for r in words.split("+")] for words in given.layouts]
+    layouts: list[list[float | str]] = [
+        [part if part.startswith("x") else float(part) for part in words.split("+")]
+        for words in given.layouts
+    ]
     if given.draw:
         draw(given.stages[0])
         return
@@ -315,14 +344,14 @@ def main() -> None:
     for name in given.stages:
         theta, began = stage_theta(name), process_time()
         modals = stage_at(asked, theta)
-        ones = modals[0].B[modals[0].rigid][:, ring(HALF)] @ np.ones(4) / 4.0
+        ones = modals[0].B[modals[0].rigid][:, rows_of(HALF)] @ np.ones(4) / 4.0
         mass = 1.0 / float(ones @ ones)
         print(f"{name}: {mass:.4f} kg, {process_time() - began:.0f} s", flush=True)
         known: dict[str, list[Known]] = {c: [] for c in CHANNELS}
         for radii in layouts:
             where, hz, met = layout(radii), {}, {}
             kappa, levers = {}, {}
-            for c in CHANNELS:
+            for c in channels_of(radii):
                 plants, lever = channel(modals, where, c, asked.weights.M_K)
                 value, last, active = bandwidth(asked, plants, c, lever, known[c], given.starts)
                 hz[c], met[c], levers[c] = value / HZ, active, lever
@@ -334,7 +363,7 @@ def main() -> None:
             row = {"stage": name, "mass": mass, "radii": radii, "hz": hz, "J": J,
                    "active": met, "levers": levers, "kappa": kappa}  # fmt: skip
             print(f"  {radii}: {omega / HZ:.2f} Hz, J {J:.3f}; "
-                  + ", ".join(f"{c} {hz[c]:.1f} {met[c]}" for c in CHANNELS)
+                  + ", ".join(f"{c} {hz[c]:.1f} {met[c]}" for c in hz)
                   + f"; {process_time() - began:.0f} s", flush=True)  # fmt: skip
             if given.write:
                 keep(row)

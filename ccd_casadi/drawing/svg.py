@@ -27,7 +27,7 @@ BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
 PURPLE, AMBER, BROWN = "#b8548c", "#a87000", "#8c564b"
 BLACK, GREY = "#1a1a1a", "#767676"
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE, AMBER, BROWN, BLACK)
-# Colours of a figure -> the page's variable (`page.CSS`) that it becomes: (light, dark).
+# Colours of a figure -> the page's variable (`paint.CSS`) that it becomes: (light, dark).
 THEME = {
     "blue": (BLUE, "#5ab4ee"), "orange": (ORANGE, "#ff8f45"), "green": (GREEN, "#2fc79a"),
     "purple": (PURPLE, "#e59cc6"), "amber": (AMBER, "#e6b23c"), "brown": (BROWN, "#c9a093"),

@@ -19,7 +19,7 @@ from bokeh.plotting import figure
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.drawing.maps import GROUND, RING
-from ccd_casadi.drawing.page import escape
+from ccd_casadi.drawing.paint import escape
 from ccd_casadi.drawing.svg import ORANGE
 from ccd_casadi.explorer.controls import DARK
 from ccd_casadi.explorer.message import Change

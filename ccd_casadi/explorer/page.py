@@ -14,7 +14,7 @@ from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.markups import Div
 
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.drawing.page import escape
+from ccd_casadi.drawing.paint import escape
 from ccd_casadi.explorer.background import Background, Solve
 from ccd_casadi.explorer.controls import Controls
 from ccd_casadi.explorer.curves import curves_of, sampled_of, with_sampled

@@ -17,7 +17,7 @@ from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
 from tornado.web import StaticFileHandler
 
-from ccd_casadi.drawing.page import theme
+from ccd_casadi.drawing.paint import theme
 from ccd_casadi.explorer.background import Background
 from ccd_casadi.explorer.page import SOLVED, Page
 from ccd_casadi.explorer.panels import FIGURES

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.drawing.content import Lines, Modes
-from ccd_casadi.drawing.page import escape
-from ccd_casadi.drawing.paint import block_html
+from ccd_casadi.drawing.paint import block_html, escape
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of

@@ -79,15 +79,18 @@ class NodeInterpolation:
         slopes = np.vstack([dkernel, dpower]).T @ self._inverse
         return np.concatenate([kernel, power]) @ self._inverse, slopes / self.size
 
-    def left_out(self, values: Array) -> float:
-        """How far fields (n, N) at an inner node are from what the others say, over their largest.
+    def left_out(self, values: Array, points: Array) -> float:
+        """How far fields (n, N) are from what the other nodes say, over their largest.
 
-        Nodes at the edge are not counted: beyond the others nothing is interpolated.
+        At the inner nodes nearest to points (m, d): nodes that are far away say nothing of these,
+        and beyond an edge nothing is interpolated.
         """
         count, edge = len(self.nodes), np.abs(self._at).max(axis=0)
-        inner = (np.abs(self._at) < edge).all(axis=1)
+        inner = np.flatnonzero((np.abs(self._at) < edge).all(axis=1))
+        away = np.linalg.norm(self.nodes[inner, None] - points, axis=2)
+        near = inner[away.argmin(axis=0)] if len(inner) else inner
         gap = (self._inverse[:count] @ values.T) / np.diag(self._inverse[:count])[:, None]
-        share = np.abs(gap[inner]) / np.abs(values).max(axis=1, initial=1e-300)
+        share = np.abs(gap[near]) / np.abs(values).max(axis=1, initial=1e-300)
         return float(share.max(initial=0.0))
 
     def _row(self, at: Array) -> tuple[Array, Array, Array, Array]:

@@ -117,11 +117,12 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
 
     def notes(theta: Sequence[float]) -> tuple[str, ...]:
         whole = plant.evaluate(below(theta))
-        error = between.left_out(_flexible(whole)[1].T @ whole.B)
+        at = np.array([point for group in points for point in group.at(np.asarray(theta))])
+        error = between.left_out(_flexible(whole)[1].T @ whole.B, at)
         return (
             *plant.notes(below(theta)),
-            f"forces and sensors stand between {len(nodes)} nodes: an inner one, left out, is "
-            f"predicted to {100.0 * error:.2g} % of a mode's largest displacement at worst",
+            f"forces and sensors stand between {len(nodes)} nodes: the inner ones nearest to them, "
+            f"left out, are predicted to {100.0 * error:.2g} % of a mode's largest displacement",
         )
 
     evaluate = of(plant.evaluate)

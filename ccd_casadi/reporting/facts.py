@@ -19,47 +19,9 @@ from ccd_casadi.support.units import HZ, counted, display_unit, number, small_sh
 
 def conclusion(result: Mapping[str, Any]) -> str:
     """One sentence with the key numbers, for every kind of controller."""
-    if result["status"] == "infeasible":
-        return f"No feasible design: {result['reason']}"
-    verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
-    begins = f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}"
-    hz = f"{number(result['bandwidth_hz'])} Hz"
-    cost = f"a hardware cost of {cost_words(result)} (J = {number(result['objective'], 6)})"
-    if "race" in result:  # a fixed structure
-        order = f"a controller of order {result['controller']['order']}"
-        v = FIGURES[result.get("minimise", BANDWIDTH.key)]
-        own = "" if v is BANDWIDTH else f"{v.words} {v.shown(result[f'{v.entry}_of_set'])} and "
-        return f"{begins}: {order} with {own}a bandwidth of {hz} on {_plants(result)}, at {cost}."
-    certificate = result["certificate"]
-    proof = (
-        f"certified stable with ‖[W_S S; W_KS KS; W_T T]‖∞ ≤ {number(certificate['norm_bound'])}"
-        if certificate["passed"]
-        else "NOT certified"
-    )
-    return (
-        f"{begins}, with a closed-loop bandwidth of {hz} at {cost}, {proof}. It took "
-        f"{result['syntheses']} true syntheses and {number(result['seconds'], 2)} s."
-        f"{_prediction(result)}"
-    )
-
-
-def _plants(result: Mapping[str, Any]) -> str:
-    designed, judged = (result[name]["plants"] for name in ("certificate", "robust"))
-    if designed == judged == 1:
-        return "the model, the only plant of its set"
-    again = counted(judged, "plant")
-    return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
-
-
-def _prediction(result: Mapping[str, Any]) -> str:
-    """How good the prediction was; of a design that was itself a sample the figure says nothing."""
-    line = result.get("verdict", {}).get("predicted", {})
-    if result.get("formulation") == "direct":
-        return ""
-    if line.get("left_out") is not None:
-        missed = number(100.0 * line["left_out"], 2)
-        return f" It is a training sample; a surrogate without it misses ω_b by {missed} %."
-    return f" The prediction errs by {small_share(result['verification_error'])}."
+    theta = theta_words(result) if "theta" in result else ""
+    value = FIGURES[result.get("minimise", BANDWIDTH.key)]
+    return paragraph("report.conclusion", result, value, theta)
 
 
 def run_name(place: Path) -> str:
@@ -122,8 +84,7 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
 
 def facts(table: str, *known: Any) -> list[Fact]:
     """Quantity, value, remark: the rows of a table of `templates/facts.txt`, a line each."""
-    told = {"cost_words": cost_words, "prediction_words": prediction_words}
-    text = _text(f"facts.{table}", *known, channel_words=channel_words, **told)
+    text = _text(f"facts.{table}", *known)
     rows = ([*line.split(" :: ", 2), "", ""] for line in text.split("\n") if line)
     return [(quantity, value, remark) for quantity, value, remark, *_ in rows]
 
@@ -144,7 +105,8 @@ def _text(part: str, *known: Any, **functions: Any) -> str:
     name, macro = part.split(".")
     made = template(
         f"templates/{name}.txt", HZ=HZ, number=number, with_unit=with_unit, counted=counted,
-        small_share=small_share, **functions,
+        small_share=small_share, cost_words=cost_words, prediction_words=prediction_words,
+        channel_words=channel_words, **functions,
     )  # fmt: skip
     try:
         return str(getattr(made.module, macro)(*known))

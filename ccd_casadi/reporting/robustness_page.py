@@ -5,16 +5,31 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Chapter, Facts, Figure, Heading, Page, Table, Words
-from ccd_casadi.reporting import robustness_figures as figures
+from ccd_casadi.drawing.content import (
+    Band,
+    Chapter,
+    Curve,
+    Facts,
+    Figure,
+    Heading,
+    Level,
+    Lines,
+    Page,
+    Panel,
+    Table,
+    Words,
+)
+from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.reporting.facts import facts, paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.study import Study
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, number, with_unit
 
+SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
 
@@ -114,7 +129,32 @@ def _gains(found: Study) -> Chapter:
 
 
 def _perturbed(run: FinishedRun, found: Study) -> Chapter:
-    drawn = figures.perturbed(run, found, paragraph("robustness.perturbed", figures.SHOWN_PEAK))
+    """Peak and bandwidth over the shift, and over the damping; one mode at a time."""
+    S_max = run.problem.inner.S_max
+    panels = []
+    for line, label, factor in (
+        (found.shift, "resonance shift (%)", 100.0),
+        (found.damping, "damping × (–)", 1.0),
+    ):
+        judged = line.judged
+        x = np.array([item.place[0] for item in judged])
+        peak = np.array([item.peak if item.stable else np.nan for item in judged])
+        bandwidth = np.array([item.bandwidth / HZ for item in judged])
+        # the axis shows what matters about S_max; a loop near instability has any peak
+        top = min(float(np.nanmax(peak)) * 1.05, SHOWN_PEAK * S_max)
+        limit = (Level(S_max, f"S_max {S_max:g}", colour=GREY),)
+        ends = (factor * float(x[0]), factor * float(x[-1]))
+        curve = Curve(factor * x, peak, marker=".")
+        span = (1.0, max(top, 1.1 * S_max))
+        lost = _unstable(factor * x, peak, factor * np.array(line.stable), span)
+        faster = Curve(factor * x, bandwidth, colour=ORANGE, marker=".")
+        panels.append((
+            Panel(label, "‖S‖∞ (–)", (curve,), bands=lost, levels=limit, x_range=ends,
+                  y_range=span),
+            Panel(label, "ω_b (Hz)", (faster,), x_range=ends),
+        ))  # fmt: skip
+    lines = Lines(tuple(panels), "Peak of S and bandwidth off the model")
+    drawn = Figure(lines, paragraph("robustness.perturbed", SHOWN_PEAK))
     rows = tuple(
         (number(item.place[0], 5), 100.0 * item.place[1], "yes" if item.stable else "NO",
          item.bandwidth / HZ, item.peak) for item in found.modes
@@ -124,22 +164,70 @@ def _perturbed(run: FinishedRun, found: Study) -> Chapter:
     return Chapter("Plants off the model", (drawn, *modes))
 
 
+def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:
+    """The ends of a line on which the loop is lost, in grey."""
+    found: list[Band] = []
+    for outer, edge in ((x[0], stable[0]), (x[-1], stable[1])):
+        if outer != edge and np.isnan(peak).any():
+            ends = np.array([outer, edge])
+            label = "" if found else "unstable"
+            found.append(Band(ends, np.full(2, span[0]), np.full(2, span[1]), label, GREY))
+    return tuple(found)
+
+
+def shown_peak(run: FinishedRun, found: Study) -> float:
+    """The right end of the axis of peaks of the random plants."""
+    S_max = run.problem.inner.S_max
+    largest = max((i.peak for i in found.tolerances.judged if i.stable), default=S_max)
+    return float(min(1.02 * max(largest, S_max), SHOWN_PEAK * S_max))
+
+
 def _tolerances(run: FinishedRun, found: Study) -> Chapter:
-    hard, shown = found.tolerances, figures.shown_peak(run, found)
+    """Distributions of peak and bandwidth over the random plants; in the table of quantiles the
+    unstable ones are infinite peaks."""
+    hard, shown = found.tolerances, shown_peak(run, found)
+    judged = hard.judged
+    peak = np.sort([item.peak for item in judged if item.stable])
+    bandwidth = np.sort([item.bandwidth / HZ for item in judged if item.stable])
+    share = (np.arange(peak.size) + 1.0) / max(len(judged), 1)
+    S_max = run.problem.inner.S_max
+    limit = (Level(S_max, "S_max", vertical=True), Level(1.0, "all"))
+    panels = (
+        Panel("‖S‖∞ (–)", "share of the plants (–)", (Curve(peak, share),),
+              levels=limit, x_range=(min(*peak, S_max, 1e9), shown),
+              y_range=(0.0, 1.08)),
+        Panel("ω_b (Hz)", "share of the plants (–)", (Curve(bandwidth, share, colour=ORANGE),),
+              y_range=(0.0, 1.08)),
+    )  # fmt: skip
+    peaks = np.sort([item.peak for item in judged])
+    bands = np.sort([item.bandwidth / HZ if item.stable else 0.0 for item in judged])
+    shares = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+    at = [round(share * (len(judged) - 1)) for share in shares]
+    table = Table.of(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), shares, peaks[at], bands[at])
     theta = theta_words({
         "theta": dict(zip(run.problem.names, hard.worst.place, strict=True)),
         "units": dict(zip(run.problem.names, run.problem.units, strict=True)),
     })  # fmt: skip
     caption, *worst = _words("tolerances", hard, shown, theta)
-    drawn = figures.tolerances(run, found, caption)
-    return Chapter("Hardware tolerances", (drawn, *map(Words, worst)))
+    lines = Lines((panels,), "Peak and bandwidth of random hardware")
+    return Chapter("Hardware tolerances", (Figure(lines, caption, (table,)), *map(Words, worst)))
 
 
 def _structured(found: Study) -> list[Chapter]:
     bound = found.structured
     if bound is None:
         return []
-    drawn = figures.structured(bound, paragraph("robustness.structured", bound))
+    # 1/μ is what is allowed of complex errors; the level is what is allowed of real ones
+    panel = Panel(
+        "frequency (Hz)", "μ (–)", (Curve(bound.hz, bound.mu, "complex errors", BLUE),),
+        levels=(
+            Level(1.0 / bound.stiffness, f"bound for real errors (from {bound.worst_hz:.4g} Hz)"),
+        ),
+        log_x=True, log_y=True,
+        y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
+    )  # fmt: skip
+    lines = Lines(((panel,),), "Structured singular value")
+    drawn = Figure(lines, paragraph("robustness.structured", bound))
     return [Chapter("Structured singular value", (drawn,))]
 
 

@@ -24,7 +24,6 @@ from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_chapter import budget_chapter
 from ccd_casadi.reporting.facts import binding, conclusion, facts, run_name, theta_table
 from ccd_casadi.reporting.glance import glance
-from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.landscape import (
     Truths,
@@ -33,12 +32,13 @@ from ccd_casadi.reporting.landscape import (
     caption_landscape,
     landscape_data,
     read_truths,
+    slices_figure,
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
 from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_figure
-from ccd_casadi.reporting.slices import slices_figure
+from ccd_casadi.reporting.prediction import history_blocks, table_trust, trust_figure
 from ccd_casadi.reporting.start import start_chapter
 from ccd_casadi.reporting.structured_page import (
     bandwidths_table,
@@ -46,7 +46,6 @@ from ccd_casadi.reporting.structured_page import (
     controller_blocks,
     limits_blocks,
 )
-from ccd_casadi.reporting.trust import table_trust, trust_figure
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.progress import Progress
 

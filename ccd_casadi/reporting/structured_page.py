@@ -10,7 +10,7 @@ from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import SectionWords, gain_words
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
-from ccd_casadi.reporting.facts import binding
+from ccd_casadi.reporting.facts import binding, paragraph
 from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
@@ -81,32 +81,17 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
         *([("sections", whole, "continuous", hz(costs["continuous_hz"]))] if sampled else []),
         (f"sections: the design{least}", whole, loop, hz(result["bandwidth_hz"])),
     ]
-    words = (
-        "The first row is a certified bound under the same bounds on S, KS, T and GS. The others "
-        "are local searches that began at the design: at least these bandwidths are reached."
-    )
-    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), Words(
-        f"{words}{tolerance_words(costs.get('tolerances_hz', {}))}"
-    )
-
-
-def tolerance_words(hz: Mapping[str, float]) -> str:
-    """Which tolerances cost most, by the change of ω_b in Hz where each grows by 1 %."""
-    most = sorted(hz.items(), key=lambda item: item[1])[:MOST_TOLERANCES]
-    gains = [f"{number(-10.0 * value, 3)} Hz ({name})" for name, value in most if value < -LEAST_HZ]
-    if not gains:
-        return ""
-    return f" A tolerance narrower by a tenth would gain, to first order, {', '.join(gains)}."
+    most = sorted(costs.get("tolerances_hz", {}).items(), key=lambda item: item[1])
+    told = [item for item in most[:MOST_TOLERANCES] if item[1] < -LEAST_HZ]
+    words = Words(paragraph("report.costs", told))
+    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), words
 
 
 def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     """Gain and sections in Hz and damping; of `result` only `controller` is read."""
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
-    words = (
-        f"Gain {gain_words(controller)}, order {controller['order']}. Apart from the integrator, K "
-        "is stable. Every section has the gain 1 at s = 0 (the integrator's: at high frequency)."
-    )
+    words = paragraph("report.sections", controller, gain_words(controller))
     return Words(words), structured_table(found)
 
 

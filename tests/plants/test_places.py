@@ -69,7 +69,7 @@ def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed
     assert slopes @ values == pytest.approx(b + (c + c.T) @ point, abs=1e-8)
     node = int(rng.integers(len(GRID)))
     assert between.at(np.array(GRID[node]))[0] == pytest.approx(np.eye(len(GRID))[node], abs=1e-9)
-    assert between.left_out(values[None]) < 1e-8
+    assert between.left_out(values[None], point[None]) < 1e-8
 
 
 @few(20)
