@@ -9,15 +9,9 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ccd_casadi.support.command_line import ExitCode, command, run_folder
+from ccd_casadi.support.command_line import ExitCode, command, option, run_folder
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.options import (
-    break_frequencies,
-    break_frequency_options,
-    option,
-    positive,
-    valued,
-)
+from ccd_casadi.support.options import break_frequencies, break_frequency_options, positive, valued
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 

@@ -53,7 +53,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
-    from ccd_casadi.deployment import c_code, files, fmu, structured_text
+    from ccd_casadi.deployment import files, fmu, source_code
     from ccd_casadi.deployment.move import Electronics
     from ccd_casadi.deployment.on_hardware import on_hardware
     from ccd_casadi.deployment.pipeline import deploy
@@ -92,15 +92,15 @@ def main(options: argparse.Namespace) -> ExitCode:
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
-    for name in (*files.DESIGN_FILES, *c_code.FILES, structured_text.FILE, fmu.FILE):
+    for name in (*files.DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, fmu.FILE):
         (folder / name).unlink(missing_ok=True)
     files.write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
         K, name = found.realisation, run_name(options.run)
         naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed}
-        texts = c_code.write_c(folder, K, **naming, forward=moved.forward)
-        code = structured_text.structured_text(K, **naming)
-        (folder / structured_text.FILE).write_text(code, "utf-8")
+        texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
+        code = source_code.structured_text(K, **naming)
+        (folder / source_code.ST_FILE).write_text(code, "utf-8")
         if options.fmu and not fmu.write_fmu(folder / fmu.FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))

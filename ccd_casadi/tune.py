@@ -28,8 +28,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
     from ccd_casadi.codesign.inner_answer import answer_of
     from ccd_casadi.codesign.tuning import tune
-    from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.realisation import Realisation, block_diagonal
+    from ccd_casadi.deployment.source_code import write_c
     from ccd_casadi.drawing.stored import write_page
     from ccd_casadi.fixed_structure import Structure
     from ccd_casadi.inner_problem.sections_words import SectionWords

@@ -1,8 +1,8 @@
-"""Pictures of the site: python docs/pictures.py STAGE_RUN BUILT_RUN TUNED [EXPLORED_RUN]
+"""Pictures of the site: python docs/pictures.py STAGE_RUN BUILT_RUN TUNED FRONT_RUN [EXPLORED_RUN]
 
 STAGE_RUN, of the tutorial's stage, needs what `solve`, `robustness` and `deploy` write; BUILT_RUN
 is of runs/two_mass_built.toml, TUNED what `ccd tune` writes for the response or model of a stage,
-EXPLORED_RUN of runs/two_mass.toml.
+FRONT_RUN of examples/planar_stage with `insight`, EXPLORED_RUN of runs/two_mass.toml.
 """
 
 import re
@@ -24,6 +24,7 @@ PAGES = {  # which run, its page, and how much of it is shown: top, height
     "deploy_tutorial": (0, "deploy/report.html", 0, 1000),
     "report": (1, "report.html", 0, 1240),
     "tune": (2, "report.html", 0, 560),
+    "insight": (3, "insight.html", 0, 945),
 }
 
 
@@ -73,7 +74,7 @@ def main(runs: list[Path]) -> None:
                     "x": 120, "y": top, "width": 1040, "height": height})  # fmt: skip
                 picture = Image.open(BytesIO(taken)).convert("RGB").quantize(200)
                 picture.save(HERE / f"{name}.png", optimize=True)
-        for run in runs[3:]:
+        for run in runs[4:]:
             explorer(browser, run)
 
 

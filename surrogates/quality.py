@@ -33,11 +33,6 @@ class Missed:
     sigmas: float
     at_point: bool
 
-    @property
-    def where(self) -> str:
-        """Of it, as the subject of a sentence."""
-        return "the design" if self.at_point else "a sample beside the design"
-
 
 @dataclass(frozen=True, eq=False)
 class Quality:
@@ -119,11 +114,9 @@ class Quality:
         missed = self.missed
         if missed is None:
             return ""
-        what = "a sample" if missed.at_point else "one"
-        return (
-            f"{missed.where} is {what} that the others miss by {abs(missed.error):.3g} "
-            f"{self.unit}, {missed.sigmas:.1f} deviations"
-        )
+        of = "the design is a sample" if missed.at_point else "a sample beside the design is one"
+        error = f"{abs(missed.error):.3g} {self.unit}, {missed.sigmas:.1f} deviations"
+        return f"{of} that the others miss by {error}"
 
 
 def quality_of(

@@ -17,16 +17,14 @@ SHORTEST = 1e-4  # s in which jerk changes, where neither snap nor a sampling ra
 class MotorTable:
     """[motor]: one motor, or a catalogue as lists in rising order of the moving mass."""
 
-    force_constant: float | tuple[float, ...] | None = key(
+    force_constant: Numbers = key(
         "force per current, a list for a catalogue", None, check=one_or_more, unit="N/A"
     )
-    resistance: float | tuple[float, ...] | None = key(
-        "of the warm coil", None, check=one_or_more, unit="ohm"
-    )
-    peak_current: float | tuple[float, ...] | None = key(
+    resistance: Numbers = key("of the warm coil", None, check=one_or_more, unit="ohm")
+    peak_current: Numbers = key(
         "largest short-time current; absent: no limit", None, check=one_or_more, unit="A"
     )
-    moving_mass: float | tuple[float, ...] | None = key(
+    moving_mass: Numbers = key(
         "added to the plant where each force enters", None, check=one_or_more, unit="kg"
     )
     rms_power: float | None = key(

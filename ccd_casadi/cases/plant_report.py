@@ -29,6 +29,8 @@ def plant_report(
     start = facts[0]
     values = constraint_values(plant, problem.start)
     constraints = zip(plant.constraint_names, values, strict=True)
+    count = min(len(item.modes) for item in facts)
+    hertz = np.array([[mode.frequency_hz for mode in item.modes[:count]] for item in facts])
     return {
         "plant": case.plant.model or case.plant.function,
         "inputs": plant.inputs,
@@ -41,7 +43,8 @@ def plant_report(
         "inertia": start.inertia,
         "rigid_modes": sum(mode.rigid for mode in start.modes),
         "modes": [asdict(mode) for mode in start.modes],
-        "frequency_ranges_hz": _ranges(facts),
+        # least and largest of the i-th mode in order of frequency, over the points
+        "frequency_ranges_hz": np.column_stack([hertz.min(axis=0), hertz.max(axis=0)]).tolist(),
         "zeros": [asdict(zero) for zero in start.zeros],
         "effort_hz": start.effort_hz,
         "bandwidth_window_hz": [share * start.effort_hz for share in WINDOW],
@@ -73,13 +76,6 @@ def size_words(facts: PlantFacts) -> str:
         low, high = (share * facts.effort_hz for share in WINDOW)
         parts.append(f"M_K suits a bandwidth of {number(low, 2)} to {number(high, 2)} Hz")
     return ", ".join(parts)
-
-
-def _ranges(facts: Sequence[PlantFacts]) -> list[list[float]]:
-    """Least and largest frequency of the i-th mode in order of frequency, over the points."""
-    count = min(len(item.modes) for item in facts)
-    table = np.array([[mode.frequency_hz for mode in item.modes[:count]] for item in facts])
-    return [[float(low), float(high)] for low, high in zip(table.min(0), table.max(0), strict=True)]
 
 
 def _suitable(problem: CoDesignProblem, start: PlantFacts) -> list[dict[str, float]]:

@@ -6,7 +6,7 @@ checked, and the controller is certified again on the plant that the case file d
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,6 @@ from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
-from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
@@ -116,7 +115,9 @@ def read_run(folder: str | Path) -> FinishedRun:
     case = load_case(folder / "case.toml")
     problem = problem_of(case)
     theta = _theta(folder / "result.json", result, problem)
-    found = _READERS[type(problem.controller)](folder, problem, theta, result)
+    structured = isinstance(problem.controller, StructuredProblem)
+    read = _read_structured if structured else _read_mixed
+    found = read(folder, problem, theta, result)
     problem = found.pop("problem", problem)
     plant = scaled_plant(problem, theta)
     return FinishedRun(folder, case, problem, theta, plant, result=result, **found)
@@ -249,12 +250,6 @@ def _with_directions(
             for item in table["channels"]
         )
     return with_structured(problem, channels=channels)
-
-
-_READERS: dict[type[ControllerProblem], Callable[..., dict[str, Any]]] = {
-    MixedSensitivityProblem: _read_mixed,
-    StructuredProblem: _read_structured,
-}
 
 
 def read_json(path: Path) -> Mapping[str, Any]:

@@ -15,6 +15,8 @@ from ccd_casadi.cases.motion import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import NotebookHtml
 
+Spectra = tuple[Mapping[str, Any], ...]
+
 
 @dataclass(frozen=True)
 class PlantTable:
@@ -279,18 +281,10 @@ class BudgetTable:
     """
 
     window_ms: float | None = key("window of the moving average and the moving deviation", None)
-    force: tuple[Mapping[str, Any], ...] = key(
-        "spectra of forces on the stage", (), check=checks.tables
-    )
-    floor_motion: tuple[Mapping[str, Any], ...] = key(
-        "spectra of the floor's motion", (), check=checks.tables
-    )
-    sensor_noise: tuple[Mapping[str, Any], ...] = key(
-        "spectra of the sensor's noise", (), check=checks.tables
-    )
-    setpoint: tuple[Mapping[str, Any], ...] = key(
-        "spectra of the setpoint", (), check=checks.tables
-    )
+    force: Spectra = key("spectra of forces on the stage", (), check=checks.tables)
+    floor_motion: Spectra = key("spectra of the floor's motion", (), check=checks.tables)
+    sensor_noise: Spectra = key("spectra of the sensor's noise", (), check=checks.tables)
+    setpoint: Spectra = key("spectra of the setpoint", (), check=checks.tables)
 
 
 @dataclass(frozen=True)

@@ -40,16 +40,11 @@ def toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        escaped = "".join(_escape(letter) for letter in value)
-        return f'"{escaped}"'
+        marked = re.sub(r'(["\\])', r"\\\1", value)
+        shown = (c if c.isprintable() else f"\\U{ord(c):08X}" for c in marked)
+        return f'"{"".join(shown)}"'
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(toml, value)) + "]"
     if isinstance(value, Mapping):
         return "{" + ", ".join(_pairs(value)) + "}"
     return repr(value)
-
-
-def _escape(letter: str) -> str:
-    if letter in '"\\':
-        return "\\" + letter
-    return letter if letter.isprintable() else f"\\U{ord(letter):08X}"

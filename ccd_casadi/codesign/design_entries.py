@@ -52,10 +52,9 @@ def mixed_dict(problem: CoDesignProblem, theta: Sequence[float], design: Design)
     found = figures_dict(figures)
     if not figures.certified:
         return found
-    plants = [plant.plant_si()]
+    plants = [one.plant_si() for one in plant.members]
     rest = statics(plants[0], design.controller, bandwidth=figures.bandwidth,
                    omega_low=problem.inner.omega_low)  # fmt: skip
-    plants += [] if plant.family is None else [one.plant_si() for one in plant.family.perturbed]
     return (
         found
         | loop_entry(plants, design.controller, None, figures.bandwidth, figures.sensitivity_peak)

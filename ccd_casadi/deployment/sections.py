@@ -7,7 +7,6 @@ marks roots in the right half plane, as a frequency below zero does for a single
 poles that share a section with a pair of zeros show as one with ζ >= 1.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,21 +64,15 @@ def sections_of(K: StateSpace, bandwidth: float) -> Sections:
     """
     poles, zeros = _roots(K.poles), _roots(K.zeros(float(np.abs(K.poles).max())))
     gain = float((K.D - K.C @ np.linalg.solve(K.A, K.B))[0, 0])
-    pairs = _matched([z for z in zeros if z.damping is not None],
-                     [p for p in poles if p.damping is not None], FAR)  # fmt: skip
-    used = [root for pair in pairs for root in pair]
-    zeros, poles = _left(zeros, used), _left(poles, used)
+    pairs: list[tuple[Root | None, Root | None]] = [*_matched(zeros, poles, True, FAR)]
     for zero in [z for z in zeros if z.damping is not None]:
         partner = _two_real(poles)
         if partner is not None:
             zeros.remove(zero)
             pairs.append((zero, partner))
-    singles = _matched([z for z in zeros if z.damping is None],
-                       [p for p in poles if p.damping is None])  # fmt: skip
-    used = [root for pair in singles for root in pair]
-    found = [_section(z, p, bandwidth / HZ) for z, p in (*pairs, *singles)]
-    found += [_section(z, None, bandwidth / HZ) for z in _left(zeros, used)]
-    found += [_section(None, p, bandwidth / HZ) for p in _left(poles, used)]
+    pairs += _matched(zeros, poles, False)
+    pairs += [*((zero, None) for zero in zeros), *((None, pole) for pole in poles)]
+    found = [_section(zero, pole, bandwidth / HZ) for zero, pole in pairs]
     found.sort(key=lambda s: abs((s.pole or s.zero or Root(0.0)).hz))
     at = K.response(np.array([bandwidth]))[0]
     return Sections(gain, float(abs(at[0, 0])), tuple(found))
@@ -97,28 +90,24 @@ def _roots(values: np.ndarray) -> list[Root]:
 
 
 def _matched(
-    zeros: Sequence[Root], poles: Sequence[Root], most: float = np.inf
+    zeros: list[Root], poles: list[Root], paired: bool, most: float = np.inf
 ) -> list[tuple[Root, Root]]:
-    """Nearest pairs first, none further apart than the ratio `most`."""
+    """Pairs of a zero and a pole, both complex (`paired`) or both real, the nearest first and none
+    further apart than the ratio `most`; taken out of both lists."""
     apart = sorted(
         (abs(np.log(abs(z.hz / p.hz))), i, j)
         for i, z in enumerate(zeros)
         for j, p in enumerate(poles)
+        if (z.damping is not None) == (p.damping is not None) == paired
     )
-    rows, columns, found = set(), set(), []
+    taken: dict[int, int] = {}
     for distance, i, j in apart:
-        if distance > np.log(most):
-            break
-        if i not in rows and j not in columns:
-            rows.add(i)
-            columns.add(j)
-            found.append((zeros[i], poles[j]))
+        if distance <= np.log(most) and i not in taken and j not in taken.values():
+            taken[i] = j
+    found = [(zeros[i], poles[j]) for i, j in taken.items()]
+    zeros[:] = [z for i, z in enumerate(zeros) if i not in taken]
+    poles[:] = [p for j, p in enumerate(poles) if j not in taken.values()]
     return found
-
-
-def _left(roots: Sequence[Root], used: Sequence[Root]) -> list[Root]:
-    taken = {id(root) for root in used}
-    return [root for root in roots if id(root) not in taken]
 
 
 def _two_real(roots: list[Root]) -> Root | None:

@@ -167,10 +167,11 @@ class Lines:
 
 @dataclass(frozen=True)
 class ThetaPath:
-    """A method's way over θ, rows (θ₁, θ₂)."""
+    """A method's way over θ, rows (θ₁, θ₂), in a colour of its own or the next one."""
 
     label: str
     theta: Array
+    colour: str = ""
 
 
 @dataclass(frozen=True)

@@ -61,9 +61,10 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
                                      linestyle=(0, (4, 3)), linewidth=0.8, clip_on=False,
                                      label="last trust region", gid="level-region"))  # fmt: skip
         for i, path in enumerate(land.paths):
-            axes.plot(*path.theta.T, "-o", color=svg.CYCLE[(i + 1) % len(svg.CYCLE)], linewidth=1.2,
-                      markersize=6, clip_on=False, markerfacecolor="white", markeredgewidth=1.3,
-                      label=path.label, zorder=5, gid=f"curve{i}")  # fmt: skip
+            colour = path.colour or svg.CYCLE[(i + 1) % len(svg.CYCLE)]
+            axes.plot(*path.theta.T, "-o", color=colour, linewidth=1.2, markersize=6, clip_on=False,
+                      markerfacecolor="white", markeredgewidth=1.3, label=path.label, zorder=5,
+                      gid=f"curve{i}")  # fmt: skip
         if land.optimum is not None:
             a, b = land.optimum
             axes.plot([a], [b], "*", color=svg.ORANGE, markersize=15, clip_on=False, zorder=7,

@@ -53,6 +53,8 @@ def typeset(text: str) -> str:
     'less than ±2~%, norm ≤ 3, 41~µm'
     >>> typeset("KKT residual 1.5e-16, at confidence 1 - 1e-6")
     'KKT residual 1.5·10⁻¹⁶, at confidence 1 - 10⁻⁶'
+    >>> typeset("KKT residual 0.0e+00")
+    'KKT residual 0.0'
     """
     for plain, sign in (("+-", "±"), ("<=", "≤"), (">=", "≥")):
         text = text.replace(plain, sign)
@@ -63,6 +65,8 @@ def typeset(text: str) -> str:
 
 def _power(found: re.Match[str]) -> str:
     power = f"10{str(int(found[2])).translate(SUPERSCRIPT)}"
+    if not int(found[2]):  # a residual of 0.0e+00
+        return found[1]
     return power if found[1] == "1" else f"{found[1]}·{power}"
 
 

@@ -35,7 +35,7 @@ class How(StrEnum):
 
     PRESENT = "one synthesis at the present weights"
     SEARCHED = "full inner search: the largest bandwidth at this θ"
-    STRUCTURED = "fixed structure, climbed from its anchors at this θ"
+    STRUCTURED = "fixed structure, designed at this θ"
     HELD = "fixed structure, the controller designed last, judged at this θ"
 
 

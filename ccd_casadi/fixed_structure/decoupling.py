@@ -177,5 +177,5 @@ def in_units_of(plant: ScaledPlant, first: ScaledPlant) -> ScaledPlant:
     drive = time * first.force / plant.force
     return replace(
         plant, A=time * plant.A, B=drive * plant.B, dA=time * plant.dA, dB=drive * plant.dB,
-        omega_0=first.omega_0, force=first.force, channels=(), family=None,
+        omega_0=first.omega_0, force=first.force, channels=(), family=(),
     )  # fmt: skip

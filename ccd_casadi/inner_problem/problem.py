@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
-from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import NotebookHtml
@@ -191,7 +191,7 @@ def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
         return nominal
     design = scaled(Perturbation(robust.design_shift)) if robust.design_shift else nominal
     others = (p for p in robust.perturbations() if p != Perturbation())
-    return replace(nominal, family=PlantFamily(design, tuple(scaled(p) for p in others)))
+    return replace(nominal, family=(design, *map(scaled, others)))
 
 
 def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:

@@ -114,24 +114,11 @@ def flexible_modes(pencil: Pencil, rigid: Array, count: int) -> tuple[Array, Arr
     return mu[order] - pencil.shift, V[:, order]
 
 
-@dataclass(frozen=True)
-class Resolvent:
-    """(K - λM)⁺ F for many λ from one Krylov space, away from the modes deflated."""
-
-    shift: float
-    basis: Array
-    projected: Array
-    right: Array
-
-    def at(self, value: float) -> Array:
-        """(n, r) solution at λ = value, M-orthogonal to the modes deflated."""
-        k = len(self.projected)
-        system = np.eye(k) - (value + self.shift) * self.projected
-        return self.basis @ np.linalg.solve(system, self.right)
-
-
-def build_resolvent(pencil: Pencil, modes: Array, F: Array, largest: float) -> Resolvent:
-    """Block Krylov space of A⁻¹M from A⁻¹F, M-orthogonal to `modes` (n, k, all known ones).
+def build_resolvent(
+    pencil: Pencil, modes: Array, F: Array, largest: float
+) -> Callable[[float], Array]:
+    """λ -> (K - λM)⁺ F (n, r) from one block Krylov space of A⁻¹M from A⁻¹F, M-orthogonal to
+    `modes` (n, k, all known ones).
 
     (K - λM)x = F reads (1 - (λ + shift) A⁻¹M) x = A⁻¹F, and Krylov spaces do not depend on λ.
     With every mode up to λ deflated the operator is positive definite: Galerkin's method is
@@ -175,5 +162,10 @@ def build_resolvent(pencil: Pencil, modes: Array, F: Array, largest: float) -> R
             break
     else:
         raise StageError("the stage's mode derivatives did not converge; retain another number")
-    T = MV.T @ W
-    return Resolvent(pencil.shift, V, 0.5 * (T + T.T), MV.T @ start)
+    T, right = MV.T @ W, MV.T @ start
+    T = 0.5 * (T + T.T)
+
+    def at(value: float) -> Array:
+        return V @ np.linalg.solve(np.eye(len(T)) - (value + pencil.shift) * T, right)
+
+    return at

@@ -13,7 +13,6 @@ With |S| <= 1/√2 up to ω_b and <= M beyond, the share θ(ω_b) of the weight 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from ccd_casadi.kernels.frequency import prepare, responses
 from ccd_casadi.plants.modal import ModalPlant
@@ -135,13 +134,8 @@ def bandwidth_limit_hz(zero: Zero, S_max: float) -> float:
     >>> round(bandwidth_limit_hz(Zero(10.0, -1.0, 1.0), 2.0), 2)  # z tan(60°), real zero
     17.32
     """
-    x = -zero.damping_ratio * zero.frequency_hz
-    y = zero.frequency_hz * np.sqrt(max(0.0, 1.0 - zero.damping_ratio**2))
-    most = np.log(S_max) / (np.log(S_max) + 0.5 * np.log(2.0))
-
-    def excess(log_hz: float) -> float:
-        w = np.exp(log_hz)
-        return float((np.arctan((w - y) / x) + np.arctan((w + y) / x)) / np.pi - most)
-
-    centre = np.log(zero.frequency_hz)
-    return float(np.exp(scipy.optimize.brentq(excess, centre - 30.0, centre + 30.0)))
+    x, size = -zero.damping_ratio * zero.frequency_hz, zero.frequency_hz
+    angle = np.pi * np.log(S_max) / (np.log(S_max) + 0.5 * np.log(2.0))
+    # tan of both sides of θ(ω_b) = angle/π: 2 x ω_b = (|z|² - ω_b²) tan(angle)
+    across, along = x * np.cos(angle), size * np.sin(angle)
+    return float(size * along / (np.hypot(across, along) + across))

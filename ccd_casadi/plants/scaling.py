@@ -38,25 +38,15 @@ class ScaledChannel:
 
 
 @dataclass(frozen=True)
-class PlantFamily:
-    """A plant off its model: what the controller is designed on, and what it has to hold on.
-
-    All have the ω₀, the force and the drive of the plant that they belong to.
-    """
-
-    design: "ScaledPlant"
-    perturbed: tuple["ScaledPlant", ...]
-
-
-@dataclass(frozen=True)
 class ScaledPlant:
     """State space (A, B, C) of M_K G(jω₀ω), what its kernels need, and the way back to SI.
 
     `grid` are frequencies over ω₀ that resolve every resonance and transmission zero, `gain`
     the least singular value of the scaled plant there. `dA`, `dB`, `dC` are derivatives to θ
     with ω₀ and the coordinates frozen. `channels` are the blocks of an exactly block-diagonal
-    plant (see `channels`), empty where it is not. With a `family` a synthesis is one for all of
-    it, and the peak of S the largest on any of it, this plant included.
+    plant (see `channels`), empty where it is not. With a `family`, the plant that a controller is
+    designed on and those that it has to hold on, all with the ω₀, the force and the drive of this
+    one, a synthesis is one for all, and the peak of S the largest on any of these and this one.
     """
 
     A: Array
@@ -71,17 +61,17 @@ class ScaledPlant:
     dB: Array
     dC: Array
     channels: tuple[ScaledChannel, ...] = ()
-    family: PlantFamily | None = None
+    family: "tuple[ScaledPlant, ...]" = ()
 
     @property
     def design_plant(self) -> "ScaledPlant":
         """The plant that a design is made on: itself, or that of its family."""
-        return self if self.family is None else self.family.design
+        return self.family[0] if self.family else self
 
     @property
     def members(self) -> "tuple[ScaledPlant, ...]":
         """The plants that a design on it is judged on: itself, and those of its family."""
-        return (self, *(() if self.family is None else self.family.perturbed))
+        return (self, *self.family[1:])
 
     @property
     def system(self) -> StateSpace:

@@ -6,10 +6,10 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.sections import Root, sections_of
+from ccd_casadi.deployment.source_code import COMPILE
 from ccd_casadi.deployment.words import figure_rows, order_words, reason_words, short_status
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE

@@ -9,9 +9,9 @@ import json
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 from ccd_casadi.sampling.rows import COLUMNS, DAMAGED, Sample, decoded, from_row, numbers_of, to_row
 from ccd_casadi.support.errors import UserError
@@ -45,7 +45,7 @@ create index if not exists results_of_problem on results (problem);
 """
 
 
-class SampleStore:
+class SampleStore(AbstractContextManager["SampleStore"]):
     """`with SampleStore(path) as store:`; raises SampleStoreError where the file is unusable."""
 
     def __init__(self, path: str | Path) -> None:
@@ -101,9 +101,6 @@ class SampleStore:
                 if "locked" not in str(error) or time.monotonic() > deadline:
                     raise
             time.sleep(0.01)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -28,11 +28,10 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     """report.html of a comparison; reads the folder's samples."""
     problem, found = comparison.problem, answer["conclusions"]
     best = found["best"]
-    chapters = [
-        c.Chapter("The methods", _methods(problem, answer)),
-        c.Chapter("What it shows", tuple(map(c.Words, found["sentences"]))),
-        c.Chapter("Cost", (cost_figure(comparison.methods),)),
-    ]
+    chapters = [c.Chapter("The methods", _methods(problem, answer))]
+    if more := found["sentences"][2:]:  # the head has the first two
+        chapters.append(c.Chapter("What it shows", tuple(map(c.Words, more))))
+    chapters.append(c.Chapter("Cost", (cost_figure(comparison.methods),)))
     if len(problem.names) == 2:
         chapters.append(c.Chapter("Paths over the landscape", (_paths(folder, comparison, best),)))
     if best is not None:
@@ -96,10 +95,10 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[c.Table,
     if not baseline_of(problem).swept:
         words = (
             "Each formulation ends with a polish and a KKT certificate on the true problem. A "
-            "synthesis is a climb from the anchors, or a multi-start search; the descent and the "
-            "sequential designs climb from the best formulation's anchors. Left out: the descent "
-            "with K held fixed and the landscape over the weights' frequencies, which sections "
-            "do not have."
+            "synthesis is a search from the warm starts, or a multi-start search. The descent and "
+            "the sequential designs use the best formulation's warm starts. Sections have no "
+            "weights, so the descent with K held fixed and the landscape over the weights' "
+            "frequencies are left out."
         )
     return c.Table(head, tuple(rows)), c.Words(words)
 
@@ -205,6 +204,10 @@ def _cost_table(methods: Sequence[Method]) -> c.Table:
 
 
 def theta_paths(methods: Sequence[Method]) -> tuple[c.ThetaPath, ...]:
-    """The way over the two parameters of each method that is no formulation."""
-    walked = [method for method in methods if method.path and method.solution is None]
-    return tuple(c.ThetaPath(LABELS[method.name], np.array(method.path)) for method in walked)
+    """The way over the two parameters of each method that is no formulation, in the colour that it
+    has in the figure of the cost."""
+    return tuple(
+        c.ThetaPath(LABELS[method.name], np.array(method.path), CYCLE[i % len(CYCLE)])
+        for i, method in enumerate(methods)
+        if method.path and method.solution is None
+    )

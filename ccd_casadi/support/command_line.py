@@ -55,21 +55,19 @@ def parser(
     result = Parser(prog=program(command), description=description, epilog=codes)
     result.add_argument(type=Path, **place)
 
-    def add(name: str, words: str, **how: Any) -> None:
-        words = argparse.SUPPRESS if name in without_effect else words
-        result.add_argument(name, help=words, **how)
-
-    add("--out", "the folder to write into", metavar="DIR", type=_folder)
-    add(
-        "--workers", "worker processes (default: all cores)", metavar="N", type=integer(1),
-        default=usable_cores(),
-    )  # fmt: skip
-    add(
-        "--seed", "seed of all random numbers (default: 0)", metavar="N", type=integer(0), default=0
-    )
-    add("--quiet", "print no progress and no summary", action="store_true")
-    words = "refuse a case whose plant is a Python function"
-    add("--no-user-code", words, action="store_true")
+    shared: dict[str, dict[str, Any]] = {
+        "--out": {"metavar": "DIR", "type": _folder, "help": "the folder to write into"},
+        "--workers": {"metavar": "N", "type": integer(1), "default": usable_cores(),
+                      "help": "worker processes (default: all cores)"},
+        "--seed": {"metavar": "N", "type": integer(0), "default": 0,
+                   "help": "seed of all random numbers (default: 0)"},
+        "--quiet": {"action": "store_true", "help": "print no progress and no summary"},
+        "--no-user-code": {"action": "store_true",
+                           "help": "refuse a case whose plant is a Python function"},
+    }  # fmt: skip
+    for name, how in shared.items():
+        told = argparse.SUPPRESS if name in without_effect else how["help"]
+        result.add_argument(name, **how | {"help": told})
     return result
 
 

@@ -6,6 +6,7 @@ A task whose worker dies is tried once more, in a new one.
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from multiprocessing import connection
 from reprlib import Repr
 from typing import Any, Protocol, Self, TypeVar
@@ -47,7 +48,7 @@ class Pool(Protocol):
         """
 
 
-class Workers:
+class Workers(AbstractContextManager["Workers"]):
     """A lazily started process pool; with one worker the tasks run in this process.
 
     Processes are spawned, never forked, and import NumPy with one BLAS thread. They ignore
@@ -60,9 +61,6 @@ class Workers:
         self.patience = patience
         self._workers: list[WorkerProcess] = []
         self._mapping = False
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._end(self._workers)

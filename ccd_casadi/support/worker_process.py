@@ -14,10 +14,10 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib import import_module
 from multiprocessing import connection, resource_tracker
-from typing import Any, ParamSpec, Self, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -82,7 +82,7 @@ class WorkerProcess:
             self.pipe.close()
 
 
-class Runner:
+class Runner(AbstractContextManager["Runner"]):
     """One process for calls that may never return: killed at its deadline, started anew.
 
     Compiled code that loops cannot be interrupted from Python; its process can. A context manager.
@@ -90,9 +90,6 @@ class Runner:
 
     def __init__(self) -> None:
         self._process: WorkerProcess | None = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         if self._process is not None:

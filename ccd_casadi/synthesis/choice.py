@@ -71,7 +71,7 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
     m, p = plant.B.shape[1], plant.C.shape[0]
     if not p <= count <= m:
         raise UserError(f"{count} of {m} inputs for {p} outputs: give a number from {p} to {m}")
-    if weights.delta or plant.family is not None:
+    if weights.delta or plant.family:
         words = "of the model alone, without an input disturbance"
         raise UserError(f"inputs are chosen by the mixed sensitivity {words}; leave these out")
     squared: dict[tuple[int, ...], float] = {}

@@ -163,7 +163,7 @@ def sweep(
     w0 = plant.omega_0
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     points = [weights.at(float(s), float(t)) for s in S for t in T]
-    if plant.family is not None or compliance:
+    if plant.family or compliance:
         made = (synthesise(plant, point, omega_low=omega_low, gamma_backoff=gamma_backoff,
                            compliance=compliance) for point in points)  # fmt: skip
         return [design.figures for design in made]
@@ -188,7 +188,7 @@ def over_family(
     is of that one; the certified norm is of the plant itself, and no optimal one there.
     """
     w0 = plant.omega_0
-    if row[Column.CODE] != Code.CERTIFIED or plant.family is None:
+    if row[Column.CODE] != Code.CERTIFIED or not plant.family:
         return figures_from_row(row, weights, w0), plant
     w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
@@ -203,7 +203,7 @@ def over_family(
         own = assessed(plant, max(row[Column.GAMMA], (1.0 + LEVEL) * own[Column.NORM]))
     worst = plant
     if own[Column.CODE] == Code.CERTIFIED:
-        for member in plant.family.perturbed:
+        for member in plant.members[1:]:
             other = assessed(member, UNBOUNDED)
             if other[Column.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
                 figures = figures_from_row(own, weights, w0)

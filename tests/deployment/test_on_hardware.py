@@ -17,10 +17,9 @@ from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.anti_windup import back_calculation, takeover, with_anti_windup
-from ccd_casadi.deployment.c_code import vectors
 from ccd_casadi.deployment.move import PARTS, Electronics, move
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
-from ccd_casadi.deployment.structured_text import structured_text
+from ccd_casadi.deployment.source_code import structured_text, vectors
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError

@@ -15,7 +15,7 @@ from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Plant, mechanics
-from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.solve import main
 from ccd_casadi.synthesis.closed_loop import measure
@@ -109,7 +109,7 @@ def test_derivatives_with_several_channels() -> None:
 
     def family(at: np.ndarray) -> ScaledPlant:
         made = [scale_plant(shifted(plant, tuple(at), s), M_K) for s in (0.0, -0.01, 0.01)]
-        return ScaledPlant(**(vars(made[0]) | {"family": PlantFamily(made[1], (made[2],))}))
+        return ScaledPlant(**(vars(made[0]) | {"family": tuple(made[1:])}))
 
     def at(point: np.ndarray) -> Sensitivities:
         return sensitivities(family(point), weights, omega_low=OMEGA_LOW)

@@ -1,11 +1,14 @@
 """What pages say in words and shade in figures is what the numbers say."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from ccd_casadi import reporting
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -15,7 +18,7 @@ from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.reporting.facts import conclusion, theta_table, theta_words
+from ccd_casadi.reporting.facts import conclusion, facts, theta_table, theta_words
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, ways_figure
@@ -222,3 +225,29 @@ def test_arrows_of_a_nyquist_plot_point_to_higher_frequencies() -> None:
         ends = head.x[::2] + 1j * head.y[::2]
         way = L(at * 1.001) - L(at / 1.001)
         assert ((place - ends) * np.conj(way)).real.min() > 0.9 * abs(way) * abs(place - ends).max()
+
+
+def test_a_table_of_facts_says_what_it_lacks_and_keeps_a_strangers_names() -> None:
+    """A run of before may know less: its page leaves the chapter out for a KeyError."""
+    assert facts("margins", {}) == []
+    with pytest.raises(KeyError, match="crossover_hz"):
+        facts("margins", {"phase_margin_deg": 41.0, "gain_margin": None, "delay_margin_us": 6.0,
+                          "modulus_margin": 0.5})  # fmt: skip
+    ideal = {"S_max": 1.7, "S_low": 0.03, "omega_low": HZ, "compliance_max": None}
+    problem = SimpleNamespace(
+        figure=BANDWIDTH, w1=1.0, w2=-1.0, inner=SimpleNamespace(**ideal), robust=None
+    )
+    rows = facts("problem", problem, "of | fixed <b>structure</b>", "")
+    assert ("Controller", "of | fixed <b>structure</b>", "") in rows
+    assert all(len(row) == 3 for row in rows)
+
+
+def test_every_part_of_the_words_is_said_somewhere() -> None:
+    package = Path(reporting.__file__).parents[1]
+    code = "".join(path.read_text() for path in package.rglob("*.py"))
+    for name in ("facts", "report", "insight", "robustness", "deployment"):
+        words = (package / "templates" / f"{name}.txt").read_text()
+        for macro in re.findall(r"{% macro (\w+)\(", words):
+            inside = len(re.findall(rf"\b{macro}\(", words)) > 1
+            said = rf'"{name}\.{macro}"|\b(facts|_words)\([^)]*"{macro}"'
+            assert inside or re.search(said, code), f"{name}.{macro}"

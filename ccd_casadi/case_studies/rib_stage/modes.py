@@ -169,7 +169,7 @@ def slopes(
     adjoint = []
     for i in range(keep):
         gap = np.where(close[i], np.inf, lam - lam[i])
-        Z = resolvent.at(lam[i]) + V @ ((V.T @ Q) / gap[:, None]) - rigid @ (rigid.T @ Q) / lam[i]
+        Z = resolvent(lam[i]) + V @ ((V.T @ Q) / gap[:, None]) - rigid @ (rigid.T @ Q) / lam[i]
         adjoint.append(Z @ R)
     rank = F.shape[1]
     left = np.hstack([kept, *adjoint])

@@ -5,7 +5,7 @@ distances, edges by the corners that they join, faces by the edges around them; 
 do, the nearest is taken.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,31 +37,22 @@ class Boundary:
     faces: Mapping[int, Piece]
 
 
-@dataclass(frozen=True)
-class Pairing:
-    """The new numbers of a boundary's pieces; an edge in `reversed` runs the other way."""
-
-    corners: Mapping[int, int]
-    edges: Mapping[int, int]
-    faces: Mapping[int, int]
-    reversed: frozenset[int]
-
-
 def boundary_of(gmsh: Any) -> Boundary:
     """That of the solid which gmsh has loaded."""
     model = gmsh.model
 
-    def piece(dimension: int, tag: int, points: Array) -> Piece:
-        rim = model.getBoundary([(dimension, tag)], oriented=False)
-        return Piece(model.getType(dimension, tag), frozenset(n for _, n in rim), points)
+    def pieces(dimension: int, points: Callable[[int], Array]) -> dict[int, Piece]:
+        found = {}
+        for _, tag in model.getEntities(dimension):
+            rim = model.getBoundary([(dimension, tag)], oriented=False)
+            kind = model.getType(dimension, tag)
+            found[tag] = Piece(kind, frozenset(n for _, n in rim), points(tag))
+        return found
 
     return Boundary(
         {tag: model.getValue(0, tag, []) for _, tag in model.getEntities(0)},
-        {tag: piece(1, tag, edge_points(gmsh, tag, QUARTERS)) for _, tag in model.getEntities(1)},
-        {
-            tag: piece(2, tag, np.array([model.occ.getCenterOfMass(2, tag)]))
-            for _, tag in model.getEntities(2)
-        },
+        pieces(1, lambda tag: edge_points(gmsh, tag, QUARTERS)),
+        pieces(2, lambda tag: np.array([model.occ.getCenterOfMass(2, tag)])),
     )
 
 
@@ -71,22 +62,23 @@ def edge_points(gmsh: Any, tag: int, shares: Array) -> Array:
     return np.reshape(gmsh.model.getValue(1, tag, low + shares * (high - low)), (-1, 3))
 
 
-def matched(old: Boundary, new: Boundary) -> Pairing:
-    """Which piece of `new` each piece of `old` is. Raises PlantError where they do not agree."""
+def matched(old: Boundary, new: Boundary) -> tuple[dict[int, int], dict[int, int], dict[int, int]]:
+    """The number in `new` of each corner, edge and face of `old`, less than 0 of an edge that runs
+    the other way, as gmsh has it. Raises PlantError where they do not agree."""
     for word in ("corners", "edges", "faces"):
         before, now = len(getattr(old, word)), len(getattr(new, word))
         if before != now:
             raise PlantError(f"it has {now} {word} where the meshed one has {before}; {REMEDY}")
-    rows, columns = linear_sum_assignment(
-        cdist(_stack(old.corners), _stack(new.corners), "sqeuclidean")
-    )
+    at = (np.array(list(one.corners.values())).reshape(-1, 3) for one in (old, new))
+    rows, columns = linear_sum_assignment(cdist(*at, "sqeuclidean"))
     numbers = list(old.corners), list(new.corners)
     corners = {numbers[0][i]: numbers[1][j] for i, j in zip(rows, columns, strict=True)}
     edges = _pieces("edge", old.edges, new.edges, corners)
     faces = _pieces("face", old.faces, new.faces, edges)
-    away = {tag: _distances(old.edges[tag], new.edges[other]) for tag, other in edges.items()}
-    turned = frozenset(tag for tag, (straight, back) in away.items() if back < straight)
-    return Pairing(corners, edges, faces, turned)
+    for tag, other in edges.items():
+        straight, back = _distances(old.edges[tag], new.edges[other])
+        edges[tag] = -other if back < straight else other
+    return corners, edges, faces
 
 
 REMEDY = "narrow the bounds so that no face or edge appears, vanishes or merges"
@@ -111,10 +103,6 @@ def _pieces(
     if len(set(found.values())) != len(old):
         raise PlantError(f"two {word}s of the meshed solid are one here; {REMEDY}")
     return found
-
-
-def _stack(corners: Mapping[int, Array]) -> Array:
-    return np.array(list(corners.values())).reshape(-1, 3)
 
 
 def _distances(one: Piece, other: Piece) -> tuple[float, float]:

@@ -71,7 +71,7 @@ def reduced(
         return out
     resolvent = build_resolvent(pencil, np.hstack([rigid, vectors]), F, lam[-1])
     beside = [
-        resolvent.at(value)
+        resolvent(value)
         + more @ ((more.T @ F) / (values[count:] - value)[:, None])
         - rigid @ (rigid.T @ F) / value
         for value in lam

@@ -64,9 +64,8 @@ class Morph:
         return np.array(found)
 
     def _unit(self, theta: Sequence[float] | Array) -> Array:
-        return (2.0 * np.asarray(theta, float) - self.lower - self.upper) / (
-            self.upper - self.lower
-        )
+        middle, half = 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
+        return (np.asarray(theta, float) - middle) / half
 
 
 def draw_morph(

@@ -11,7 +11,7 @@ from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.surface import surface_figure
 from ccd_casadi.plants.cad.elements import Body, Material
-from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced, surface
+from ccd_casadi.plants.cad.modes import mode_shapes, reduced, surface
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
 from ccd_casadi.plants.fixed import remembered, with_fixed
@@ -85,7 +85,15 @@ class CadStage:
     def mechanics(self, theta: Sequence[float], derivatives: bool = True) -> Mechanics:
         """Rigid-body motions, then flexible modes by frequency; SI. θ in the morph's order."""
         ports = tuple(dict.fromkeys((*self.forces, *self.sensors)))
-        found = self.modal_model(theta, ports, derivatives)
+        body = Body(self.morph.points(theta), self.morph.tets, self.material)
+        velocities = self.morph.velocities(theta)[: None if derivatives else 0]
+        nodes = len(body.places)
+        F = np.zeros((3 * nodes, len(ports)))
+        dF = np.zeros((len(velocities), 3 * nodes, len(ports)))
+        for k, (face, axis) in enumerate(ports):
+            block = slice(axis * nodes, (axis + 1) * nodes)
+            F[block, k], dF[:, block, k] = body.mean(self.morph.faces[face], velocities)
+        found = reduced(body, velocities, F, dF, self.modes, self._held(body))
         count = found.M.shape[0] - self.modes
         rows = [MOTIONS.index(name) for name in self.rigid] if count else []
         rows += range(count, count + self.modes)
@@ -103,20 +111,6 @@ class CadStage:
                 dM, np.zeros_like(dM), dK, dF[:, :, drive], dF[:, :, read].transpose(0, 2, 1),
             ),
         )  # fmt: skip
-
-    def modal_model(
-        self, theta: Sequence[float], ports: Sequence[Port], derivatives: bool
-    ) -> Reduced:
-        """All motions and modes, driven and read at `ports`."""
-        body = Body(self.morph.points(theta), self.morph.tets, self.material)
-        velocities = self.morph.velocities(theta)[: None if derivatives else 0]
-        count = len(body.places)
-        F = np.zeros((3 * count, len(ports)))
-        dF = np.zeros((len(velocities), 3 * count, len(ports)))
-        for k, (face, axis) in enumerate(ports):
-            block = slice(axis * count, (axis + 1) * count)
-            F[block, k], dF[:, block, k] = body.mean(self.morph.faces[face], velocities)
-        return reduced(body, velocities, F, dF, self.modes, self._held(body))
 
     def _held(self, body: Body) -> np.ndarray:
         """(3N,) the unknowns that are zero."""
@@ -144,13 +138,11 @@ class CadStage:
 
     def mass_slope(self, theta: Sequence[float] | Array) -> Array:
         """∂mass/∂θ, (p,)."""
-        first = self.morph.points(theta)[self.morph.tets]
-        edges = first[:, 1:] - first[:, :1]
+        corners = self.morph.points(theta)[self.morph.tets]
         moved = self.morph.velocities(theta)[:, self.morph.tets]
-        steps = moved[:, :, 1:] - moved[:, :, :1]
-        a, b, c = edges.transpose(1, 0, 2)
-        sides = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-        return self.material.density * np.einsum("ptij,tij->p", steps, sides) / 6.0
+        edges, steps = (part[..., 1:, :] - part[..., :1, :] for part in (corners, moved))
+        growth = np.einsum("tij,ptji->pt", np.linalg.inv(edges), steps)
+        return self.material.density * growth @ np.linalg.det(edges) / 6.0
 
 
 def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh") -> Plant:

@@ -124,13 +124,13 @@ def moved_points(gmsh: Any, mesh: SolidMesh) -> Array:
 
     Raises PlantError where its boundary has other pieces, or where an element turns inside out.
     """
-    same = matched(mesh.boundary, boundary_of(gmsh))
+    corners, edges, faces = matched(mesh.boundary, boundary_of(gmsh))
     old, new = mesh.points, mesh.points.copy()
     for tag, node in mesh.corners.items():
-        new[node] = gmsh.model.getValue(0, same.corners[tag], [])
+        new[node] = gmsh.model.getValue(0, corners[tag], [])
     for tag, (inner, share) in mesh.edges.items():
-        here = 1.0 - share if tag in same.reversed else share
-        new[inner] = edge_points(gmsh, same.edges[tag], here)
+        here = 1.0 - share if edges[tag] < 0 else share
+        new[inner] = edge_points(gmsh, abs(edges[tag]), here)
     placed = np.array([*mesh.corners.values(), *(n for e in mesh.edges.values() for n in e[0])])
     surface = [placed]
     for tag, triangles in mesh.faces.items():
@@ -138,7 +138,7 @@ def moved_points(gmsh: Any, mesh: SolidMesh) -> Array:
         inner = np.setdiff1d(triangles, rim)
         if inner.size:
             step = extended(old, triangles, rim, new[rim] - old[rim])[inner]
-            near, _ = gmsh.model.getClosestPoint(2, same.faces[tag], (old[inner] + step).ravel())
+            near, _ = gmsh.model.getClosestPoint(2, faces[tag], (old[inner] + step).ravel())
             new[inner] = near.reshape(-1, 3)
             surface.append(inner)
     boundary = np.concatenate(surface)

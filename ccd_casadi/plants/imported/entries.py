@@ -8,7 +8,6 @@ Source: Hastie, Tibshirani & Friedman, The Elements of Statistical Learning (200
 leave-one-out in closed form.
 """
 
-from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from math import comb, prod
 
@@ -24,16 +23,9 @@ SINGULAR = 1e-9  # terms that the samples do not tell apart, or samples that not
 GOOD = 1e-3  # of an entry's range: below it a polynomial is not compared with a process
 
 
-@dataclass(frozen=True)
-class Entries:
-    """θ -> q numbers; `left_out` (N, q): the error at each sample, predicted without it."""
-
-    at: ca.Function
-    left_out: Array
-
-
-def fit_entries(theta: Array, Y: Array) -> Entries:
-    """Numbers Y (N, q) at samples θ (N, p). Raises PlantError where the samples are too few."""
+def fit_entries(theta: Array, Y: Array) -> tuple[ca.Function, Array]:
+    """θ -> q numbers, of numbers Y (N, q) at samples θ (N, p), and the error (N, q) at each sample,
+    predicted without it. Raises PlantError where the samples are too few."""
     lower, width = theta.min(axis=0), np.ptp(theta, axis=0)
     N, p = theta.shape
     unit = 2.0 * (theta - lower) / np.where(width > 0.0, width, np.nan) - 1.0
@@ -76,4 +68,4 @@ def fit_entries(theta: Array, Y: Array) -> Entries:
             raise PlantError(f"the samples cannot be interpolated: {error}; add samples") from error
         if process.loo.rms < rms[i]:
             y[i], left_out[:, i] = to_casadi(process, std=False)(x), process.left_out
-    return Entries(ca.Function("entries", [x], [ca.vertcat(*y)]), left_out)
+    return ca.Function("entries", [x], [ca.vertcat(*y)]), left_out

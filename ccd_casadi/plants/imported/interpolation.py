@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.imported.entries import Entries, fit_entries
+from ccd_casadi.plants.imported.entries import fit_entries
 from ccd_casadi.plants.imported.frames import Frame, frames
 from ccd_casadi.plants.imported.modal_table import ModalTable
 from ccd_casadi.plants.plant import Mechanics, named_values
@@ -53,22 +53,21 @@ class InterpolatedModes:
         tried = map(self._fitted, frames(table, self.rigid))
         self.frame, entries, self.left_out = min(tried, key=lambda one: one[2].response)
         theta = ca.MX.sym("theta", len(table.names))
-        y = entries.at(theta)
+        y = entries(theta)
         self._entries = ca.Function("entries", [theta], [y, ca.jacobian(y, theta)])
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         """M, D, K, B, C and their derivatives at θ."""
         y, slopes = (np.array(value) for value in self._entries(np.asarray(theta, float)))
-        values = self._matrices(y.ravel(), self.frame)
-        along = [self._matrices(column, self.frame) for column in slopes.T]
-        r, count = self.table.omega.shape[1], len(along)
-        K, dK = self._exponential(values[0], np.array([item[0] for item in along]))
+        L, log_D, B, C = self._matrices(y.T, self.frame)
+        dL, dlog_D, dB, dC = self._matrices(slopes.T, self.frame)
+        r, count = self.table.omega.shape[1], len(dL)
+        K, dK = self._exponential(L[0], dL)
         D, dD = np.zeros((r, r)), np.zeros((count, r, r))
         if self.ratio is None:
-            D, dD = self._exponential(values[1], np.array([item[1] for item in along]))
-        dB, dC = (np.array([item[k] for item in along]) for k in (2, 3))
+            D, dD = self._exponential(log_D[0], dlog_D)
         derivatives = (np.zeros((count, r, r)), dD, dK, dB, dC)
-        return Mechanics(np.eye(r), D, K, values[2], values[3], self.ratio, derivatives)
+        return Mechanics(np.eye(r), D, K, B[0], C[0], self.ratio, derivatives)
 
     def nearest(self, theta: Sequence[float]) -> tuple[int, float]:
         """The nearest sample, and how far it is (the largest share of the table's range)."""
@@ -77,11 +76,21 @@ class InterpolatedModes:
         distance = np.abs((self.table.theta - np.asarray(theta)) / width).max(axis=1)
         return int(distance.argmin()), float(distance.min())
 
-    def _fitted(self, frame: Frame) -> tuple[Frame, Entries, LeftOut]:
-        table = self.table
-        Y = np.array([self._vector(s, frame) for s in range(len(table.theta))])
-        entries = fit_entries(table.theta, Y)
-        return frame, entries, self._left_out(Y, Y - entries.left_out, frame)
+    def _fitted(self, frame: Frame) -> tuple[Frame, ca.Function, LeftOut]:
+        """θ -> entries in the frame: ln K, ln D where it is not modal, B and C; and their error."""
+        table, Q, flexible = self.table, frame.Q, slice(self.rigid, None)
+        omega, own = table.omega[:, flexible], Q[:, flexible, flexible]
+        logarithms = [2.0 * np.log(omega)]
+        if self.ratio is None:
+            logarithms.append(np.log(2.0 * table.zeta[:, flexible] * omega))
+        full = [(own * values[:, None]) @ own.transpose(0, 2, 1) for values in logarithms]
+        rows, columns = self._pairs(frame)
+        Y = np.hstack([
+            *(part[:, rows, columns] for part in full),
+            *((Q @ part).reshape(len(Q), -1) for part in (table.inputs, table.outputs)),
+        ])  # fmt: skip
+        entries, left_out = fit_entries(table.theta, Y)
+        return frame, entries, self._left_out(Y, Y - left_out, frame)
 
     def _pairs(self, frame: Frame) -> tuple[np.ndarray, ...]:
         """Rows and columns of the entries of ln K that are not zero, upper triangle."""
@@ -91,28 +100,17 @@ class InterpolatedModes:
         own = label[self.rigid :]
         return np.nonzero(np.triu(own[:, None] == own))
 
-    def _vector(self, s: int, frame: Frame) -> Array:
-        """Sample s in the frame as one vector: ln K, ln D where it is not modal, B, C."""
-        table, Q, flexible = self.table, frame.Q[s], slice(self.rigid, None)
-        omega, zeta = table.omega[s, flexible], table.zeta[s, flexible]
-        logarithms = [2.0 * np.log(omega)]
-        if self.ratio is None:
-            logarithms.append(np.log(2.0 * zeta * omega))
-        own = Q[flexible, flexible]
-        parts = [((own * values) @ own.T)[self._pairs(frame)] for values in logarithms]
-        return np.concatenate([*parts, *(np.ravel(Q @ part[s]) for part in
-                                         (table.inputs, table.outputs))])  # fmt: skip
-
-    def _matrices(self, y: Array, frame: Frame) -> tuple[Array, Array, Array, Array]:
-        """ln K, ln D (flexible modes), B and C of such a vector."""
+    def _matrices(self, Y: Array, frame: Frame) -> tuple[Array, Array, Array, Array]:
+        """ln K, ln D (flexible modes), B and C of rows (k, q) of such entries."""
         rows, columns = self._pairs(frame)
         r, m, start = self.table.omega.shape[1], self.table.inputs.shape[2], 0
-        logarithms = np.zeros((2, r - self.rigid, r - self.rigid))
+        logarithms = np.zeros((2, len(Y), r - self.rigid, r - self.rigid))
         for L in logarithms[: 1 if self.ratio is not None else 2]:
-            L[rows, columns] = L[columns, rows] = y[start : start + len(rows)]
+            L[:, rows, columns] = L[:, columns, rows] = Y[:, start : start + len(rows)]
             start += len(rows)
-        B = y[start : start + r * m].reshape(r, m)
-        return *logarithms, B, y[start + r * m :].reshape(r, -1).T
+        B, C = np.split(Y[:, start:], [r * m], axis=1)
+        C = C.reshape(len(Y), r, self.table.outputs.shape[2]).transpose(0, 2, 1)
+        return *logarithms, B.reshape(len(Y), r, m), C
 
     def _exponential(self, L: Array, dL: Array) -> tuple[Array, Array]:
         """exp(L) and its derivatives on the flexible modes, zero on the rigid ones."""
@@ -128,20 +126,18 @@ class InterpolatedModes:
         return full, 0.5 * (slopes + slopes.transpose(0, 2, 1))
 
     def _left_out(self, Y: Array, predicted: Array, frame: Frame) -> LeftOut:
-        frequency, response = np.zeros(len(Y)), np.zeros(len(Y))
-        for s, (true, found) in enumerate(zip(Y, predicted, strict=True)):
-            L = self._matrices(found, frame)[0]
-            if L.size:
-                omega = np.exp(0.5 * np.linalg.eigvalsh(L))
-                frequency[s] = np.abs(omega / self.table.omega[s, self.rigid :] - 1.0).max()
-            one, other = (self._response(y, frame) for y in (true, found))
+        omega = np.exp(0.5 * np.linalg.eigvalsh(self._matrices(predicted, frame)[0]))
+        moved = np.abs(omega / self.table.omega[:, self.rigid :] - 1.0).max(initial=0.0)
+        missed = []
+        for pair in zip(Y, predicted, strict=True):
+            one, other = (self._response(y[None], frame) for y in pair)
             sizes = np.linalg.norm(one, axis=(1, 2))
-            response[s] = (np.linalg.norm(other - one, axis=(1, 2)) / sizes).max()
-        return LeftOut(float(frequency.max()), float(response.max()))
+            missed.append((np.linalg.norm(other - one, axis=(1, 2)) / sizes).max())
+        return LeftOut(float(moved), float(max(missed)))
 
     def _response(self, y: Array, frame: Frame) -> np.ndarray:
         """G at s = (0.1 + j) ω over the band of the modes, undamped."""
-        L, _, B, C = self._matrices(y, frame)
+        (L,), _, (B,), (C,) = self._matrices(y, frame)
         K, _ = self._exponential(L, np.zeros((0, *L.shape)))
         flexible = self.table.omega[:, self.rigid :]
         low, high = (flexible.min(), flexible.max()) if flexible.size else (1.0, 10.0)

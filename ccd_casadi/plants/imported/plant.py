@@ -64,7 +64,7 @@ def plant_of_table(
             modes = InterpolatedModes(table, rigid_below)
         except PlantError as error:
             raise PlantError(f"{source}: {error}") from error
-        scalars = fit_entries(table.theta, numbers).at(theta)
+        scalars = fit_entries(table.theta, numbers)[0](theta)
         between = {
             "evaluate": modes,
             "references": {NEAREST: lambda at: row_of(table, modes.rigid, modes.nearest(at)[0])},

@@ -1,8 +1,11 @@
-"""The difference equation as C99: a header, a source, and a test with its own vectors.
+"""The difference equation as source code: C99 with a test of its own, and structured text.
 
 No allocation, no library but the test's, double precision. Data are row-major: the blocks of A one
-after the other, then B (states × errors), C (forces × states), D (forces × errors). The output is
-computed before the state is advanced, so that u leaves as early as it can.
+after the other (in structured text A whole), then B (states × errors), C (forces × states),
+D (forces × errors). The output is computed before the state is advanced, so that u leaves as early
+as it can. The structured text (IEC 61131-3) is one function block for a PLC's fast task, with the
+same order of operations in LREAL. Only what every PLC has is used: FOR, IF, arrays of constants.
+`RESET` puts it to rest, `TAKEOVER` begins with the forces U_BEFORE, otherwise a call is one sample.
 """
 
 from collections.abc import Mapping
@@ -17,6 +20,7 @@ from ccd_casadi.deployment.realisation import (
     Realisation,
     difference_equation,
     dot,
+    literal,
     literals,
     plain_title,
 )
@@ -27,7 +31,7 @@ COMPILE = (
     "cc -std=c99 -O2 -ffp-contract=off -Wall -Wextra -pedantic "
     "-o controller_test controller.c controller_test.c"
 )
-FILES = ("controller.h", "controller.c", "controller_test.c")
+C_FILES, ST_FILE = ("controller.h", "controller.c", "controller_test.c"), "controller.st"
 SAMPLES = 64  # of the test vectors
 ERROR = 1e-6  # m; size of the errors in the test vectors
 TOLERANCE = 1e-12  # of the largest force
@@ -51,21 +55,44 @@ def c_files(
     `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none.
     """
     K, limit = realisation.system, realisation.saturation
-    n, p, m = len(K.A), K.B.shape[1], len(K.C)
     errors, forwards, first, forces = vectors(realisation)
-    values = {
-        "title": plain_title(title), "verified": verified, "n": n, "p": p, "m": m,
-        "period": f"{K.period:.17g}", "rate": f"{1.0 / K.period:.10g}", "delay": f"{delay:.10g}",
-        "ahead": f"{delay + 0.5 * K.period:.6g}", "room": max(n, 1),
-        "limit": None if limit is None else f"{limit:.17g}", "L": realisation.back_calculation,
+    values = _values(realisation, title, delay, verified) | {
+        "rate": f"{1.0 / K.period:.10g}", "ahead": f"{delay + 0.5 * K.period:.6g}",
+        "room": max(len(K.A), 1), "limit": None if limit is None else f"{limit:.17g}",
         "blocks": realisation.blocks or (0,), "A": realisation.block_entries,
-        "B": K.B, "C": K.C, "D": K.D, "X": takeover(K),
-        "F": np.zeros((ORDER + 1, m, p)) if forward is None else forward,
+        "F": np.zeros((ORDER + 1, *K.D.shape)) if forward is None else forward,
         "compile": COMPILE, "tolerance": f"{TOLERANCE:g}", "samples": SAMPLES,
         "errors": errors, "forwards": forwards, "first": first, "forces": forces,
+        "initialiser": lambda entries: f"{{\n    {literals(entries, 4)}\n}}",
     }  # fmt: skip
-    made = (template(f"deployment/templates/{name}", initialiser=_initialiser) for name in FILES)
-    return {name: each.render(values) for name, each in zip(FILES, made, strict=True)}
+    return {name: template(f"deployment/templates/{name}").render(values) for name in C_FILES}
+
+
+def structured_text(realisation: Realisation, *, title: str, delay: float, verified: bool) -> str:
+    """The function block; delay in s. A controller without states keeps one that stays at rest."""
+    K, limit, sizes = realisation.system, realisation.saturation, realisation.blocks or (1,)
+    n, (m, p), rest = sum(sizes), K.D.shape, {}
+    if not len(K.A):
+        shapes = {"A": (1, 1), "B": (1, p), "C": (m, 1), "X": (1, p + m), "L": (1, m)}
+        rest = {name: np.zeros(shape) for name, shape in shapes.items()}
+    starts = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
+    L = realisation.back_calculation
+    values = _values(realisation, title, delay, verified) | {
+        "n": n, "limit": literal(1e308 if limit is None else limit), "starts": starts,
+        "ends": starts + np.repeat(sizes, sizes) - 1, "A": K.A,
+        "L": np.zeros((n, m)) if L is None else L, "numbers": lambda entries: literals(entries, 8),
+    }  # fmt: skip
+    return template(f"deployment/templates/{ST_FILE}").render(values | rest)
+
+
+def _values(realisation: Realisation, title: str, delay: float, verified: bool) -> dict[str, Any]:
+    """What both languages need."""
+    K = realisation.system
+    return {
+        "title": plain_title(title), "verified": verified, "period": f"{K.period:.17g}",
+        "delay": f"{delay:.10g}", "n": len(K.A), "p": K.B.shape[1], "m": len(K.C),
+        "B": K.B, "C": K.C, "D": K.D, "L": realisation.back_calculation, "X": takeover(K),
+    }  # fmt: skip
 
 
 def vectors(realisation: Realisation) -> tuple[Array, Array, Array, Array]:
@@ -81,7 +108,3 @@ def vectors(realisation: Realisation) -> tuple[Array, Array, Array, Array]:
     first = np.full(len(K.C), 0.5 * size)
     start = [dot(row, [*errors[0], *first]) for row in takeover(K).tolist()]
     return errors, forwards, first, difference_equation(realisation, errors, forwards, start)
-
-
-def _initialiser(values: Array) -> str:
-    return f"{{\n    {literals(values, 4)}\n}}"
