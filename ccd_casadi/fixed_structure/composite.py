@@ -109,6 +109,12 @@ class CompositeProblem(LoopProblem):
                     names[j] += f" of {own.name}"
         return names
 
+    def gains_of(self, constraints: Constraints) -> np.ndarray:
+        out = np.zeros((len(constraints.v), 2), int)
+        for number, (part, at, own) in enumerate(self.split(constraints)):
+            out[at] = part.problem.gains_of(own) + np.array([number, 0])
+        return out
+
     def plants_of(self, constraints: Constraints) -> np.ndarray:
         """Of all."""
         out = np.zeros(len(constraints.v), int)

@@ -33,7 +33,7 @@ from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.outer_structured import multistart_at, value_with_design
 from ccd_casadi.codesign.run import outer_of
-from ccd_casadi.codesign.theta_joint import with_scenarios
+from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_robustness import worst_case
