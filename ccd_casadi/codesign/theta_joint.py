@@ -43,7 +43,7 @@ AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs f
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
 FOLLOWING = 0.1  # of that reach, after a search on a reduced basis
-ENDINGS, KEPT = 12, 2e-6  # last steps; of J: a promise at which the conditions of optimality hold
+ENDINGS, KEPT = 12, 1e-5  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 
 
@@ -104,7 +104,7 @@ def joint_search(
         elif gained < POOR * found.gain:
             reach *= 0.3
     if not (settled or ends is not None):
-        best = finished(working.sampler, best)[0]
+        best, *_ = finished(working.sampler, best)
     counted = structured_of(working.sampler.problem).scenarios
     worse = set(counted) - set(structured_of(sampler.problem).scenarios)
     if best.theta == first.theta and not worse:
@@ -130,15 +130,16 @@ def finished_on_worse_plants(
     working: WorkingSet, start: JointPoint, final: int, tell: Callable[[str], None] | None
 ) -> tuple[WorkingSet, JointPoint, bool]:
     """The joint optimum near by with the worse plants found at it, the set that has these, and
-    whether it is one of all of them."""
+    whether it is one of all of them: also where the last ones cost less of J than is promised at an
+    end."""
     best, has_basis = start, plant_of(working.sampler.problem).nearby is not None
     looks, kinds = ((final, *AGAIN), (True, False)) if has_basis else ((final,), (False,))
     for _ in range(ROUNDS):
         for bent in kinds:
-            best, near = finished(working.sampler, best, bent, tell)
-            before, true = working, nearby(working.sampler.problem, (), best.theta)
-            working, best, _ = working.on_worse_plants(true, best, looks, WITHIN, tell)
-            if working is not before:
+            best, J, near = finished(working.sampler, best, bent, tell)
+            true = nearby(working.sampler.problem, (), best.theta)
+            working, best, there = working.on_worse_plants(true, best, looks, WITHIN, tell)
+            if not there - J <= KEPT * abs(J):
                 working = working.reduced(true, best)
                 break
         else:
@@ -151,11 +152,12 @@ def finished(
     start: JointPoint,
     bent: bool = False,
     tell: Callable[[str], None] | None = None,
-) -> tuple[JointPoint, bool]:
-    """The joint optimum near by, on the plants from what is known at one place after the other: so
-    near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether
-    it is that near, or was. With `bent` on reduced bases around these places, which go further;
-    else on the plants to first order, exact there."""
+) -> tuple[JointPoint, float, bool]:
+    """The joint optimum near by, J there, and whether the start was as near or no more is promised.
+
+    From what is known at one place after the other: so near that all rows meet which bind at a kink
+    of ω_b*, as `theta_kkt` has to see it. With `bent` on reduced bases around these places, which
+    go further; else on the plants to first order, exact there."""
     problem = sampler.problem
     reach = REACH if bent else CLOSE
     if not bent and plant_of(problem).nearby is not None:
@@ -173,7 +175,7 @@ def finished(
         if tell is not None:
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
         if found.gain <= KEPT * abs(J):
-            return best, True
+            return best, J, True
         del make
         others = around(found.end)
         end, there = JointModel(problem, others, found.end, reach).adapted()
@@ -181,7 +183,7 @@ def finished(
         if there < J:
             best, J, models = end, there, others
         gc.collect()  # bases are large, and searches before hold theirs in circles
-    return best, first[1] - J <= SETTLED * abs(J)
+    return best, J, first[1] - J <= SETTLED * abs(J)
 
 
 def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Array) -> Array:
