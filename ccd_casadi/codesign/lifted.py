@@ -65,14 +65,14 @@ def solve_lifted(
     With `given` samples the rounds start from these.
     """
     problem = sampler.problem
-    lower, upper = lifted_bounds(problem)
-    points = options.points or 6 * len(lower)
+    bounds, n = lifted_bounds(problem), len(problem.names) + 2
+    points = options.points or 6 * n
     if given is None:
-        X = design("sobol", lower, upper, points, seed)
+        X = design("sobol", *bounds, points, seed)
         samples = [s for s in sampler.quantities(X) if s.certified]
     else:
         samples = [sample for sample in given if isinstance(sample, QuantitySample)]
-    if len(samples) < len(lower) + 1:
+    if len(samples) < n + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)
     iterates: list[Iterate] = []
@@ -87,7 +87,7 @@ def solve_lifted(
         elif len(samples) > len(processes[0].X):
             processes = update_quantities(problem, samples, processes)
         program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
-        spread = design("sobol", lower, upper, options.starts, seed + round_number)
+        spread = design("sobol", *bounds, options.starts, seed + round_number)
         if incumbent is not None:
             # One sample moves the surrogates' optima, and seldom makes one: the last round's lead.
             known = [] if solution is None else [optimum.x for optimum in solution.optima]
@@ -100,13 +100,12 @@ def solve_lifted(
         predicted = np.array([float(process.predict(x[None, :])[0]) for process in processes])
         with sampler.spent.on("rounds"):
             sample = sampler.quantities(x, f"verifying round {round_number + 1}")[0]
-        away = np.inf if incumbent is None else x - incumbent.x
         errors = np.abs(sample.values[:-1] - predicted)  # of ω_b relative, of ln of the bounded
         errors[0] /= sample.values[0]
         iterate = iterate_of(
             problem, sample.x[: len(problem.names)], float(predicted[0]), float(sample.values[0]),
             error=float(errors.max()) if sample.certified else np.inf,
-            step=float(np.abs(away / (upper - lower)).max()),
+            step=np.inf if incumbent is None else float(bounds.away(x, incumbent.x)),
         )  # fmt: skip
         iterates.append(iterate)
         settled = incumbent is not None and abs(

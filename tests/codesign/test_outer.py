@@ -22,6 +22,7 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.optim.box import Box
 from ccd_casadi.studies.sequential import design_hardware, first_resonance
 
 W1, W2 = 0.0995, -0.9950
@@ -80,8 +81,8 @@ def test_an_optimum_lies_on_the_bounds_that_the_slopes_lead_to(
     solution = solve_program(program, starts())
     expected = [61.0 if flat else corner[0], corner[1]]
     np.testing.assert_allclose(solution.best.x, expected, atol=1e-6)
-    assert (program.lower <= solution.best.x).all()
-    assert (solution.best.x <= program.upper).all()
+    assert (program.box.lower <= solution.best.x).all()
+    assert (solution.best.x <= program.box.upper).all()
 
 
 def test_a_hardware_constraint_is_respected(tmp_path: Path) -> None:
@@ -143,7 +144,8 @@ def test_convex_problems_in_a_box_agree_with_scipy(seed: int, exact: bool) -> No
     lower = rng.uniform(-2.0, 0.0, 3)
     upper = lower + rng.uniform(0.1, 3.0, 3)
     x = ca.MX.sym("x", 3)
-    program = NonlinearProgram(x, ca.sumsqr(ca.DM(A) @ x - b), ca.MX(0, 1), lower, upper, exact)
+    within = Box(lower, upper)
+    program = NonlinearProgram(x, ca.sumsqr(ca.DM(A) @ x - b), ca.MX(0, 1), within, exact)
     best = solve_program(program, rng.uniform(lower, upper, (2, 3))).best
     reference = lsq_linear(A, b, (lower, upper), tol=1e-14)
     assert best.objective == pytest.approx(2.0 * reference.cost, rel=1e-6)
