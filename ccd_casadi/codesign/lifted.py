@@ -5,12 +5,12 @@ their exact gradients determine them; the same samples answer any S_max, S_low, 
 and λ with no new synthesis.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
-from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.gaussian_processes import best_left_out, interpolating, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     OuterSolution,
@@ -22,7 +22,8 @@ from ccd_casadi.inner_problem.objective import constraint_shares, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import QuantitySample
-from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
+from ccd_casadi.support.arrays import Array
+from surrogates import GaussianProcess, design, fit_outputs, to_casadi
 
 STEP = 1e-4  # share of the box below which a step counts as small
 SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
@@ -85,7 +86,7 @@ def solve_lifted(
             processes = fit_quantities(problem, samples, seed, kind=options.kernel)
             fitted = len(samples)
         elif len(samples) > len(processes[0].X):
-            processes = update_quantities(problem, samples, processes)
+            processes = update_quantities(samples, processes)
         program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
         spread = design("sobol", *bounds, options.starts, seed + round_number)
         if incumbent is not None:
@@ -130,9 +131,7 @@ def fit_quantities(
 ) -> tuple[GaussianProcess, ...]:
     """Processes of ω_b (rad/s) and ln of each bounded figure over x = (θ, ln ω_S, ln ω_T)."""
     lower, upper = lifted_bounds(problem)
-    X = np.array([sample.x for sample in samples])
-    Y = np.array([sample.values[:-1] for sample in samples])
-    dY = np.array([sample.gradients[:-1] for sample in samples])
+    X, Y, dY = _arrays(samples)
     found = [
         fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1, kernel=kernel)
         for kernel in kernels_of(kind)
@@ -141,27 +140,18 @@ def fit_quantities(
 
 
 def update_quantities(
-    problem: CoDesignProblem, samples: list[QuantitySample], processes: tuple[GaussianProcess, ...]
+    samples: list[QuantitySample], processes: tuple[GaussianProcess, ...]
 ) -> tuple[GaussianProcess, ...]:
-    """The same processes conditioned on more samples, hyperparameters kept but for their noise.
+    """The same processes on more samples."""
+    X, Y, dY = _arrays(samples)
+    return tuple(interpolating(each, X, Y[:, i], dY[:, i]) for i, each in enumerate(processes))
 
-    The truth has none: what a fit to the whole box takes for noise is what its kernel cannot
-    follow there, and would be averaged away sample by sample where the rounds gather.
-    """
-    lower, upper = lifted_bounds(problem)
-    X = np.array([sample.x for sample in samples])
-    return tuple(
-        condition(
-            replace(process.hyperparameters, noise_variance=0.0, gradient_noise_variance=0.0),
-            X,
-            np.array([sample.values[i] for sample in samples]),
-            lower=lower,
-            upper=upper,
-            kernel=process.kernel,
-            dY=np.array([sample.gradients[i] for sample in samples]),
-        )
-        for i, process in enumerate(processes)
-    )
+
+def _arrays(samples: list[QuantitySample]) -> tuple[Array, Array, Array]:
+    """x (N, n), outputs (N, k) and their slopes (N, k, n): ω_b and ln of each bounded figure."""
+    rows = [(sample.x, sample.values[:-1], sample.gradients[:-1]) for sample in samples]
+    X, Y, dY = map(np.array, zip(*rows, strict=True))
+    return X, Y, dY
 
 
 def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:

@@ -143,7 +143,8 @@ class Sampler:
         missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
             tasks = [(problems[theta], self.hash, key, theta) for key, theta in missing.items()]
-            for rows, (key, theta, payload) in self.workers.map_unordered(inner_unit, tasks):
+            for key, (rows, payload) in self.workers.map_unordered(inner_unit, tasks):
+                theta = missing[key]
                 self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
                 if theta not in self.solved:  # who goes on from the store asks for it by this key
                     own = sample_key(self.inner_hash, theta, 0.0, 0.0)

@@ -61,8 +61,8 @@ def optimal_line(
     residual: float, gap: float = 0.0, look: GlobalCheck | None = None
 ) -> v.VerdictLine:
     kkt = KktCertificate(residual, 0.0, 0.0, {}, (), None, ())
-    known, _ = v.search_evidence(16, 2, look)
-    return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", known=known)
+    known = v.search_evidence(16, 2, look)
+    return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", searched=known)
 
 
 @given(st.floats(0.0, 10.0))
