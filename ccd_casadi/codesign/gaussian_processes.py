@@ -101,17 +101,17 @@ def recommendation(qualities: Sequence[Quality]) -> str:
     """What follows from them, in one or two sentences; nothing where there is no surrogate."""
     if not qualities:
         return ""
-    said = []
+    said, names = [], {q.name: q.name.replace("_", " ") for q in qualities}
     poor = [q for q in qualities if q.poor]
     if poor:
-        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.loo.q2:.2g})" for q in poor)
+        which = ", ".join(f"{names[q.name]} (Q² {q.loo.q2:.2g})" for q in poor)
         said.append(
             f"Left-out samples of {which} are predicted poorly: more samples are needed before the "
             "surrogate says anything away from the design."
         )
     rough = [q for q in qualities if not q.followed and not q.poor]
     if rough:
-        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.loo.q2:.3g})" for q in rough)
+        which = ", ".join(f"{names[q.name]} (Q² {q.loo.q2:.3g})" for q in rough)
         said.append(
             f"Left-out samples of {which} are predicted roughly, as those of a function with kinks "
             "or jumps are: one smooth surrogate follows them only near the design."
@@ -123,7 +123,7 @@ def recommendation(qualities: Sequence[Quality]) -> str:
             else "The larger of two local peaks is kinked where they are equal; the rounds refit "
             "near the design, where one of them is the larger."
         )
-    beyond = [q.name.replace("_", " ") for q in qualities if q.extrapolates]
+    beyond = [names[q.name] for q in qualities if q.extrapolates]
     if beyond:
         said.append(
             f"At the design the surrogate of {', '.join(beyond)} extrapolates: trust the "
@@ -131,7 +131,7 @@ def recommendation(qualities: Sequence[Quality]) -> str:
         )
     for q in qualities:
         if q.unsupported and not q.extrapolates and not q.poor:
-            said.append(f"{q.name.replace('_', ' ').capitalize()}: {q.unsupported}.")
+            said.append(f"{names[q.name].capitalize()}: {q.unsupported}.")
     return " ".join(said) or "The surrogates follow their samples, and support the design."
 
 

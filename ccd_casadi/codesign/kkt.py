@@ -19,7 +19,7 @@ of its gradient is 1e-6; the gradients themselves are good to 1e-10.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -128,10 +128,10 @@ def _certificate(here: TrueDesign, at: ActiveSet, second: bool) -> KktCertificat
     mu = at.multipliers()
     Z = at.free(mu)
     found = at.certificate(mu, at.residual(mu), np.inf if Z.shape[1] == 0 else None)
-    if found.second_order is not None or not second:
+    if not (second and Z.shape[1]):
         return found
     columns = lagrangian_hessian(here, Z, found.multipliers)
-    return at.certificate(mu, found.stationarity, reduced_curvature(Z, columns, at.size))
+    return replace(found, second_order=reduced_curvature(Z, columns, at.size))
 
 
 def first_order(

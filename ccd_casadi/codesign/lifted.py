@@ -15,7 +15,7 @@ from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     OuterSolution,
     lifted_bounds,
-    lifted_program,
+    outer_program,
     solve_program,
 )
 from ccd_casadi.inner_problem.objective import constraint_shares, objective
@@ -87,7 +87,7 @@ def solve_lifted(
             fitted = len(samples)
         elif len(samples) > len(processes[0].X):
             processes = update_quantities(samples, processes)
-        program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
+        program = outer_program(problem, to_casadi(processes, std=False), margin=MARGIN)
         spread = design("sobol", *bounds, options.starts, seed + round_number)
         if incumbent is not None:
             # One sample moves the surrogates' optima, and seldom makes one: the last round's lead.
@@ -158,21 +158,15 @@ def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:
     return objective(problem, sample.x[: len(problem.names)], sample.values[0])
 
 
-def _violation(problem: CoDesignProblem, sample: QuantitySample) -> float:
-    """Largest violation of λ, in shares of its size, and, in ln, of a bound."""
-    levels = problem.inner.levels - MARGIN
-    lam = constraint_shares(problem, sample.x[: len(problem.names)])
-    return float(np.concatenate([sample.values[1:-1] - levels, lam]).max())
-
-
 def _better(
     problem: CoDesignProblem, incumbent: QuantitySample | None, sample: QuantitySample
 ) -> QuantitySample:
-    """The sample with less violation beyond the slack; among feasible ones the better J."""
-    if incumbent is None:
-        return sample
+    """The sample with less violation beyond the slack, of λ in shares of its size, of a bound in
+    ln; among feasible ones the better J."""
 
     def rank(s: QuantitySample) -> tuple[float, float]:
-        return max(0.0, _violation(problem, s) - FEASIBLE), _objective(problem, s)
+        lam = constraint_shares(problem, s.x[: len(problem.names)])
+        over = np.concatenate([s.values[1:-1] - problem.inner.levels + MARGIN, lam]).max()
+        return max(0.0, float(over) - FEASIBLE), _objective(problem, s)
 
-    return min(incumbent, sample, key=rank)
+    return sample if incumbent is None else min(incumbent, sample, key=rank)

@@ -14,7 +14,7 @@ from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     OuterSolution,
-    nested_program,
+    outer_program,
     solve_program,
 )
 from ccd_casadi.inner_problem.objective import objective, violated
@@ -102,7 +102,7 @@ def solve_nested(
             refine(round_number)
             continue
         surrogate = fit_bandwidth(problem, local, seed, options.kernel, gradients)
-        program = nested_program(problem, to_casadi(surrogate, std=False))
+        program = outer_program(problem, to_casadi(surrogate, std=False))
         program = replace(program, box=region)
         starts = _starts(problem, local, region, options.starts, seed + round_number)
         try:

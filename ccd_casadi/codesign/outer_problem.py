@@ -75,22 +75,14 @@ class OuterFailure(RuntimeError):
     """IPOPT converged from no start."""
 
 
-def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> NonlinearProgram:
-    """The outer problem over θ with a surrogate bandwidth(θ) in rad/s."""
-    return _program(problem, bandwidth, box(problem), np.empty(0))
-
-
-def lifted_program(
-    problem: CoDesignProblem, quantities: ca.Function, *, margin: float = MARGIN
+def outer_program(
+    problem: CoDesignProblem, model: ca.Function, *, margin: float = MARGIN
 ) -> NonlinearProgram:
-    """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln of what is bounded."""
-    return _program(problem, quantities, lifted_bounds(problem), problem.inner.levels - margin)
-
-
-def _program(
-    problem: CoDesignProblem, model: ca.Function, bounds: Box, levels: Array
-) -> NonlinearProgram:
-    """Over x, which begins with θ, with model(x) -> ω_b and what must not exceed `levels` (m,)."""
+    """Over θ with model(θ) -> ω_b in rad/s; or over (θ, ln ω_S, ln ω_T), where the model is a
+    function of these, with model(x) -> ω_b, ln of what is bounded."""
+    lifted = model.size1_in(0) > len(problem.names)
+    bounds = lifted_bounds(problem) if lifted else box(problem)
+    levels = problem.inner.levels - margin if lifted else ()
     x = ca.MX.sym("x", len(bounds.lower))
     q = model(x)
     f, lam = _hardware(problem, x[: len(problem.names)])
