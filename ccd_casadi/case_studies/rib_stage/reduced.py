@@ -1,7 +1,8 @@
 """The stage near θ that are known, by a reduced basis: Rayleigh and Ritz in what the modes span.
 
 A basis V of a symmetry holds its modes φ at some θ, what they move by, (K + σM)⁻¹(∂K - λ ∂M)φ, the
-rigid motions at every θ, and what forces at the point masses bend. In it
+rigid motions at every θ, and what forces at actuators, sensors and point masses bend: what a mode's
+move lacks in V counts with what these forces' answer lacks in it. In it
 
     Vᵀ K(θ) V = Σ c_q(θ) Vᵀ K_q V,   Vᵀ M(θ) V likewise,
 
@@ -32,11 +33,11 @@ from ccd_casadi.case_studies.rib_stage.model import (
 )
 from ccd_casadi.case_studies.rib_stage.modes import (
     CLUSTER,
-    EXTRA,
     SHIFT,
     SQUARE_GROUPS,
     Discretisation,
     Group,
+    compressed,
     discretise,
     functionals,
     groups_of,
@@ -52,6 +53,8 @@ from ccd_casadi.support.threads import side_by_side
 
 KNOWN = 1e-4  # of its length: what of a mode's move is beside the basis and not worth a vector
 ROUNDING = 1e-8  # the same of a mode
+BEYOND = 4  # modes of a symmetry beyond those kept: shapes move by them
+LEVELS = 2  # of what forces bend, as of a Krylov space
 COUPLED = 24  # lowest modes of each symmetry that point masses couple
 RIGID = {"A1": 1, "A2": 1, "SA": 2, "AS": 2}  # rigid motions of a symmetry
 
@@ -159,16 +162,19 @@ def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array)
 def _grown(
     stage: RibStage, disc: Discretisation, group: Group, basis: Basis, theta: Array
 ) -> Basis:
-    """With the modes at θ, what they move by, and what forces at the point masses bend."""
+    """With the modes at θ, what they move by, and what forces at the points bend."""
     masses = stage.geometry.point_masses
-    count = (TWENTY if masses else stage.modes).of(group) + EXTRA
+    count = max(TWENTY.of(group), stage.modes.of(group)) + BEYOND
     body, sector = replace(stage.geometry, point_masses=()), sector_of(disc, group.solved[0])
     found = spectrum(disc, body, theta, group, count)
     vectors, inverse = found.vectors, found.pencil.inverse
-    for image in group.images if masses else ():
-        forces = functionals(disc, image, theta, [(p.x, p.y) for p in masses])[0]
-        bent = inverse(forces.reshape(len(forces), -1))
-        vectors = np.hstack([vectors, bent, inverse(found.pencil.mass(bent))])
+    acting = [*points_of(stage), *((p.x, p.y) for p in masses)]
+    for image in group.images:
+        bent = compressed(functionals(disc, image, theta, acting)[0].reshape(len(vectors), -1))[0]
+        for _ in range(LEVELS):
+            bent = inverse(bent)
+            vectors = np.hstack([vectors, bent])
+            bent = found.pencil.mass(bent)
     basis = _wider(stage, disc, group, basis, vectors, ROUNDING)
     moved = disc.assembler.moved(sector, theta, found.values, found.vectors)
     return _wider(stage, disc, group, basis, inverse(moved), KNOWN)
@@ -246,7 +252,7 @@ def _modes(stage: RibStage, group: Group, basis: Basis, theta: Array) -> tuple[S
             fields.append((signs * known[here]).transpose(0, 2, 1))
         u, lam, left = np.stack(fields, 3), values, modes
         if masses:
-            lam, turn = _lowest(values, u[0, :, :, -len(masses) :])
+            lam, turn = _lowest(values, u[0])
             u, left = np.einsum("tjcp,ji->ticp", u, turn), modes @ turn
         right = left if masses else left[:, :kept]
         dK, dM = (left.T @ (part[1:] @ right) for part in (K, M))
@@ -264,12 +270,12 @@ def _whole(triangles: Array) -> Array:
 
 
 def _lowest(values: Array, G: Array) -> tuple[Array, Array]:
-    """λ (k,) and directions (m, k) of the lowest modes and what forces at masses bend of the others
+    """λ (k,) and directions (m, k) of the lowest modes and what forces at points bend of the others
     (m,), G (m, 3, p) being the displacements there."""
     few = min(COUPLED, len(values))
     high = values[few:]
     bent = G[few:].reshape(len(high), G.shape[1] * G.shape[2]) / (high + SHIFT)[:, None]
-    Q = np.linalg.qr(np.hstack([bent, bent / (high + SHIFT)[:, None] * SHIFT]))[0]
+    Q = compressed(np.hstack([bent, bent / (high + SHIFT)[:, None] * SHIFT]))[0]
     own, turn = np.linalg.eigh(Q.T @ (high[:, None] * Q))
     return np.append(values[:few], own), block_diag(np.eye(few), Q @ turn)
 
