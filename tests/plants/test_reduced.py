@@ -11,6 +11,7 @@ from ccd_casadi.case_studies.rib_stage.geometry import Geometry, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE
 from ccd_casadi.case_studies.rib_stage.model import RibStage
 from ccd_casadi.case_studies.rib_stage.plant import plant_of_stage
+from ccd_casadi.case_studies.rib_stage.truncation import TWENTY
 from ccd_casadi.plants.plant import Mechanics, nearby_model
 from ccd_casadi.support.arrays import Array
 
@@ -44,6 +45,19 @@ def test_at_a_known_theta_it_has_the_modes_of_the_elements(stage: RibStage, with
         np.testing.assert_allclose(frequencies(told), frequencies(true), rtol=within)
         size = np.abs(strengths(true)).max()
         np.testing.assert_allclose(strengths(told), strengths(true), atol=10.0 * within * size)
+
+
+@pytest.mark.parametrize(
+    "stage", [BARE, replace(BARE, modes=TWENTY), replace(LOADED, modes=TWENTY)]
+)
+def test_at_a_known_theta_displacements_move_as_those_of_the_elements(stage: RibStage) -> None:
+    """A search on a basis ends elsewhere where its slopes are not the elements'."""
+    told, true = reduced_at(stage, [HERE], HERE), stage.mechanics(tuple(HERE))
+    signs = np.sign(np.einsum("im,im->i", told.B, true.B))
+    seen = np.abs(true.B).max(1) > 1e-6 * np.abs(true.B).max()  # what corners neither drive nor see
+    moved = np.tensordot(STEP, true.derivatives[3], 1)[seen]
+    found = (signs[:, None] * np.tensordot(STEP, told.derivatives[3], 1))[seen]
+    np.testing.assert_allclose(found, moved, atol=5e-3 * np.abs(moved).max())
 
 
 def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
