@@ -46,7 +46,7 @@ from ccd_casadi.case_studies.rib_stage.modes import (
     spectrum,
 )
 from ccd_casadi.case_studies.rib_stage.symmetry import AS, mirror_signs, swap_displacements
-from ccd_casadi.case_studies.rib_stage.truncation import TWENTY
+from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, faded
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.threads import side_by_side
@@ -110,23 +110,31 @@ def mechanics(stage: RibStage, known: Bases, theta: Sequence[float]) -> Mechanic
     small = [_modes(stage, group, basis, here) for group, basis in groups]
     of = {s: one for group, own in zip(SQUARE_GROUPS, small, strict=True)
           for (s,), one in zip(group.images, own, strict=True)}  # fmt: skip
-    n, row = 3 + stage.modes.total, 3
+    coupled, row, later = groups_of(stage.geometry), 3, 3 + stage.modes.total
+    n = later + stage.fading * len(coupled)
     lam, u, du = np.zeros(n), np.zeros((n, len(points))), np.zeros((len(here), n, len(points)))
     dK = np.zeros((len(here), n, n))
     u[:3], du[:, :3] = rigid_part(stage, here)
-    for group in groups_of(stage.geometry):
+    for group in coupled:
         rigid, count = sum(RIGID.get(s.name, 0) for s in group.solved), stage.modes.of(group)
         images = (
             [of[s] for (s,) in group.images]
             if not masses
             else [_coupled([of[s] for s in group.solved], [mass.mass for mass in masses])]
         )
+        kept = count + stage.fading
         for place, one in enumerate(images):
-            # A pair of modes of one frequency stands in turns.
+            # A pair of modes of one frequency stands in turns; those that fade follow all others.
             own = row + place + len(images) * np.arange(count)
-            lam[own] = one.values[rigid : rigid + count]
-            u[own], du[:, own], dK[:, own[:, None], own] = _slopes(one, rigid, count, len(points))
-        row += len(images) * count
+            own = np.append(own, later + np.arange(stage.fading))
+            lam[own] = one.values[rigid : rigid + kept]
+            u[own], du[:, own], dK[:, own[:, None], own] = _slopes(one, rigid, kept, len(points))
+            if stage.fading:
+                slopes = np.diagonal(_slopes(one, rigid, kept + 1, 0)[2], 0, 1, 2)
+                w, dw = faded(one.values[rigid : rigid + kept + 1], slopes, count)
+                du[:, own] = w[:, None] * du[:, own] + dw[:, :, None] * u[own]
+                u[own] *= w[:, None]
+        row, later = row + len(images) * count, later + stage.fading
     return assembled(stage, lam[3:], u, du, dK)
 
 
