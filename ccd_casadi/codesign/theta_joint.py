@@ -63,6 +63,7 @@ def joint_search(
         return sampler, first, True
     best, known = JointPoint(first.theta, first.kappa, first.bandwidth), [first.theta]
     reach, settled, working = REACH, False, WorkingSet(sampler)
+    bent = plant_of(problem).nearby is not None
     for turn in range(TURNS):
         models = nearby(problem, known, best.theta)
         within = LOOSE if turn else WITHIN
@@ -73,7 +74,7 @@ def joint_search(
             return sampler, first, False
         if not np.isfinite(J):
             break
-        make = partial(proposed, problem, models, best, reach)
+        make = partial(proposed, problem, models, best, reach, bent=bent)
         found = working.sampler.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
