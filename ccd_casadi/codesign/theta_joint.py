@@ -140,7 +140,6 @@ def finished_on_worse_plants(
         working, best, there = working.on_worse_plants(true, best, looks, WITHIN, tell)
         if working is before or there - J <= KEPT * abs(J):
             return working, best, near
-        working = working.reduced(true, best)
     return working, best, False
 
 
