@@ -95,9 +95,10 @@ def mixed_answer(
     head = head_of(problem, theta)
     rows: tuple[DesignFigures, ...] = ()
     if point is not None:
+        at = point
 
         def peak(choice: CoDesignProblem) -> float:
-            return float(np.nan_to_num(true_design(choice, theta, *point).values[1], nan=np.inf))
+            return float(np.nan_to_num(true_design(choice, theta, *at).values[1], nan=np.inf))
 
         problem, syntheses = min(design_choices(problem), key=peak), 1
     else:
