@@ -56,6 +56,10 @@ class Lifted:
     kernel: str = "matern52"
     box_points: int = 32
 
+    def sampled(self, variables: int) -> int:
+        """How many designs the plan has."""
+        return self.points or 6 * variables
+
 
 def solve_lifted(
     sampler: Sampler, options: Lifted, *, seed: int, given: KnownSamples | None = None
@@ -66,7 +70,7 @@ def solve_lifted(
     """
     problem = sampler.problem
     lower, upper = lifted_bounds(problem)
-    points = options.points or 6 * len(lower)
+    points = options.sampled(len(lower))
     if given is None:
         X = design("sobol", lower, upper, points, seed)
         samples = [s for s in sampler.quantities(X) if s.certified]
