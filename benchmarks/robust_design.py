@@ -5,10 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate, Structure
+from ccd_casadi.fixed_structure import (
+    Bounds,
+    Sampling,
+    SectionsDesign,
+    SetCertificate,
+    Structure,
+    synthesise,
+)
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import certify
-from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
     LATTICE,

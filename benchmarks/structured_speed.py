@@ -38,8 +38,7 @@ def problems():
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.run_folder import sections_kappa
-    from ccd_casadi.fixed_structure import Structure
-    from ccd_casadi.fixed_structure.channel_design import synthesise
+    from ccd_casadi.fixed_structure import Structure, synthesise
     from ccd_casadi.fixed_structure.design import problem_for
     from ccd_casadi.fixed_structure.sections_design import in_problem_units
     from ccd_casadi.inner_problem.structured_plant_set import (

@@ -15,7 +15,7 @@ from ccd_casadi.codesign.verified import Solution as Solution
 from ccd_casadi.deployment.pipeline import deploy as deploy
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify
-from ccd_casadi.fixed_structure.existing_plants import synthesise_sections as synthesise_sections
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise_sections
 from ccd_casadi.fixed_structure.measured import read_frequency_response as read_frequency_response
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure as Structure

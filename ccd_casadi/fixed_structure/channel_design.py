@@ -11,6 +11,7 @@ sensors (fewer outputs than channels) it starts from random controllers that are
 from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -35,17 +36,21 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.synthesis.interchange import from_control, plant_from_control
 
+SLOWEST = 10.0  # ω₀ over ω_low/S_low, the bandwidth that S of slope one needs at least
 TIGHTENED = (1.0, 0.6, 0.3)  # of the room that S_max leaves above 1, for channels of coupled plants
 
 
-def synthesise(
-    plants: Sequence[ScaledPlant],
+def synthesise_sections(
+    plants: Any,
     structure: Structure | ChannelStructure,
     bounds: Bounds,
     *,
     sampling: Sampling | None = None,
+    M_K: float | None = None,
     starts: int = 12,
     seed: int = 0,
     initial: Sequence[Array] = (),
@@ -54,19 +59,85 @@ def synthesise(
     progress: Progress | None = None,
     workers: Pool | None = None,
 ) -> SectionsDesign:
-    """max ω_b over the parameters of a structure, with every bound on every plant.
+    """max ω_b over the parameters of a structure, with every bound on every plant of a set.
 
-    `initial`: parameters κ in SI, of several channels stacked, that start beside `starts` others by
-    rules and at random, or alone with `only_initial`. `frequencies` as in `problem_for`: give them
-    where designs at several θ are compared. The searches are spread over `workers`; their number
-    changes nothing else. Raises PlantError for plants that cannot be in a set.
+        max ω_b   s.t.  on each plant: stable, |S| <= S_max, |S(jω_low)| <= S_low,
+                        |S(jω)| <= 1/√2 for ω <= ω_b, |S(jω)| <= shape (ω/ω_b)/√2,
+                        |W_KS KS|, |W_T T| <= weighted_level, |GS| <= compliance_max
+
+    Parameters
+    ----------
+    plants : control.StateSpace, control.TransferFunction or ScaledPlant, or a list of them
+        Stable, force (N) to displacement (m). Give a free mass the slow suspension that it has, if
+        only of its cables.
+    structure, bounds : Structure or ChannelStructure, Bounds
+        Sections of K, and what holds on every plant.
+    sampling : Sampling, optional
+        Rate and delay, exact; left out, the loop is continuous.
+    M_K : float, optional
+        Scale of control systems, N/m; left out, that of `bounds.weights`, or that of
+        ω₀ = 10 ω_low/S_low.
+    starts, seed : int
+        Of the multi-start search: how many controllers by rules and at random, and which.
+    initial, only_initial : sequence of array, bool
+        Parameters κ in SI of earlier designs, of several channels stacked, which start beside the
+        others, or alone.
+    frequencies : tuple of two floats, optional
+        As in `problem_for`, rad/s: give them where designs at several θ are compared.
+    progress, workers : callable, Pool, optional
+        Is given a line at a time; the searches are spread over them, which changes nothing else.
+
+    Returns
+    -------
+    SectionsDesign
+        `outcome` says how it ended; `controller` is K(s) in SI, e = r - y to force.
+
+    Raises
+    ------
+    UserError
+        A system is no continuous one.
+    PlantError
+        A system cannot be a plant, or the plants cannot be in a set.
+
+    Examples
+    --------
+    >>> import control
+    >>> import ccd_casadi as ccd
+    >>> plant = control.tf([1.0], [2.0, 12.0, 800.0])  # 2 kg on 800 N/m
+    >>> bounds = ccd.Bounds(S_max=1.8, S_low=0.1, omega_low=5.0, shape=1.1, compliance_max=1e-4)
+    >>> structure = ccd.Structure(lead=1, biquads=0, roll_off=1)
+    >>> light = control.tf([1.0], [1.8, 12.0, 800.0])
+    >>> sampling = ccd.Sampling(rate_hz=2000.0, delay_us=250.0)
+    >>> design = ccd.synthesise_sections([plant, light], structure, bounds, sampling=sampling,
+    ...                                  starts=4)
+    >>> design.certified, design.certificate.words
+    (True, 'stable and within every bound on 2 plants')
     """
-    problem = problem_for(plants, structure, bounds, sampling, frequencies)
-    search = DesignSearch(problem, plants, sampling, starts, seed, initial, only_initial, progress,
+    scaled = _scaled(plants, bounds, M_K)
+    problem = problem_for(scaled, structure, bounds, sampling, frequencies)
+    search = DesignSearch(problem, scaled, sampling, starts, seed, initial, only_initial, progress,
                           workers)  # fmt: skip
     if isinstance(problem, CompositeProblem):
         return _of_several(search, problem)
     return of_one_channel(search)
+
+
+def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]:
+    """The plants, control systems in units of M_K: without one, of the weights or by the bounds,
+    ω₀ of the first a decade above the least bandwidth that they ask for."""
+    scale = M_K if bounds.weights is None else bounds.weights.M_K
+    if M_K is not None and scale != M_K:
+        raise UserError(f"M_K is {M_K:g}, that of the weights {scale:g}; give one")
+    scaled = list(plants) if isinstance(plants, list | tuple) else [plants]
+    for i, system in enumerate(scaled):
+        if isinstance(system, ScaledPlant):
+            continue
+        if scale is None:
+            space = from_control(system)
+            inertial = float(np.linalg.norm(space.C @ space.A @ space.B, 2))
+            scale = (SLOWEST * bounds.omega_low / bounds.S_low) ** 2 / inertial if inertial else 1.0
+        scaled[i] = plant_from_control(system, scale)
+    return scaled
 
 
 def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesign:

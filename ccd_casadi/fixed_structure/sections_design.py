@@ -106,8 +106,8 @@ def span_of(problem: LoopProblem) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class DesignSearch:
-    """A search for controllers on plants, with the options of `channel_design.synthesise`, and when
-    it `began` (s of `perf_counter`)."""
+    """A search for controllers on plants, with the options of `synthesise_sections`, and when it
+    `began` (s of `perf_counter`)."""
 
     problem: LoopProblem
     plants: Sequence[ScaledPlant]

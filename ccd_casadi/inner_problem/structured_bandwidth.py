@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.analysis.move_time import MoveTime
 from ccd_casadi.fixed_structure import SectionsDesign, Structure
-from ccd_casadi.fixed_structure.channel_design import synthesise
+from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
@@ -63,7 +63,7 @@ def searched(
 ) -> SectionsDesign:
     """The largest bandwidth on plants, from controllers κ in SI and `starts` others beside them."""
     structured = structured_of(problem)
-    return synthesise(
+    return synthesise_sections(
         plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
         starts=starts or 0, seed=structured.seed, initial=initial, only_initial=starts is None,
         frequencies=structured.frequencies, progress=progress, workers=workers,

@@ -20,8 +20,14 @@ from helpers import HZ, SUSPENSION, few, scaled
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure, certify
-from ccd_casadi.fixed_structure.channel_design import synthesise
+from ccd_casadi.fixed_structure import (
+    Bounds,
+    Sampling,
+    SectionsDesign,
+    Structure,
+    certify,
+    synthesise,
+)
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, given_decoupling
