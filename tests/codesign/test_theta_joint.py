@@ -210,9 +210,9 @@ def test_with_sections_the_smaller_plan_is_sampled() -> None:
 
 
 def test_where_each_theta_is_dear_none_is_sampled() -> None:
-    runs = ROOT / "runs"
-    chosen = {name: usual_name(load_case(runs / f"{name}.toml"), 6)
-              for name in ("rib_stage_built", "two_mass_built", "rib_stage")}  # fmt: skip
+    names = ("rib_stage_built", "two_mass_built", "rib_stage")
+    cases = {name: load_case(ROOT / "runs" / f"{name}.toml") for name in names}
+    chosen = {name: usual_name(case, len(case.theta)) for name, case in cases.items()}
     assert chosen == {
         "rib_stage_built": "direct", "two_mass_built": "nested", "rib_stage": "nested"
     }  # fmt: skip
