@@ -22,6 +22,7 @@ from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
@@ -95,8 +96,8 @@ class Outer(ABC):
         return True
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of x."""
+    def bounds(self) -> Box:
+        """The bounds of x."""
         return box(self.problem)
 
     def prepared(self, seed: int) -> "Outer":
@@ -131,8 +132,8 @@ class Outer(ABC):
 
         From one start that has a design it is the polish that follows.
         """
-        problem, (lower, upper) = self.problem, box(self.problem)
-        thetas = np.vstack([problem.start, design("sobol", lower, upper, starts, seed)])[:starts]
+        spread = design("sobol", *box(self.problem), starts, seed)
+        thetas = np.vstack([self.problem.start, spread])[:starts]
         begun = self.sampler.values(thetas, "direct")
         if starts == 1 and begun[0].feasible:
             return FormulationResult(begun[0].joint, agreed=True)
@@ -143,8 +144,7 @@ class Outer(ABC):
         if not places:
             words = f"no design meets its constraints from {counted(starts, 'start')}"
             return FormulationResult(message=words)
-        lower, upper = self.bounds
-        ends = distinct([(one.objective, one.x) for one in places], upper - lower, starts, BASIN)
+        ends = distinct([(one.objective, one.x) for one in places], self.bounds, starts, BASIN)
         return FormulationResult(ends.best.x, outer=ends, agreed=True)
 
     @abstractmethod

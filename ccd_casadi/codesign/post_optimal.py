@@ -29,6 +29,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import ACTIVE, ActiveSet, KktCertificate
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.sampling.samples import InnerSample
@@ -100,12 +101,12 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
             progress.advance()
         return found
 
-    lower, upper = lifted_bounds(problem)
-    slope = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * (upper - lower)
-    bounds = [_Parameter(name, bound, np.zeros(n), {name: -1.0 / bound})
-              for name, (_, bound) in problem.inner.bounds.items()]  # fmt: skip
+    bounds = lifted_bounds(problem)
+    slope = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * bounds.width
+    own = [_Parameter(name, bound, np.zeros(n), {name: -1.0 / bound})
+           for name, (_, bound) in problem.inner.bounds.items()]  # fmt: skip
     known = _Parameter("w2", problem.w2, slope, cost=float(design.values[0]))
-    return _responses(problem, x, (lower, upper), kkt, active, hessian, [known, *bounds], slope)
+    return _responses(problem, x, bounds, kkt, active, hessian, [known, *own], slope)
 
 
 def structured_responses(
@@ -119,16 +120,16 @@ def structured_responses(
     it takes second derivatives of v(θ), which are not known. At a kink of it the multipliers μ
     are those of θ and controller together.
     """
-    lower, upper = box(problem)
+    bounds = box(problem)
     kkt = theta_kkt(problem, sample, envelope=found.envelope)
     loop = found.design.multipliers if kkt.kink is None else kkt.kink.multipliers
-    slope, known = np.array(sample.gradient) * (upper - lower), problem.figure is BANDWIDTH
+    slope, known = np.array(sample.gradient) * bounds.width, problem.figure is BANDWIDTH
     own = [_Parameter("w2", problem.w2, slope, cost=sample.value)]
     for name, value, mu in _loop_bounds(problem, loop) if known else ():
         rate = sample.bandwidth * mu / value
         own.append(_Parameter(name, value, 0.0 * slope, {}, problem.w2 * rate, rate))
     return _responses(
-        problem, np.array(sample.theta), (lower, upper), kkt, active_theta(problem, sample),
+        problem, np.array(sample.theta), bounds, kkt, active_theta(problem, sample),
         lambda: None, own, slope if known else np.nan * slope,
     )  # fmt: skip
 
@@ -142,7 +143,7 @@ def _strong(kkt: KktCertificate) -> list[str]:
 def _responses(
     problem: CoDesignProblem,
     x: Array,
-    bounds: tuple[Array, Array],
+    bounds: Box,
     kkt: KktCertificate,
     here: ActiveSet,
     hessian: Callable[[], Array | None],
@@ -151,7 +152,7 @@ def _responses(
 ) -> PostOptimal:
     """Responses at x within `bounds`, which begins with θ; ∇²L by `hessian` where directions are
     left (None: not known), ω_b with `slope_b` (n,); `parameters`: w2 and the bounds on the loop."""
-    n, count, width = x.size, len(problem.names), bounds[1] - bounds[0]
+    n, count, width = x.size, len(problem.names), bounds.width
     strong = _strong(kkt)
     held = [here.labels.index(name) for name in strong]
     A = here.rows[held] * here.sizes[held, None]
@@ -194,12 +195,9 @@ def _level(parameter: _Parameter, constraint: str) -> float:
 
 
 def _parameters(
-    problem: CoDesignProblem,
-    x: Array,
-    bounds: tuple[Array, Array],
-    slope_f: Array,
+    problem: CoDesignProblem, x: Array, bounds: Box, slope_f: Array,
     parameters: Sequence[_Parameter],
-) -> Iterator[_Parameter]:
+) -> Iterator[_Parameter]:  # fmt: skip
     """w1, `parameters` (w2, bounds on the loop), the level of each λ, and the bounds of x."""
     none, count, plant = np.zeros(x.size), len(problem.names), plant_of(problem)
     yield _Parameter("w1", problem.w1, slope_f, cost=hardware_cost(plant, x[:count]))

@@ -7,6 +7,7 @@ itself said of it (`at_solve`), so that a command may be given again.
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -40,10 +41,14 @@ def result_dict(
     problem, tolerance = verified.problem, terms.tolerance
     promised = predicted_value(outcome, verified.point, verified.value)
     error = abs(promised / verified.value - 1.0)
-    known = verified.searched(outcome, look)
+    optimality = partial(
+        optimal, verified.kkt, level=verified.kkt_level, saddle=verified.saddle,
+        tolerance=tolerance, better=verified.gap_words(), unknown=verified.no_gradient_words(),
+        searched=verified.searched(outcome, look),
+    )  # fmt: skip
     verdict = {  # in the order in which they matter
         "certified": verified.certified_line(),
-        "optimal": optimal_line(verified, tolerance, verified.inner_gap, known),
+        "optimal": optimality(gap=verified.inner_gap),
         "predicted": predicted(
             error=error,
             tolerance=tolerance,
@@ -58,13 +63,12 @@ def result_dict(
     }
     evidence = verified.evidence(promised)
     held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}
-    stationary = optimal_line(verified, tolerance, 0.0, known)
     checks = {
         "certificate": verified.certified,
         "constraints": verified.feasible,
         "prediction": bool(error <= tolerance),
         "inner_optimum": bool(verified.inner_gap <= tolerance),
-        "optimality": stationary.state is not State.FAILED,
+        "optimality": optimality(gap=0.0).state is not State.FAILED,
         **verified.checks(),
     }
     failed = [name for name, passed in checks.items() if not passed]
@@ -101,24 +105,6 @@ def result_dict(
         **move_entry(problem, verified.theta, verified.controller),
     }
     return json_values(result)
-
-
-def optimal_line(
-    verified: Verified, tolerance: float, gap: float, searched: tuple[str, Mapping[str, Any]]
-) -> VerdictLine:
-    """Whether θ is stationary, and whether anything better is known, where it was `searched`."""
-    known, figures = searched
-    line = optimal(
-        verified.kkt,
-        level=verified.kkt_level,
-        saddle=verified.saddle,
-        gap=gap,
-        tolerance=tolerance,
-        better=verified.gap_words(),
-        known=known,
-        unknown=verified.no_gradient_words(),
-    )
-    return VerdictLine(line.state, line.words, {**line.figures, **figures})
 
 
 def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float:

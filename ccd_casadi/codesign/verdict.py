@@ -59,17 +59,17 @@ def optimal(
     gap: float,
     tolerance: float,
     better: str,
-    known: str,
+    searched: tuple[str, Mapping[str, Any]],
     unknown: str = "",
     saddle: float = SADDLE,
 ) -> VerdictLine:
     """KKT residual over θ up to `level`, and the whole inner problem at θ, `better` by `gap`.
 
-    `known`: where something better was looked for; `unknown`: why there may be no gradient; in
-    words.
+    `searched`: where something better was looked for, in words and figures; `unknown`: why there
+    may be no gradient, in words.
     """
-    residual, kink = kkt.stationarity, kkt.kink
-    figures: dict[str, Any] = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap}
+    residual, kink, (known, found) = kkt.stationarity, kkt.kink, searched
+    figures = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap, **found}
     if not gap <= tolerance:
         return VerdictLine(State.FAILED, f"not optimal: {better}; {known}", figures)
     if unknown and not math.isfinite(residual):

@@ -100,7 +100,7 @@ def rule_unit(case: CoDesignProblem, problem_key: str, key: str, theta: tuple[fl
         "kappa": [], "active": [], "shortfall": "" if feasible else "a bound is not kept",
         "violation": None, "syntheses": 1,
     }  # fmt: skip
-    return [], (key, theta, payload)
+    return [], payload
 
 
 # 3. The design that a run ends with.
