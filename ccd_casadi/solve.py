@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from ccd_casadi.cases.first_look import module_of_workers
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
@@ -118,14 +119,15 @@ def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -
     option("--no-report", action="store_true",
            help="write no pages, for jobs that only need result.json"),
     SCHEDULER, needs=["ccd_casadi.codesign.run"],
+    early=lambda options: None if options.scheduler else module_of_workers(options.case),
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.formulations import formulation_of, slow_words, usual_name
+    from ccd_casadi.codesign.result import resolved, write_run
     from ccd_casadi.codesign.run import co_design
-    from ccd_casadi.codesign.run_files import resolved, write_run
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler

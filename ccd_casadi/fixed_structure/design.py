@@ -15,7 +15,7 @@ from ccd_casadi.fixed_structure.composite import box_of, composite_problem
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
+from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopProblem, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope, envelope_of, optimality
 from ccd_casadi.fixed_structure.race import SAME, distinct, run_race
 from ccd_casadi.fixed_structure.sections_design import (
@@ -29,11 +29,13 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool, results
 
 LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 REDRAWS = 2  # searches at most from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
+AT_ONCE = 16  # controllers that a process looks at
 POOL = 12  # random starts tried for stability for each one that is kept
 
 
@@ -64,7 +66,7 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
     pool = stabilising(problem, np.reshape(search.inside(search.initial), (-1, len(names))))
     known = len(pool)
     if not search.only_initial:
-        pool = np.concatenate([pool, _pool(problem, starts, rng)])
+        pool = np.concatenate([pool, _pool(problem, starts, rng, workers)])
     if not len(pool):
         return search.failed()
     last = search.only_initial
@@ -73,14 +75,14 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
         best = runners[0].merit
         count = max(starts // 2, 1)
         fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
-        fresh = _nearest(problem, stabilising(problem, fresh), count)
+        fresh = _nearest(problem, stabilising(problem, fresh), count, workers)
         runners = run_race(problem, fresh, search.tell, workers, runners)
         if runners[0].merit < best + SAME:
             break
     return search.concluded(runners, len(pool))
 
 
-def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
+def _pool(problem: Problem, starts: int, rng: np.random.Generator, workers: Pool | None) -> Array:
     """Half by rules, half at random, of those that are stable; the nearest to the bounds of each,
     and the fastest by rule, which none at a modest bandwidth leads to.
 
@@ -94,19 +96,24 @@ def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
         if len(rules) + len(random):
             half = max(starts // 2, 1)
             fastest = rules[-1:] if half > 2 else rules[:0]
-            near = _nearest(problem, rules[: len(rules) - len(fastest)], half - len(fastest))
-            far = _nearest(problem, random, 4 * half)
+            rules = rules[: len(rules) - len(fastest)]
+            near = _nearest(problem, rules, half - len(fastest), workers)
+            far = _nearest(problem, random, 4 * half, workers)
             chosen = rng.permutation(len(far))[: max(starts - len(near) - len(fastest), half)]
             return np.concatenate([near, fastest, far[chosen]])
         low, high = 0.03 * low, low
     return np.zeros((0, len(problem.structure.names)))
 
 
-def _nearest(problem: Problem, kappa: Array, count: int) -> Array:
+def _nearest(problem: Problem, kappa: Array, count: int, workers: Pool | None) -> Array:
     """The `count` controllers that miss the bounds least at a modest bandwidth."""
-    tau = float(np.log(0.1))
-    misses = [assess(problem, one, tau).violation for one in kappa]
-    return kappa[np.argsort(misses)[:count]]
+    parts = {i: (problem, kappa[i : i + AT_ONCE]) for i in range(0, len(kappa), AT_ONCE)}
+    misses = dict(results(workers, _misses, parts))
+    return kappa[np.argsort([miss for i in parts for miss in misses[i]])[:count]]
+
+
+def _misses(problem: Problem, kappa: Array) -> list[float]:
+    return [assess(problem, one, FIRST).violation for one in kappa]
 
 
 def bandwidth_envelope(

@@ -18,6 +18,7 @@ from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_c
 from ccd_casadi.support.options import DEFAULT_CASE, Option, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import option as option
+from ccd_casadi.support.process_pool import begin_early, end_early
 from ccd_casadi.support.terminal import kept_quiet, say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
@@ -78,10 +79,11 @@ SCHEDULER = option(
 
 
 def command(
-    name: str, description: str, *options: Option, needs: Sequence[str], **how: Any
-) -> Callable[[Body], Callable[..., int]]:
+    name: str, description: str, *options: Option, needs: Sequence[str],
+    early: Callable[[argparse.Namespace], str | None] = lambda options: None, **how: Any,
+) -> Callable[[Body], Callable[..., int]]:  # fmt: skip
     """Makes the entry point of a command, which takes words and gives an exit code, of what it does
-    with its options; `how` as in `parser`, which `options` are added to, `needs` as in `run`."""
+    with its options; `how` as in `parser`, which `options` are added to, the others as in `run`."""
 
     def entry_of(body: Body) -> Callable[..., int]:
         @wraps(body)
@@ -89,7 +91,7 @@ def command(
             arguments = parser(name, description, **how)
             for add in options:
                 add(arguments)
-            return run(body, arguments, argv, needs=needs)
+            return run(body, arguments, argv, needs=needs, early=early)
 
         return main
 
@@ -102,11 +104,13 @@ def run(
     argv: Sequence[str] | None = None,
     *,
     needs: Sequence[str] = (),
+    early: Callable[[argparse.Namespace], str | None] = lambda options: None,
 ) -> int:
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line.
 
     The modules `needs` are what `main` imports that takes time: they are imported once the options
-    are known to be right, and while a Ctrl-C still finds nothing begun.
+    are known to be right, and while a Ctrl-C still finds nothing begun. Meanwhile processes import
+    the module that `early` names, if it does, for the first pool of `main`.
     """
     code = ExitCode.INTERRUPTED
     try:
@@ -117,6 +121,8 @@ def run(
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
+    if (of_workers := early(options)) is not None:
+        begin_early(options.workers, of_workers)
     for module in needs:
         import_module(module)
     raise_on_ctrl_c()
@@ -156,6 +162,8 @@ def run(
         if not was_ctrl_c(error):
             raise
         say(f"interrupted: {_RESUMABLE}", sys.stderr)
+    finally:
+        end_early()
     return int(code)
 
 

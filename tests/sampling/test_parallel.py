@@ -1,5 +1,6 @@
 """The pool of workers: every result once, errors told, no process left behind."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from busy import HANGS
 
 from ccd_casadi.support.options import usable_cores
-from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.process_pool import Workers, begin_early, end_early
 from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost
 
 HERE = Path(__file__).parent
@@ -73,6 +74,19 @@ def test_every_task_gives_its_result_once(count: int, tasks: int) -> None:
         found = sorted(workers.map_unordered(square, range(tasks)))
         again = sorted(workers.map_unordered(square, range(tasks)))
     assert found == again == [i * i for i in range(tasks)]
+
+
+def test_a_pool_takes_the_processes_that_were_started_early() -> None:
+    before = {child.pid for child in multiprocessing.active_children()}
+    begin_early(2, "ccd_casadi")
+    early = {child.pid for child in multiprocessing.active_children()} - before
+    with Workers(2) as workers:
+        used = {found[0] for found in workers.map_unordered(whereabouts, range(8))}
+        assert len(early) == 2
+        assert used <= early
+    begin_early(2, "ccd_casadi")
+    end_early()
+    assert {child.pid for child in multiprocessing.active_children()} == before
 
 
 def test_workers_are_other_processes_with_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,7 +217,7 @@ import sys
 sys.path[:0] = {[str(HERE), str(HERE.parent / "support")]!r}
 import ccd_casadi.solve  # as the command does: workers import it as they start
 from ccd_casadi.support.command_line import parser, run
-from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.process_pool import Workers, begin_early, end_early
 from test_parallel import pid_and_sleep
 
 def main(options):
