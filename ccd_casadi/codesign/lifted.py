@@ -57,6 +57,10 @@ class Lifted:
     kernel: str = "matern52"
     box_points: int = 32
 
+    def sampled(self, variables: int) -> int:
+        """How many designs the plan has."""
+        return self.points or 6 * variables
+
 
 def solve_lifted(
     sampler: Sampler, options: Lifted, *, seed: int, given: KnownSamples | None = None
@@ -67,7 +71,7 @@ def solve_lifted(
     """
     problem = sampler.problem
     bounds, n = lifted_bounds(problem), len(problem.names) + 2
-    points = options.points or 6 * n
+    points = options.sampled(n)
     if given is None:
         X = design("sobol", *bounds, points, seed)
         samples = [s for s in sampler.quantities(X) if s.certified]

@@ -56,6 +56,10 @@ class Nested:
     kernel: str = "matern52"
     box_points: int = 32
 
+    def sampled(self, variables: int) -> int:
+        """How many designs the plan has."""
+        return self.points**variables if self.plan == "grid" else self.points
+
 
 def solve_nested(
     sampler: Sampler,

@@ -122,9 +122,9 @@ class Outer(ABC):
         if isinstance(formulation, Lifted):
             if self.extra_variables:
                 return solve_lifted(self.sampler, formulation, seed=seed, given=given)
-            points = formulation.points or 6 * len(self.problem.names)
-            options = {key: value for key, value in vars(formulation).items() if key != "points"}
-            formulation = Nested("sobol", points, **options)
+            formulation = Nested(**vars(formulation) | {
+                "plan": "sobol", "points": formulation.sampled(len(self.problem.names)),
+            })  # fmt: skip
         return solve_nested(self.sampler, formulation, seed=seed, given=given, gradients=lifted)
 
     def solve_on_truth(self, starts: int, seed: int) -> FormulationResult:
