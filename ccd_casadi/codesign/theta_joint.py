@@ -87,7 +87,7 @@ def joint_search(
             working, best, _ = working.on_worse_plants(models, best, looks, WITHIN, tell)
             del make, models
             gc.collect()  # with which the bases go
-            working, best, settled = finished_on_worse_plants(working, best, final, tell)
+            working, best, settled = finished_on_worse_plants(working.whole, best, final, tell)
             if settled:
                 break
             known = [best.theta]

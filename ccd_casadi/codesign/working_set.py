@@ -38,6 +38,11 @@ class WorkingSet:
     aside: tuple[Scenario, ...] = ()
     back: frozenset[Scenario] = frozenset()
 
+    @property
+    def whole(self) -> "WorkingSet":
+        """With those aside too: at an end plants that bind in turns would bring each other back."""
+        return WorkingSet(with_scenarios(self.sampler, self.aside)) if self.aside else self
+
     def reduced(self, models: Sequence[Evaluate], at: JointPoint) -> "WorkingSet":
         """Without the plants that do not hold the controller there."""
         problem = self.sampler.problem
