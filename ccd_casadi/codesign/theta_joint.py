@@ -181,10 +181,16 @@ def finished(
 
 def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Array) -> Array:
     """By how much J is larger at θ (n, n_θ) beside a sample, by climbs of its controller on the
-    plants to first order there."""
-    here, found = JointPoint(sample.theta, sample.kappa, sample.bandwidth), []
+    plants to first order there; the best controller of them counts at every one."""
+    here = JointPoint(sample.theta, sample.kappa, sample.bandwidth)
     models = nearby(problem, (), here.theta)
-    for theta in [np.array(here.theta), *thetas]:
-        there = replace(here, theta=tuple(theta.tolist()))
-        found.append(JointModel(problem, models, there, 0.0).adapted(STEPS)[1])
-    return np.array(found[1:]) - found[0]
+    places = [here.theta, *(tuple(theta.tolist()) for theta in thetas)]
+
+    def climbed(start: JointPoint) -> list[tuple[JointPoint, float]]:
+        starts = (replace(start, theta=place) for place in places)
+        return [JointModel(problem, models, one, 0.0).adapted(STEPS) for one in starts]
+
+    own = climbed(here)
+    other = climbed(min(own, key=lambda end: end[1])[0])
+    J = np.array([min(a[1], b[1]) for a, b in zip(own, other, strict=True)])
+    return J[1:] - J[0]
