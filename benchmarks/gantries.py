@@ -1,16 +1,19 @@
 """Random gantries: two motors, two encoders, three positions in the set, two θ; all verified?
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/gantries.py [--cases N] [--first SEED] [--workers N]
+        [--formulation NAME]
 
 A beam on two driven carriages, a slide on it that stands left, in the middle and right: three
 coupled plants of two channels. θ are the height of the beam and the mass of the carriages. A seed
 draws masses, span, stiffness of the guides, damping, rate, delay, S_max and the worth of a hertz.
-Each is `solve` as it stands, one line of JSON each: status, J, seconds of the wall and of the
-processor. Raises nothing; the exit status is 1 where one is not verified.
+Each is solved as `solve` would, by the formulation that it takes or the one that is named. One line
+of JSON each: status, J, seconds of the wall and of the processor, workers included. Raises nothing;
+the exit status is 1 where one is not verified.
 """
 
 import argparse
 import json
+import resource
 import sys
 import tempfile
 import time
@@ -128,32 +131,43 @@ def written(seed: int, folder: Path) -> Path:
     return path
 
 
+def processor_seconds() -> float:
+    """Of this process and of those that it has ended."""
+    return sum(use.ru_utime + use.ru_stime for use in map(resource.getrusage, (
+        resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))  # fmt: skip
+
+
 def main() -> int:
     """Every case, a line each."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
-    from ccd_casadi.codesign.nested import Nested
+    from ccd_casadi.codesign.formulations import formulation_of, usual_name
     from ccd_casadi.codesign.run import solve
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=4)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--formulation", choices=("nested", "lifted", "direct"))
     options = parser.parse_args()
     failed = 0
     for seed in range(options.first, options.first + options.cases):
-        with tempfile.TemporaryDirectory() as name:
-            path = written(seed, Path(name))
-            began, spent = time.perf_counter(), time.process_time()
-            solution = solve(problem_of(load_case(path)), Nested(), workers=options.workers)
+        with tempfile.TemporaryDirectory() as folder:
+            path = written(seed, Path(folder))
+            began, spent = time.perf_counter(), processor_seconds()
+            case = load_case(path)
+            name = options.formulation or usual_name(case, len(case.theta))
+            formulation = formulation_of(case, name)
+            solution = solve(problem_of(case), formulation, workers=options.workers)
         result = solution.result
         failed += result["status"] != "verified"
-        row = {"seed": seed, "status": result["status"], "reason": result.get("reason", "")}
+        row = {"seed": seed, "formulation": name, "status": result["status"],
+               "reason": result.get("reason", "")}  # fmt: skip
         if solution.verified is not None:
             row |= {"J": result["objective"], "bandwidth_hz": result["bandwidth_hz"],
                     "theta": result["theta"], "syntheses": result["syntheses"]}  # fmt: skip
         row |= {"seconds": round(time.perf_counter() - began, 1),
-                "own_processor_seconds": round(time.process_time() - spent, 1)}  # fmt: skip
+                "processor_seconds": round(processor_seconds() - spent, 1)}  # fmt: skip
         print(json.dumps(row), flush=True)
     return int(failed > 0)
 

@@ -1,6 +1,6 @@
 """The rib stage's controller on random plants inside its set, sampled with hold and delay.
 
-    python benchmarks/rib_stage_built.py [FOLDER] [--plants N] [--seed N] [--write]
+    python benchmarks/rib_stage_built.py [FOLDER] [--plants N] [--seed N] [--modes N] [--write]
 
 FOLDER holds controller.json of runs/rib_stage_built.toml (`solve`, or `inner --out`), and
 result.json or inner.json (what `inner` printed) for θ; by default the design of docs/rib_stage.md,
@@ -9,10 +9,10 @@ finite-element model: a payload of up to 50 g on one of the centre ribs, up to 3
 any side, ten or twenty modes, the shipped mesh (every fourth group: no payload, the finer mesh);
 within it every flexible mode is shifted on its own within ±2 % and the damping factor lies between
 0.5 and 2. `--anywhere` puts the payload anywhere within 30 mm, on the plate between the ribs too,
-where the case's set has none. Every loop is closed with K by Tustin's rule, hold and delay exact
-(`robust.sampled`, which the synthesis does not use): eigenvalues, ‖S‖∞, ω_b; the worst plant is
-run sample by sample too. `--write` keeps every group in benchmarks/rib_stage_built.json and goes on
-from there.
+where the case's set has none; `--modes` keeps so many modes in all of them. Every loop is closed
+with K by Tustin's rule, hold and delay exact (`robust.sampled`, which the synthesis does not use):
+eigenvalues, ‖S‖∞, ω_b; the worst plant is run sample by sample too. `--write` keeps every group in
+benchmarks/rib_stage_built.json and goes on from there.
 """
 
 import argparse
@@ -65,7 +65,7 @@ def theta_of(folder: Path) -> list[float]:
 
 
 def plants(
-    theta: list[float], seed: int, group: int, anywhere: bool
+    theta: list[float], seed: int, group: int, anywhere: bool, modes: int | None
 ) -> list[tuple[StateSpace, dict[str, Any]]]:
     """The plants of a group with where they lie."""
     rng = np.random.default_rng([seed, group])
@@ -74,6 +74,7 @@ def plants(
         radius, angle = REACH * np.sqrt(rng.random()), 2.0 * np.pi * rng.random()
     payload = (radius * np.cos(angle), radius * np.sin(angle), PAYLOAD * rng.random())
     options: dict[str, Any] = {"modes": int(rng.choice([10, 20]))}
+    options |= {"modes": modes} if modes else {}
     options |= {"mesh": "fine"} if group % 4 == 3 else {"point_masses": (payload,)}
     system = mechanics(rib_stage(NAMES, **options), theta, derivatives=False)
     box = UncertainPlant((system,), Suspension(), M_K, mode_shift=0.02, damping=(0.5, 2.0))
@@ -86,10 +87,10 @@ def plants(
 
 
 def judged(
-    K: StateSpace, theta: list[float], seed: int, group: int, anywhere: bool
+    K: StateSpace, theta: list[float], seed: int, group: int, anywhere: bool, modes: int | None
 ) -> tuple[list[dict[str, Any]], StateSpace]:
     """Rows of a group, and its worst plant."""
-    rows, made = [], plants(theta, seed, group, anywhere)
+    rows, made = [], plants(theta, seed, group, anywhere, modes)
     for plant, place in made:
         f = sampled_figures(closed_loop(sampled(plant, 1.0 / RATE, DELAY), K).S)
         rows.append({"group": group, "stable": f.stable, "radius": f.spectral_radius,
@@ -105,21 +106,19 @@ def main() -> None:
     arguments.add_argument("--plants", type=int, default=500)
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--anywhere", action="store_true")
+    arguments.add_argument("--modes", type=int, choices=(10, 20, 44))
     arguments.add_argument("--write", action="store_true")
     options = arguments.parse_args()
     K, theta = controller(options.folder), theta_of(options.folder)
     rows: list[dict[str, Any]] = []
     if options.write and RESULTS.is_file():
         known = json.loads(RESULTS.read_text())
-        if (known["theta"], known["seed"], known["anywhere"]) == (
-            theta,
-            options.seed,
-            options.anywhere,
-        ):
+        own = (theta, options.seed, options.anywhere, options.modes)
+        if (known["theta"], known["seed"], known["anywhere"], known.get("modes")) == own:
             rows = known["rows"]
     measured, top = None, -np.inf
     for group in range(len(rows) // GROUP, -(-options.plants // GROUP)):
-        more, plant = judged(K, theta, options.seed, group, options.anywhere)
+        more, plant = judged(K, theta, options.seed, group, options.anywhere, options.modes)
         rows += more
         peak = max(row["peak"] or np.inf for row in more)
         if top < peak < np.inf:
@@ -132,6 +131,7 @@ def main() -> None:
                 "theta": theta,
                 "seed": options.seed,
                 "anywhere": options.anywhere,
+                "modes": options.modes,
                 "rows": rows,
             }
             RESULTS.write_text(json.dumps(kept) + "\n")

@@ -10,7 +10,7 @@ has a source of its own, independent of the others, of the same spectrum.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -200,14 +200,6 @@ class Source:
             return HZ * np.array(self.spectrum.hz)
         roots = [corner[0] for corner in (*self.spectrum.zeros, *self.spectrum.poles)]
         return HZ * np.array(roots, float)
-
-    def times(self, factor: float) -> "Source":
-        """The same source with `factor` times the amplitude."""
-        spectrum = self.spectrum
-        if isinstance(spectrum, ShapedSpectrum):
-            return replace(self, spectrum=replace(spectrum, level=factor**2 * spectrum.level))
-        density = tuple(factor**2 * value for value in spectrum.density)
-        return replace(self, spectrum=replace(spectrum, density=density))
 
 
 @dataclass(frozen=True)

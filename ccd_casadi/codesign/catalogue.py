@@ -28,6 +28,7 @@ from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import with_all_spent
+from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import counted
 
 Lists = dict[str, tuple[float, ...]]
@@ -219,29 +220,21 @@ def _listed(
     J = best.result.get("objective", np.inf)
     assert best.problem is not None
     held = best.problem.source.held
-    cutting = min((part.bound for part in left if not part.lost), default=np.inf)
-    return {
-        "values": {name: list(values) for name, values in problem.listed},
+    cut, lost = ([part for part in left if part.lost is item] for item in (False, True))
+    return json_values({
+        "values": dict(problem.listed),
         "chosen": {name: held[name] for name, _ in problem.listed},
         "combinations": int(np.prod([len(values) for _, values in problem.listed])),
         "solved": whole,
         "between": len(nodes) - whole,
         "judged": judged,
-        "cut": sum(part.count for part in left if not part.lost),
-        "least_of_cut": cutting if np.isfinite(cutting) else None,
-        "without_design": sum(part.count for part in left if part.lost),
-        "free_objective": free if np.isfinite(free) else None,
-        "objective_above_free": J - free if np.isfinite([J, free]).all() else None,
-        "nodes": [
-            {
-                "lists": {name: list(values) for name, values in node.lists.items()},
-                "status": node.status,
-                "objective": node.objective if np.isfinite(node.objective) else None,
-                "words": node.words,
-            }
-            for node in nodes
-        ],
-    }
+        "cut": sum(part.count for part in cut),
+        "least_of_cut": min((part.bound for part in cut), default=None),
+        "without_design": sum(part.count for part in lost),
+        "free_objective": free,
+        "objective_above_free": J - free,
+        "nodes": nodes,
+    })  # fmt: skip
 
 
 def _made_of(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:

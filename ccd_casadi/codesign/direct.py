@@ -35,6 +35,10 @@ class Direct:
     tolerance: float = 1e-3
     box_points: int = 32
 
+    def sampled(self, variables: int) -> int:
+        """How many designs the plan has."""
+        return self.starts
+
 
 def polish(truth: TrueQuantities, x: Array) -> TrueDesign:
     """From a design nearly optimal to the nearest stationary point of the true problem.

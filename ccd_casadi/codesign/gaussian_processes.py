@@ -33,6 +33,24 @@ def best_left_out(processes: Iterable[GaussianProcess]) -> GaussianProcess:
     return min(processes, key=lambda process: process.loo.rms)
 
 
+def interpolating(
+    process: GaussianProcess, X: Array, Y: Array, dY: Array | None, longest: float = np.inf
+) -> GaussianProcess:
+    """The process conditioned on other samples, hyperparameters kept but for their noise.
+
+    The truth has none: what a fit to the whole box takes for noise is what its kernel cannot
+    follow there, and would be averaged away sample by sample where samples gather. `longest`: of
+    its length scales, in shares of the box.
+    """
+    exact = replace(
+        process.hyperparameters,
+        length_scales=np.minimum(process.hyperparameters.length_scales, longest),
+        noise_variance=0.0, gradient_noise_variance=0.0,
+    )  # fmt: skip
+    ends = {"lower": process.lower, "upper": process.upper}
+    return condition(exact, X, Y, **ends, kernel=process.kernel, dY=dY)
+
+
 def with_sample(process: GaussianProcess, x: Array, value: float, slope: Array) -> GaussianProcess:
     """The process with one more sample (d,), its slope (d,) too where it has those of the others.
 
@@ -49,22 +67,16 @@ def with_sample(process: GaussianProcess, x: Array, value: float, slope: Array) 
     dY = np.vstack([targets[1:].T / width, slope]) if sloped else None
     X = np.vstack([process.lower + width * process.X[others], x])
     Y = np.append(process.output_mean + targets[0], value)
-    box, best = {"lower": process.lower, "upper": process.upper}, process
+    best = process
 
     def missed(each: GaussianProcess) -> float:
         return abs(float(each.predict(x[None, :])[0]) - value)
 
-    scales = process.hyperparameters.length_scales
     for longest in (np.inf, 10.0, 3.0, 1.0, 0.3):  # of the box: what a jump lets a process have
-        exact = replace(
-            process.hyperparameters, length_scales=np.minimum(scales, longest),
-            noise_variance=0.0, gradient_noise_variance=0.0,
-        )  # fmt: skip
         try:
-            found = condition(exact, X, Y, **box, kernel=process.kernel, dY=dY)
+            best = min(best, interpolating(process, X, Y, dY, longest), key=missed)
         except SurrogateFitError:
             continue
-        best = min(best, found, key=missed)
         if missed(best) <= TAKEN * abs(value):
             break
     return best
@@ -89,17 +101,17 @@ def recommendation(qualities: Sequence[Quality]) -> str:
     """What follows from them, in one or two sentences; nothing where there is no surrogate."""
     if not qualities:
         return ""
-    said = []
+    said, names = [], {q.name: q.name.replace("_", " ") for q in qualities}
     poor = [q for q in qualities if q.poor]
     if poor:
-        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.loo.q2:.2g})" for q in poor)
+        which = ", ".join(f"{names[q.name]} (Q² {q.loo.q2:.2g})" for q in poor)
         said.append(
             f"Left-out samples of {which} are predicted poorly: more samples are needed before the "
             "surrogate says anything away from the design."
         )
     rough = [q for q in qualities if not q.followed and not q.poor]
     if rough:
-        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.loo.q2:.3g})" for q in rough)
+        which = ", ".join(f"{names[q.name]} (Q² {q.loo.q2:.3g})" for q in rough)
         said.append(
             f"Left-out samples of {which} are predicted roughly, as those of a function with kinks "
             "or jumps are: one smooth surrogate follows them only near the design."
@@ -111,7 +123,7 @@ def recommendation(qualities: Sequence[Quality]) -> str:
             else "The larger of two local peaks is kinked where they are equal; the rounds refit "
             "near the design, where one of them is the larger."
         )
-    beyond = [q.name.replace("_", " ") for q in qualities if q.extrapolates]
+    beyond = [names[q.name] for q in qualities if q.extrapolates]
     if beyond:
         said.append(
             f"At the design the surrogate of {', '.join(beyond)} extrapolates: trust the "
@@ -119,7 +131,7 @@ def recommendation(qualities: Sequence[Quality]) -> str:
         )
     for q in qualities:
         if q.unsupported and not q.extrapolates and not q.poor:
-            said.append(f"{q.name.replace('_', ' ').capitalize()}: {q.unsupported}.")
+            said.append(f"{names[q.name].capitalize()}: {q.unsupported}.")
     return " ".join(said) or "The surrogates follow their samples, and support the design."
 
 

@@ -97,10 +97,10 @@ def _ends(problem: CoDesignProblem, theta: Array) -> Array:
 
 def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
     """Ends of local solves from a few starts around x: the last try where x is not stationary."""
-    lower, upper = box(outer.problem)
+    here, bounds = outer.theta_of(x), box(outer.problem)
     found = []
-    for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, lower.size)):
-        theta = np.clip(outer.theta_of(x) + step * (upper - lower), lower, upper)
+    for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, here.size)):
+        theta = np.clip(here + step * bounds.width, *bounds)
         sample = outer.sampler.values(theta, "perturbed starts")[0]
         place = outer.local_solve(sample, (), 1e-13) if sample.feasible else None
         if place is not None:
@@ -111,19 +111,19 @@ def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
 def _spread(outer: Outer, points: int, seed: int) -> list[InnerSample]:
     """The inner problems that the run has solved, and as many more as make up `points`; where these
     are dear, those of a spread set that none is near."""
-    sampler, (lower, upper) = outer.sampler, box(outer.problem)
+    sampler, bounds = outer.sampler, box(outer.problem)
     known: list[InnerSample] = []
     for sample in sampler.solved.values():
-        away = [np.abs((np.array(sample.theta) - one.theta) / (upper - lower)) for one in known]
-        if all(far.max() > CLUSTER for far in away):
+        if all(bounds.away(sample.theta, one.theta) > CLUSTER for one in known):
             known.append(sample)
-    spread = design("sobol", lower, upper, points, seed)
+    spread = design("sobol", *bounds, points, seed)
     if outer.global_check_is_cheap:
         spread = spread[len(known) :]
     else:
-        apart, solved = 0.5 * points ** (-1.0 / lower.size), [one.theta for one in known]
-        away = np.abs((spread[:, None] - np.reshape(solved, (-1, lower.size))) / (upper - lower))
-        spread = spread[(away.max(axis=2) > apart).all(axis=1)]
+        n = spread.shape[1]
+        solved = np.reshape([one.theta for one in known], (-1, n))
+        away = bounds.away(spread[:, None], solved)
+        spread = spread[(away > 0.5 * points ** (-1.0 / n)).all(axis=1)]
     more = [theta for theta in spread if not violated(outer.problem, theta)]
     if more:
         known = [*known, *sampler.values(np.array(more), "global check")]
@@ -137,14 +137,11 @@ def _starts(
     best first."""
     if not samples:
         return [], []
-    lower, upper = box(problem)
-    unit = (np.array([sample.theta for sample in samples]) - lower) / (upper - lower)
-    here = (theta - lower) / (upper - lower)
+    bounds, thetas = box(problem), np.array([sample.theta for sample in samples])
     lowest: list[InnerSample] = []
     others: list[InnerSample] = []
     for i in np.argsort(values):
-        away = np.abs(unit - unit[i]).max(axis=1)
-        near = np.argsort(away)[1 : lower.size + 2]
-        if np.abs(unit[i] - here).max() > SAME:
+        near = np.argsort(bounds.away(thetas, thetas[i]))[1 : theta.size + 2]
+        if bounds.away(thetas[i], theta) > SAME:
             (lowest if (values[near] >= values[i]).all() else others).append(samples[i])
     return lowest, others

@@ -62,7 +62,7 @@ def descend(
     where others `ended`. Returns the start where it is not certified.
     """
     model = _Peaks(truth, ended)
-    here = model.at((x - model.lower) / model.width)
+    here = model.at(model.box.shares(x))
     if here is None or model.ended(here, here):
         return x
     scale = max(float(np.abs(here.gradient).max()), 1e-300)
@@ -70,7 +70,7 @@ def descend(
         model, here, scale * np.eye(x.size), Radius(FIRST, LEAST, LARGEST), steps=steps,
         penalty=scale, least_gain=settled * abs(here.value),
     )  # fmt: skip
-    return model.lower + model.width * end.best.x
+    return model.box.lower + model.box.width * end.best.x
 
 
 class _Peaks(Model[_Design]):
@@ -80,16 +80,15 @@ class _Peaks(Model[_Design]):
 
     def __init__(self, truth: TrueQuantities, known: Sequence[tuple[Array, float]]) -> None:
         self.truth = truth
-        self.lower, upper = lifted_bounds(truth.problem)
-        self.width = upper - self.lower
-        self.low, self.high = np.zeros(len(upper)), np.ones(len(upper))
-        self.known = [((at - self.lower) / self.width, J) for at, J in known]
+        self.box = lifted_bounds(truth.problem)
+        self.low, self.high = np.zeros_like(self.box.lower), np.ones_like(self.box.lower)
+        self.known = [(self.box.shares(at), J) for at, J in known]
         self.bend = SHELF
 
     def at(self, x: Array) -> Iterate[_Design] | None:
         """A certified design with ∇J, its constraints and its peaks."""
         z = np.clip(x, 0.0, 1.0)
-        there = TrueDesign(self.truth, self.lower + self.width * z)
+        there = TrueDesign(self.truth, self.box.lower + self.box.width * z)
         made = there.design
         if not made.figures.certified or made.made is None:
             return None

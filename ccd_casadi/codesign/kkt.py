@@ -19,7 +19,7 @@ of its gradient is 1e-6; the gradients themselves are good to 1e-10.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -119,19 +119,19 @@ def kkt_certificate(here: TrueDesign, second: bool = False) -> KktCertificate:
 
 def active_at(here: TrueDesign, others: tuple[PeakConstraint, ...] = ()) -> ActiveSet:
     """The active constraints and bounds, with `others` besides the problem's own."""
-    lower, upper = lifted_bounds(here.problem)
     variables = (*here.problem.names, "omega_S", "omega_T")
-    return active_set((here.x - lower) / (upper - lower), first_order(here, others), variables)
+    z = lifted_bounds(here.problem).shares(here.x)
+    return active_set(z, first_order(here, others), variables)
 
 
 def _certificate(here: TrueDesign, at: ActiveSet, second: bool) -> KktCertificate:
     mu = at.multipliers()
     Z = at.free(mu)
     found = at.certificate(mu, at.residual(mu), np.inf if Z.shape[1] == 0 else None)
-    if found.second_order is not None or not second:
+    if not (second and Z.shape[1]):
         return found
     columns = lagrangian_hessian(here, Z, found.multipliers)
-    return at.certificate(mu, found.stationarity, reduced_curvature(Z, columns, at.size))
+    return replace(found, second_order=reduced_curvature(Z, columns, at.size))
 
 
 def first_order(
@@ -139,9 +139,9 @@ def first_order(
 ) -> FirstOrder:
     """J, the bounds on the loop (ln, `inside` tighter), λ, and `others` like the bounds."""
     problem, design, count = here.problem, here.design, len(here.problem.names)
-    lower, upper = lifted_bounds(problem)
     own, sizes = hardware_at(problem, here.theta), constraint_sizes(problem)
-    total = np.hstack([design.to_theta, design.to_break_frequencies]) * (upper - lower)
+    total = np.hstack([design.to_theta, design.to_break_frequencies])
+    total *= lifted_bounds(problem).width
     gradient = problem.w2 * total[0]
     gradient[:count] += own.cost_gradient
     bounds, peaks = design.values[1:-1] - problem.inner.levels, [peak.value for peak in others]
@@ -163,18 +163,17 @@ def lagrangian_hessian(
 
     `multipliers` by the certificate's names.
     """
-    lower, upper = lifted_bounds(here.problem)
-    width = upper - lower
+    bounds = lifted_bounds(here.problem)
 
     def slope(z: Array) -> Array | None:
-        there = TrueDesign(here.truth, lower + width * z)
+        there = TrueDesign(here.truth, bounds.lower + bounds.width * z)
         if not there.design.figures.certified:
             return None
         found = first_order(there)
         mu = np.array([multipliers.get(name, 0.0) for name in found.names]) * found.sizes
         return found.gradient + mu @ found.jacobian
 
-    return hessian_products(slope, (here.x - lower) / width, directions)
+    return hessian_products(slope, bounds.shares(here.x), directions)
 
 
 def newton_step(here: TrueDesign) -> Array | None:
@@ -203,5 +202,5 @@ def newton_step(here: TrueDesign) -> Array | None:
         d = d + np.linalg.lstsq(A, aim, rcond=None)[0]
     if np.abs(d).max() > NEAR:
         return None
-    lower, upper = lifted_bounds(problem)
-    return np.clip(here.x + (upper - lower) * d, lower, upper)
+    bounds = lifted_bounds(problem)
+    return np.clip(here.x + bounds.width * d, *bounds)

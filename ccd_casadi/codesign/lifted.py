@@ -5,24 +5,25 @@ their exact gradients determine them; the same samples answer any S_max, S_low, 
 and λ with no new synthesis.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
-from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.gaussian_processes import best_left_out, interpolating, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     OuterSolution,
     lifted_bounds,
-    lifted_program,
+    outer_program,
     solve_program,
 )
 from ccd_casadi.inner_problem.objective import constraint_shares, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import QuantitySample
-from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
+from ccd_casadi.support.arrays import Array
+from surrogates import GaussianProcess, design, fit_outputs, to_casadi
 
 STEP = 1e-4  # share of the box below which a step counts as small
 SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
@@ -56,6 +57,10 @@ class Lifted:
     kernel: str = "matern52"
     box_points: int = 32
 
+    def sampled(self, variables: int) -> int:
+        """How many designs the plan has."""
+        return self.points or 6 * variables
+
 
 def solve_lifted(
     sampler: Sampler, options: Lifted, *, seed: int, given: KnownSamples | None = None
@@ -65,14 +70,14 @@ def solve_lifted(
     With `given` samples the rounds start from these.
     """
     problem = sampler.problem
-    lower, upper = lifted_bounds(problem)
-    points = options.points or 6 * len(lower)
+    bounds, n = lifted_bounds(problem), len(problem.names) + 2
+    points = options.sampled(n)
     if given is None:
-        X = design("sobol", lower, upper, points, seed)
+        X = design("sobol", *bounds, points, seed)
         samples = [s for s in sampler.quantities(X) if s.certified]
     else:
         samples = [sample for sample in given if isinstance(sample, QuantitySample)]
-    if len(samples) < len(lower) + 1:
+    if len(samples) < n + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)
     iterates: list[Iterate] = []
@@ -85,9 +90,9 @@ def solve_lifted(
             processes = fit_quantities(problem, samples, seed, kind=options.kernel)
             fitted = len(samples)
         elif len(samples) > len(processes[0].X):
-            processes = update_quantities(problem, samples, processes)
-        program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
-        spread = design("sobol", lower, upper, options.starts, seed + round_number)
+            processes = update_quantities(samples, processes)
+        program = outer_program(problem, to_casadi(processes, std=False), margin=MARGIN)
+        spread = design("sobol", *bounds, options.starts, seed + round_number)
         if incumbent is not None:
             # One sample moves the surrogates' optima, and seldom makes one: the last round's lead.
             known = [] if solution is None else [optimum.x for optimum in solution.optima]
@@ -100,13 +105,12 @@ def solve_lifted(
         predicted = np.array([float(process.predict(x[None, :])[0]) for process in processes])
         with sampler.spent.on("rounds"):
             sample = sampler.quantities(x, f"verifying round {round_number + 1}")[0]
-        away = np.inf if incumbent is None else x - incumbent.x
         errors = np.abs(sample.values[:-1] - predicted)  # of ω_b relative, of ln of the bounded
         errors[0] /= sample.values[0]
         iterate = iterate_of(
             problem, sample.x[: len(problem.names)], float(predicted[0]), float(sample.values[0]),
             error=float(errors.max()) if sample.certified else np.inf,
-            step=float(np.abs(away / (upper - lower)).max()),
+            step=np.inf if incumbent is None else float(bounds.away(x, incumbent.x)),
         )  # fmt: skip
         iterates.append(iterate)
         settled = incumbent is not None and abs(
@@ -131,9 +135,7 @@ def fit_quantities(
 ) -> tuple[GaussianProcess, ...]:
     """Processes of ω_b (rad/s) and ln of each bounded figure over x = (θ, ln ω_S, ln ω_T)."""
     lower, upper = lifted_bounds(problem)
-    X = np.array([sample.x for sample in samples])
-    Y = np.array([sample.values[:-1] for sample in samples])
-    dY = np.array([sample.gradients[:-1] for sample in samples])
+    X, Y, dY = _arrays(samples)
     found = [
         fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1, kernel=kernel)
         for kernel in kernels_of(kind)
@@ -142,48 +144,33 @@ def fit_quantities(
 
 
 def update_quantities(
-    problem: CoDesignProblem, samples: list[QuantitySample], processes: tuple[GaussianProcess, ...]
+    samples: list[QuantitySample], processes: tuple[GaussianProcess, ...]
 ) -> tuple[GaussianProcess, ...]:
-    """The same processes conditioned on more samples, hyperparameters kept but for their noise.
+    """The same processes on more samples."""
+    X, Y, dY = _arrays(samples)
+    return tuple(interpolating(each, X, Y[:, i], dY[:, i]) for i, each in enumerate(processes))
 
-    The truth has none: what a fit to the whole box takes for noise is what its kernel cannot
-    follow there, and would be averaged away sample by sample where the rounds gather.
-    """
-    lower, upper = lifted_bounds(problem)
-    X = np.array([sample.x for sample in samples])
-    return tuple(
-        condition(
-            replace(process.hyperparameters, noise_variance=0.0, gradient_noise_variance=0.0),
-            X,
-            np.array([sample.values[i] for sample in samples]),
-            lower=lower,
-            upper=upper,
-            kernel=process.kernel,
-            dY=np.array([sample.gradients[i] for sample in samples]),
-        )
-        for i, process in enumerate(processes)
-    )
+
+def _arrays(samples: list[QuantitySample]) -> tuple[Array, Array, Array]:
+    """x (N, n), outputs (N, k) and their slopes (N, k, n): ω_b and ln of each bounded figure."""
+    rows = [(sample.x, sample.values[:-1], sample.gradients[:-1]) for sample in samples]
+    X, Y, dY = map(np.array, zip(*rows, strict=True))
+    return X, Y, dY
 
 
 def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:
     return objective(problem, sample.x[: len(problem.names)], sample.values[0])
 
 
-def _violation(problem: CoDesignProblem, sample: QuantitySample) -> float:
-    """Largest violation of λ, in shares of its size, and, in ln, of a bound."""
-    levels = problem.inner.levels - MARGIN
-    lam = constraint_shares(problem, sample.x[: len(problem.names)])
-    return float(np.concatenate([sample.values[1:-1] - levels, lam]).max())
-
-
 def _better(
     problem: CoDesignProblem, incumbent: QuantitySample | None, sample: QuantitySample
 ) -> QuantitySample:
-    """The sample with less violation beyond the slack; among feasible ones the better J."""
-    if incumbent is None:
-        return sample
+    """The sample with less violation beyond the slack, of λ in shares of its size, of a bound in
+    ln; among feasible ones the better J."""
 
     def rank(s: QuantitySample) -> tuple[float, float]:
-        return max(0.0, _violation(problem, s) - FEASIBLE), _objective(problem, s)
+        lam = constraint_shares(problem, s.x[: len(problem.names)])
+        over = np.concatenate([s.values[1:-1] - problem.inner.levels + MARGIN, lam]).max()
+        return max(0.0, float(over) - FEASIBLE), _objective(problem, s)
 
-    return min(incumbent, sample, key=rank)
+    return sample if incumbent is None else min(incumbent, sample, key=rank)

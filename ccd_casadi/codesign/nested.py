@@ -14,11 +14,12 @@ from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     OuterSolution,
-    nested_program,
+    outer_program,
     solve_program,
 )
 from ccd_casadi.inner_problem.objective import objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.optim.box import Box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
@@ -55,6 +56,10 @@ class Nested:
     kernel: str = "matern52"
     box_points: int = 32
 
+    def sampled(self, variables: int) -> int:
+        """How many designs the plan has."""
+        return self.points**variables if self.plan == "grid" else self.points
+
 
 def solve_nested(
     sampler: Sampler,
@@ -70,12 +75,12 @@ def solve_nested(
     envelope's gradients too.
     """
     problem = sampler.problem
-    lower, upper = box(problem)
+    bounds, n = box(problem), len(problem.names)
     if given is None:
-        plan = design(options.plan, lower, upper, options.points, seed)
+        plan = design(options.plan, *bounds, options.points, seed)
         thetas = _allowed(problem, np.unique(np.vstack([plan, problem.start]), axis=0))
     else:
-        thetas = np.array([sample.x[: len(lower)] for sample in given])
+        thetas = np.array([sample.x[:n] for sample in given])
     samples = sampler.values(thetas)
     if not any(sample.feasible for sample in samples):
         return FormulationResult(message="no sampled theta is feasible")
@@ -83,8 +88,8 @@ def solve_nested(
 
     def refine(number: int) -> None:
         """True inner problems spread over the region around the best θ."""
-        low, high = _region(problem, _best(problem, samples), radius)
-        new = design("lhs", low, high, 2 * len(lower) + 1, seed + number)
+        region = bounds.around(_best(problem, samples).theta, radius)
+        new = design("lhs", *region, 2 * n + 1, seed + number)
         with sampler.spent.on("rounds"):
             samples.extend(sampler.values(_allowed(problem, new), f"refining round {number + 1}"))
 
@@ -94,16 +99,16 @@ def solve_nested(
     for round_number in range(options.max_refinements + 1):
         samples, improvements = sampler.latest(samples), sampler.improvements
         best = _best(problem, samples)
-        low, high = _region(problem, best, radius)
-        local = _local(samples, low, high, upper - lower)
+        region = bounds.around(best.theta, radius)
+        local = _local(samples, region, bounds)
         if len(local) == 1:  # a feasible sliver: what is fitted has to be found first
             radius = max(0.4 * radius, 1e-3)
             refine(round_number)
             continue
         surrogate = fit_bandwidth(problem, local, seed, options.kernel, gradients)
-        program = nested_program(problem, to_casadi(surrogate, std=False))
-        program = replace(program, lower=low, upper=high)
-        starts = _starts(problem, local, low, high, options.starts, seed + round_number)
+        program = outer_program(problem, to_casadi(surrogate, std=False))
+        program = replace(program, box=region)
+        starts = _starts(problem, local, region, options.starts, seed + round_number)
         try:
             solution = solve_program(program, starts)
         except OuterFailure:
@@ -114,7 +119,7 @@ def solve_nested(
         with sampler.spent.on("rounds"):
             sample = sampler.values(theta, f"verifying round {round_number + 1}")[0]
         error = float(abs(predicted / sample.value - 1.0)) if sample.feasible else np.inf
-        step = float(np.abs((theta - best.theta) / (upper - lower)).max())
+        step = float(bounds.away(theta, best.theta))
         figures = {"error": error, "step": step, "radius": radius}
         iterate = iterate_of(problem, sample.theta, predicted, sample.value, **figures)
         iterates.append(iterate)
@@ -177,35 +182,25 @@ def _best(problem: CoDesignProblem, samples: list[InnerSample]) -> InnerSample:
     return min(inside or feasible, key=lambda s: objective(problem, s.theta, s.value))
 
 
-def _region(problem: CoDesignProblem, best: InnerSample, radius: float) -> tuple[Array, Array]:
-    lower, upper = box(problem)
-    half = radius * (upper - lower)
-    return np.maximum(lower, best.theta - half), np.minimum(upper, best.theta + half)
-
-
-def _local(samples: list[InnerSample], low: Array, high: Array, width: Array) -> list[InnerSample]:
+def _local(samples: list[InnerSample], region: Box, bounds: Box) -> list[InnerSample]:
     """Feasible samples in the region and a margin; the nearest ones where these are too few."""
     feasible = list({s.theta: s for s in samples if s.feasible}.values())
-    centre = 0.5 * (low + high)
+    centre = 0.5 * (region.lower + region.upper)
 
     def distance(sample: InnerSample) -> float:
-        return float(np.abs((np.array(sample.theta) - centre) / width).max())
+        return float(bounds.away(sample.theta, centre))
 
-    reach = 0.75 * float(((high - low) / width).max())
+    reach = 0.75 * float(bounds.away(region.upper, region.lower))
     near = [sample for sample in feasible if distance(sample) <= reach]
-    enough = 3 * len(low) + 2
+    enough = 3 * len(centre) + 2
     return near if len(near) >= enough else sorted(feasible, key=distance)[:enough]
 
 
 def _starts(
-    problem: CoDesignProblem,
-    samples: list[InnerSample],
-    low: Array,
-    high: Array,
-    count: int,
-    seed: int,
+    problem: CoDesignProblem, samples: list[InnerSample], region: Box, count: int, seed: int
 ) -> Array:
     """The best samples inside the region and a Sobol set over it."""
+    low, high = region
     inside = [s for s in samples if (low <= s.theta).all() and (s.theta <= high).all()]
     top = sorted(inside, key=lambda s: problem.w2 * s.value)[: max(1, count // 4)]
     spread = design("sobol", low, high, max(count - len(top), 1), seed)

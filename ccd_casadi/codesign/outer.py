@@ -22,6 +22,7 @@ from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
@@ -95,8 +96,8 @@ class Outer(ABC):
         return True
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of x."""
+    def bounds(self) -> Box:
+        """The bounds of x."""
         return box(self.problem)
 
     def prepared(self, seed: int) -> "Outer":
@@ -121,9 +122,9 @@ class Outer(ABC):
         if isinstance(formulation, Lifted):
             if self.extra_variables:
                 return solve_lifted(self.sampler, formulation, seed=seed, given=given)
-            points = formulation.points or 6 * len(self.problem.names)
-            options = {key: value for key, value in vars(formulation).items() if key != "points"}
-            formulation = Nested("sobol", points, **options)
+            formulation = Nested(**vars(formulation) | {
+                "plan": "sobol", "points": formulation.sampled(len(self.problem.names)),
+            })  # fmt: skip
         return solve_nested(self.sampler, formulation, seed=seed, given=given, gradients=lifted)
 
     def solve_on_truth(self, starts: int, seed: int) -> FormulationResult:
@@ -131,8 +132,8 @@ class Outer(ABC):
 
         From one start that has a design it is the polish that follows.
         """
-        problem, (lower, upper) = self.problem, box(self.problem)
-        thetas = np.vstack([problem.start, design("sobol", lower, upper, starts, seed)])[:starts]
+        spread = design("sobol", *box(self.problem), starts, seed)
+        thetas = np.vstack([self.problem.start, spread])[:starts]
         begun = self.sampler.values(thetas, "direct")
         if starts == 1 and begun[0].feasible:
             return FormulationResult(begun[0].joint, agreed=True)
@@ -143,8 +144,7 @@ class Outer(ABC):
         if not places:
             words = f"no design meets its constraints from {counted(starts, 'start')}"
             return FormulationResult(message=words)
-        lower, upper = self.bounds
-        ends = distinct([(one.objective, one.x) for one in places], upper - lower, starts, BASIN)
+        ends = distinct([(one.objective, one.x) for one in places], self.bounds, starts, BASIN)
         return FormulationResult(ends.best.x, outer=ends, agreed=True)
 
     @abstractmethod

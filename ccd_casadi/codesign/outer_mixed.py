@@ -26,6 +26,7 @@ from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import final_design
+from ccd_casadi.optim.box import Box
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import InnerSample
@@ -47,14 +48,13 @@ class MixedOuter(Outer):
     extra_variables = ("omega_S", "omega_T")
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
+    def bounds(self) -> Box:
         return lifted_bounds(self.problem)
 
     def fallback(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """The true inner problem at a few θ tells an infeasible case from a formulation that
         failed."""
-        lower, upper = box(self.problem)
-        points = design("sobol", lower, upper, 8, seed)
+        points = design("sobol", *box(self.problem), 8, seed)
         with self.sampler.spent.on("rescue"):
             samples = self.sampler.values(points, "search for a feasible design")
         feasible = [sample for sample in samples if sample.feasible]
@@ -67,9 +67,9 @@ class MixedOuter(Outer):
 
     def polished(self, x: Array) -> End:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
-        problem, sampler, truth = self.problem, self.sampler, self.sampler.truth
-        lower, upper = lifted_bounds(problem)
-        width = 1e-9 * (upper - lower)  # within rounding of a bound: onto it
+        sampler, truth = self.sampler, self.sampler.truth
+        lower, upper = self.bounds
+        width = 1e-9 * self.bounds.width  # within rounding of a bound: onto it
         for _ in range(POLISH_ROUNDS):
             before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)

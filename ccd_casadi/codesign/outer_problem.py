@@ -17,6 +17,7 @@ import numpy as np
 from ccd_casadi.inner_problem.objective import constraint_shares, constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
+from ccd_casadi.optim.box import Box
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.interrupts import interrupts_kept, raise_dropped
@@ -39,13 +40,12 @@ APART = 1e-4  # of the box: ends closer than this are one optimum
 
 @dataclass(frozen=True)
 class NonlinearProgram:
-    """min f(x), g(x) <= 0, lower <= x <= upper; g has λ in shares of its size."""
+    """min f(x), g(x) <= 0, x in its box; g has λ in shares of its size."""
 
     x: ca.MX
     f: ca.MX
     g: ca.MX
-    lower: Array
-    upper: Array
+    box: Box
     exact_hessian: bool = True
 
 
@@ -75,36 +75,26 @@ class OuterFailure(RuntimeError):
     """IPOPT converged from no start."""
 
 
-def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> NonlinearProgram:
-    """The outer problem over θ with a surrogate bandwidth(θ) in rad/s."""
-    return _program(problem, bandwidth, *box(problem), np.empty(0))
-
-
-def lifted_program(
-    problem: CoDesignProblem, quantities: ca.Function, *, margin: float = MARGIN
+def outer_program(
+    problem: CoDesignProblem, model: ca.Function, *, margin: float = MARGIN
 ) -> NonlinearProgram:
-    """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln of what is bounded."""
-    return _program(problem, quantities, *lifted_bounds(problem), problem.inner.levels - margin)
-
-
-def _program(
-    problem: CoDesignProblem, model: ca.Function, lower: Array, upper: Array, levels: Array
-) -> NonlinearProgram:
-    """Over x, which begins with θ, with model(x) -> ω_b and what must not exceed `levels` (m,)."""
-    x = ca.MX.sym("x", len(lower))
+    """Over θ with model(θ) -> ω_b in rad/s; or over (θ, ln ω_S, ln ω_T), where the model is a
+    function of these, with model(x) -> ω_b, ln of what is bounded."""
+    lifted = model.size1_in(0) > len(problem.names)
+    bounds = lifted_bounds(problem) if lifted else box(problem)
+    levels = problem.inner.levels - margin if lifted else ()
+    x = ca.MX.sym("x", len(bounds.lower))
     q = model(x)
     f, lam = _hardware(problem, x[: len(problem.names)])
     J = problem.w1 * f + problem.w2 * q[0]
     g = ca.vertcat(*(q[1 + i] - level for i, level in enumerate(levels)), lam)
-    return NonlinearProgram(x, J, g, lower, upper, plant_of(problem).exact_hessian)
+    return NonlinearProgram(x, J, g, bounds, plant_of(problem).exact_hessian)
 
 
-def lifted_bounds(problem: CoDesignProblem) -> tuple[Array, Array]:
+def lifted_bounds(problem: CoDesignProblem) -> Box:
     """Bounds of (θ, ln ω_S, ln ω_T)."""
-    inner = problem.inner
-    lower = np.array([*problem.lower, *np.log([inner.omega_S[0], inner.omega_T[0]])])
-    upper = np.array([*problem.upper, *np.log([inner.omega_S[1], inner.omega_T[1]])])
-    return lower, upper
+    ends = np.log([problem.inner.omega_S, problem.inner.omega_T])
+    return Box(*(np.append(end, ends[:, i]) for i, end in enumerate(box(problem))))
 
 
 def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
@@ -112,15 +102,15 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
 
     Raises OuterFailure where no start converges.
     """
-    width = program.upper - program.lower
+    lower, width = program.box.lower, program.box.width
     z = ca.MX.sym("z", program.x.shape[0])
-    inside = program.lower + width * z
+    inside = lower + width * z
     f, g = ca.substitute([program.f, program.g], [program.x], [inside])
     options = OPTIONS.copy()
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
     solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)
-    begun = np.clip((np.atleast_2d(starts) - program.lower) / width, 0.0, 1.0)
+    begun = np.clip(program.box.shares(np.atleast_2d(starts)), 0.0, 1.0)
     ends, verdicts = [], []
     for start in begun:
         raise_dropped()
@@ -132,17 +122,17 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
             ends.append((float(result["f"]), np.clip(np.array(result["x"]).ravel(), 0.0, 1.0)))
     if not ends:
         raise OuterFailure(f"IPOPT converged from none of {len(begun)} starts: {verdicts[0]}")
-    return distinct([(J, program.lower + width * end) for J, end in ends], width, len(begun))
+    return distinct([(J, lower + width * end) for J, end in ends], program.box, len(begun))
 
 
 def distinct(
-    ends: Sequence[tuple[float, Array]], width: Array, starts: int, apart: float = APART
+    ends: Sequence[tuple[float, Array]], bounds: Box, starts: int, apart: float = APART
 ) -> OuterSolution:
     """Ends (J, x) of local solves from so many starts, those of one optimum together."""
     optima: list[LocalOptimum] = []
     for objective, x in sorted(ends, key=lambda item: item[0]):
-        away = [float(np.abs((x - other.x) / width).max()) for other in optima]
-        same = next((i for i, far in enumerate(away) if far < apart), None)
+        near = (i for i, other in enumerate(optima) if bounds.away(x, other.x) < apart)
+        same = next(near, None)
         if same is None:
             optima.append(LocalOptimum(x, objective))
         else:
@@ -158,8 +148,8 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
     plant = plant_of(problem)
     if not plant.constraint_names:
         return ""
-    lower, upper = np.array(problem.lower), np.array(problem.upper)
-    points = np.vstack([np.array(problem.start), design("sobol", lower, upper, starts, seed)])
+    lower, upper = box(problem)
+    points = np.vstack([problem.start, design("sobol", lower, upper, starts, seed)])
     if not all(violated(problem, point) for point in points):
         return ""
     theta, slack = ca.MX.sym("theta", len(lower)), ca.MX.sym("slack")
@@ -169,8 +159,7 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         x=ca.vertcat(theta, slack),
         f=slack,
         g=_hardware(problem, theta)[1] - slack,
-        lower=np.append(lower, -most),
-        upper=np.append(upper, most),
+        box=Box(np.append(lower, -most), np.append(upper, most)),
         exact_hessian=plant.exact_hessian,
     )
     try:

@@ -78,12 +78,10 @@ def pieces_from(
     Again from the best where a better controller was found on the way for what had been known.
     """
     problem, asked = sampler.problem, [best]
-    lower, upper = box(problem)
-    width = upper - lower
+    bounds = box(problem)
 
     def at(z: Array) -> Local | None:
-        theta = np.clip(lower + width * z, lower, upper)
-        asked.extend(sampler.values(theta, "local solve"))
+        asked.extend(sampler.values(bounds.point(z), "local solve"))
         return local(asked[-1])
 
     @cache
@@ -91,20 +89,20 @@ def pieces_from(
         J, gradient = objective_of(problem, sample), objective_gradient(problem, sample)
         if not (np.isfinite(J) and np.isfinite(gradient).all()):
             return None
-        return Local((np.array(sample.theta) - lower) / width, J, gradient)
+        return Local(bounds.shares(sample.theta), J, gradient)
 
     def known() -> list[Local]:
         return [found for found in map(local, sampler.solved.values()) if found is not None]
 
     def constraints(z: Array) -> tuple[Array, Array]:
-        found = hardware_at(problem, lower + width * z)
+        found = hardware_at(problem, bounds.lower + bounds.width * z)
         return found.constraints, found.slopes
 
     for _ in range(FOLLOWED):
         start, improvements = local(best), sampler.improvements
         if start is None:
             break
-        steps = STEPS * len(lower)
+        steps = STEPS * len(problem.names)
         descend(at, start, known, constraints, steps=steps, settled=settled, first=first)
         best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
         if sampler.improvements == improvements:

@@ -48,7 +48,7 @@ def other_peaks(
     That is S_max anywhere, on every plant of a robust set, and -3 dB below ω_b, which is the first
     crossing only as long as they do not pass it.
     """
-    figures, width = design.figures, np.subtract(*lifted_bounds(problem)[::-1])
+    figures, width = design.figures, lifted_bounds(problem).width
     peaks = local_peaks_with_gradients(
         scaled_plant(problem, tuple(x[:-2])),
         problem.weights.at(figures.omega_S, figures.omega_T),

@@ -29,6 +29,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import ACTIVE, ActiveSet, KktCertificate
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.sampling.samples import InnerSample
@@ -100,12 +101,14 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
             progress.advance()
         return found
 
-    lower, upper = lifted_bounds(problem)
-    slope = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * (upper - lower)
-    bounds = [_Parameter(name, bound, np.zeros(n), {name: -1.0 / bound})
-              for name, (_, bound) in problem.inner.bounds.items()]  # fmt: skip
+    bounds = lifted_bounds(problem)
+    slope = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * bounds.width
+    moved = {name: [name] for name in problem.inner.bounds}  # peaks besides the largest too
+    moved["S_max"] += [name for name in kkt.multipliers if name.startswith(OTHER_PEAK)]
+    own = [_Parameter(name, bound, np.zeros(n), dict.fromkeys(moved[name], -1.0 / bound))
+           for name, (_, bound) in problem.inner.bounds.items()]  # fmt: skip
     known = _Parameter("w2", problem.w2, slope, cost=float(design.values[0]))
-    return _responses(problem, x, (lower, upper), kkt, active, hessian, [known, *bounds], slope)
+    return _responses(problem, x, bounds, kkt, active, hessian, [known, *own], slope)
 
 
 def structured_responses(
@@ -119,16 +122,16 @@ def structured_responses(
     it takes second derivatives of v(θ), which are not known. At a kink of it the multipliers μ
     are those of θ and controller together.
     """
-    lower, upper = box(problem)
+    bounds = box(problem)
     kkt = theta_kkt(problem, sample, envelope=found.envelope)
     loop = found.design.multipliers if kkt.kink is None else kkt.kink.multipliers
-    slope, known = np.array(sample.gradient) * (upper - lower), problem.figure is BANDWIDTH
+    slope, known = np.array(sample.gradient) * bounds.width, problem.figure is BANDWIDTH
     own = [_Parameter("w2", problem.w2, slope, cost=sample.value)]
     for name, value, mu in _loop_bounds(problem, loop) if known else ():
         rate = sample.bandwidth * mu / value
         own.append(_Parameter(name, value, 0.0 * slope, {}, problem.w2 * rate, rate))
     return _responses(
-        problem, np.array(sample.theta), (lower, upper), kkt, active_theta(problem, sample),
+        problem, np.array(sample.theta), bounds, kkt, active_theta(problem, sample),
         lambda: None, own, slope if known else np.nan * slope,
     )  # fmt: skip
 
@@ -142,7 +145,7 @@ def _strong(kkt: KktCertificate) -> list[str]:
 def _responses(
     problem: CoDesignProblem,
     x: Array,
-    bounds: tuple[Array, Array],
+    bounds: Box,
     kkt: KktCertificate,
     here: ActiveSet,
     hessian: Callable[[], Array | None],
@@ -151,7 +154,7 @@ def _responses(
 ) -> PostOptimal:
     """Responses at x within `bounds`, which begins with θ; ∇²L by `hessian` where directions are
     left (None: not known), ω_b with `slope_b` (n,); `parameters`: w2 and the bounds on the loop."""
-    n, count, width = x.size, len(problem.names), bounds[1] - bounds[0]
+    n, count, width = x.size, len(problem.names), bounds.width
     strong = _strong(kkt)
     held = [here.labels.index(name) for name in strong]
     A = here.rows[held] * here.sizes[held, None]
@@ -168,10 +171,10 @@ def _responses(
     for parameter in _parameters(problem, x, bounds, slope_f, parameters):
         dz = np.full(n, np.nan)
         if determined:
-            level = [_level(parameter, name) for name in strong]
+            level = [parameter.levels.get(name, 0.0) for name in strong]
             dz = np.linalg.solve(system, -np.concatenate([parameter.gradient, level]))[:n]
         dx = tuple(map(float, dz * width))
-        change = sum(mu * _level(parameter, name) for name, mu in kkt.multipliers.items())
+        change = sum(kkt.multipliers.get(name, 0.0) * d for name, d in parameter.levels.items())
         responses.append(
             Response(
                 parameter=parameter.name,
@@ -187,19 +190,10 @@ def _responses(
     return PostOptimal(tuple(responses), kkt, weak, determined)
 
 
-def _level(parameter: _Parameter, constraint: str) -> float:
-    """∂g/∂p of a constraint; a peak besides the largest moves with S_max as that one does."""
-    name = "S_max" if constraint.startswith(OTHER_PEAK) else constraint
-    return parameter.levels.get(name, 0.0)
-
-
 def _parameters(
-    problem: CoDesignProblem,
-    x: Array,
-    bounds: tuple[Array, Array],
-    slope_f: Array,
+    problem: CoDesignProblem, x: Array, bounds: Box, slope_f: Array,
     parameters: Sequence[_Parameter],
-) -> Iterator[_Parameter]:
+) -> Iterator[_Parameter]:  # fmt: skip
     """w1, `parameters` (w2, bounds on the loop), the level of each λ, and the bounds of x."""
     none, count, plant = np.zeros(x.size), len(problem.names), plant_of(problem)
     yield _Parameter("w1", problem.w1, slope_f, cost=hardware_cost(plant, x[:count]))

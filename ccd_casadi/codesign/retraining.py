@@ -27,6 +27,7 @@ from ccd_casadi.codesign.search import conclude_at
 from ccd_casadi.codesign.stored import keep_version, stored_designs, stored_thetas
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import box
+from ccd_casadi.optim.box import Box
 from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.sampling.samples import InnerSample, QuantitySample, quantity_sample
 from ccd_casadi.sampling.spent import spent_entry
@@ -153,20 +154,21 @@ class Job:
         None where the truth has no value at most of its points. Raises UserError where the budget
         is too small for it.
         """
-        lower, upper = box(self.outer.problem) if self.over_theta else self.outer.bounds
-        least, seen = PER_INPUT * len(lower), self._stored()
+        bounds = box(self.outer.problem) if self.over_theta else self.outer.bounds
+        n, seen = len(bounds.lower), self._stored()
+        least = PER_INPUT * n
         for doubling in range(DOUBLINGS):
             if len(_usable(seen)) >= least:
                 break
-            X = sobol(lower, upper, least << doubling, self.seed)
-            new = X[_distances(X, seen, upper - lower) > NEAR]
+            X = sobol(*bounds, least << doubling, self.seed)
+            new = X[_distances(X, seen, bounds) > NEAR]
             room = max(int(np.ceil(self.left / self._cost(len(seen)))), 0)
-            seen += self._sampled(new[:room])
+            seen += self._truth(new[:room])
         kept: list[Seen] = []
         for sample in _usable(seen):
-            if _distances(np.array([sample.x]), kept, upper - lower)[0] > NEAR:
+            if _distances(np.array([sample.x]), kept, bounds)[0] > NEAR:
                 kept.append(sample)
-        if len(kept) < len(lower) + 2:
+        if len(kept) < n + 2:
             if len(seen) >= least:
                 return None
             words = f"leaves {len(kept)} samples, too few for a first fit; give a larger one"
@@ -177,17 +179,14 @@ class Job:
         """Samples of the store within the bounds, oldest first, failures among them."""
         store, problem = self.outer.sampler.store, self.outer.problem
         if self.over_theta:
-            return self._sampled(stored_thetas(store, problem))
+            return self._truth(stored_thetas(store, problem))
         designs = stored_designs(store, problem)
         return [quantity_sample(tuple(x), row, problem.inner) for x, row in designs]
 
-    def _sampled(self, X: Array) -> "list[Seen]":
-        """The truth at X (m, d), what is known already from the store."""
-        if not len(X):
-            return []
-        if self.over_theta:
-            return [*self.outer.sampler.values(X, "retraining")]
-        return [*self.outer.sampler.quantities(X, "retraining")]
+    def _truth(self, X: Array) -> "list[Seen]":
+        """At X (m, d), what is known already from the store."""
+        sampler = self.outer.sampler
+        return [*(sampler.values if self.over_theta else sampler.quantities)(X, "retraining")]
 
     def _kept(self, outcome: FormulationResult) -> str | None:
         """The name of the version that the job's surrogate is kept as."""
@@ -217,9 +216,7 @@ def _usable(samples: list[Seen]) -> list[Seen]:
     return [s for s in samples if (s.feasible if isinstance(s, InnerSample) else s.certified)]
 
 
-def _distances(X: Array, others: list[Seen], width: Array) -> Array:
+def _distances(X: Array, others: list[Seen], bounds: Box) -> Array:
     """Of X (m, d) to the nearest of the samples, the largest component in shares of the box."""
-    if not others:
-        return np.full(len(X), np.inf)
-    known = np.array([sample.x for sample in others])
-    return np.array([np.abs((known - x) / width).max(axis=1).min() for x in X])
+    known = np.reshape([sample.x for sample in others], (-1, X.shape[1]))
+    return np.asarray(bounds.away(X[:, None], known).min(axis=1, initial=np.inf))

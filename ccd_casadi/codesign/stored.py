@@ -33,23 +33,22 @@ def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[A
 
     Designs that were not certified are among them.
     """
-    lower, upper = lifted_bounds(problem)
+    bounds = lifted_bounds(problem)
     keys = store.keys_with_gradients(hashes_of(problem)[0])
-    known = store.get(keys)
-    slack = SAME * (upper - lower)
-    found = []
+    known, found = store.get(keys), []
     for item in keys:
         row = known.get(item)
         # an index that names what the table has not is damage too
         if (
             row is None
             or len(row.theta) != len(problem.names)
-            or len(row.gradients or ()) != (2 + len(problem.inner.bounds)) * len(lower)
+            or len(row.gradients or ()) != (2 + len(problem.inner.bounds)) * len(bounds.lower)
         ):
             raise store.damaged()
         x = np.array([*row.theta, np.log(row.omega_S), np.log(row.omega_T)])
-        if (x >= lower - slack).all() and (x <= upper + slack).all():
-            found.append((np.clip(x, lower, upper), row))
+        inside = np.clip(x, *bounds)
+        if bounds.away(x, inside) <= SAME:
+            found.append((inside, row))
     return found
 
 

@@ -164,13 +164,11 @@ def _nothing(words: str) -> Solution:
 
 def _allowed(problem: CoDesignProblem, theta: Array) -> Array | None:
     """The nearest θ within the box and λ(θ) <= 0; None where none is found."""
-    lower, upper = box(problem)
-    plant, x = plant_of(problem), ca.MX.sym("theta", len(lower))
-    lam = plant.hardware(x)[1]
-    theta = np.clip(theta, lower, upper)
-    f = ca.sumsqr((x - theta) / (upper - lower))
-    program = NonlinearProgram(x, f, lam + INSIDE, lower, upper, plant.exact_hessian)
+    bounds, plant, x = box(problem), plant_of(problem), ca.MX.sym("theta", len(theta))
+    lam, theta = plant.hardware(x)[1], np.clip(theta, *bounds)
+    f = ca.sumsqr((x - theta) / bounds.width)
+    program = NonlinearProgram(x, f, lam + INSIDE, bounds, plant.exact_hessian)
     try:
-        return np.clip(solve_program(program, theta).best.x, lower, upper) if lam.numel() else theta
+        return np.clip(solve_program(program, theta).best.x, *bounds) if lam.numel() else theta
     except OuterFailure:
         return None

@@ -23,17 +23,11 @@ from ccd_casadi.codesign.joint_model import (
     Proposal,
     proposed,
 )
+from ccd_casadi.codesign.working_set import WorkingSet
 from ccd_casadi.fixed_structure.worst_plant import WITHIN
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_plant_set import (
-    nearby,
-    structured_of,
-    uncertain_plant,
-    with_structured,
-)
-from ccd_casadi.inner_problem.structured_problem import Scenario
-from ccd_casadi.inner_problem.structured_robustness import violations
+from ccd_casadi.inner_problem.structured_plant_set import nearby, structured_of
 from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
@@ -48,8 +42,7 @@ ROUNDS = 4  # last searches at most, while worse plants are found at their end
 AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
-FOLLOWING = 0.1  # of that reach, after a search on a reduced basis
-ENDINGS, KEPT = 12, 2e-6  # last steps; of J: a promise at which the conditions of optimality hold
+ENDINGS, KEPT = 12, 1e-5  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 
 
@@ -69,18 +62,20 @@ def joint_search(
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
     best, known = JointPoint(first.theta, first.kappa, first.bandwidth), [first.theta]
-    reach, settled, asked = REACH, False, sampler
+    reach, settled, working = REACH, False, WorkingSet(sampler)
+    bent = plant_of(problem).nearby is not None
     for turn in range(TURNS):
         models = nearby(problem, known, best.theta)
         within = LOOSE if turn else WITHIN
-        asked, best, J = on_worse_plants(asked, models, best, (turn,), within, tell)
-        problem = asked.problem
+        working, best, J = working.on_worse_plants(models, best, (turn,), within, tell)
+        working = working.reduced(models, best)
+        problem = working.sampler.problem
         if _arrived(problem, best, J, ends or ()):
             return sampler, first, False
         if not np.isfinite(J):
             break
-        make = partial(proposed, problem, models, best, reach)
-        found = asked.cached("together", (*best.theta, reach, turn), Proposal, make)
+        make = partial(proposed, problem, models, best, reach, bent=bent)
+        found = working.sampler.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
@@ -89,10 +84,10 @@ def joint_search(
                 break
             final = APART + (LOOKS + 1) * turn + LOOKS
             looks = range(final - LOOKS, final)
-            asked, best, _ = on_worse_plants(asked, models, best, looks, WITHIN, tell)
+            working, best, _ = working.on_worse_plants(models, best, looks, WITHIN, tell)
             del make, models
             gc.collect()  # with which the bases go
-            asked, best, settled = finished_on_worse_plants(asked, best, final, tell)
+            working, best, settled = finished_on_worse_plants(working, best, final, tell)
             if settled:
                 break
             known = [best.theta]
@@ -109,12 +104,14 @@ def joint_search(
         elif gained < POOR * found.gain:
             reach *= 0.3
     if not (settled or ends is not None):
-        best = finished(asked, best)[0]
-    if best.theta == first.theta and asked is sampler:
+        best, *_ = finished(working.sampler, best)
+    counted = structured_of(working.sampler.problem).scenarios
+    worse = set(counted) - set(structured_of(sampler.problem).scenarios)
+    if best.theta == first.theta and not worse:
         return sampler, first, settled
-    last = asked.value_from(best.theta, best.kappa)
-    if asked is not sampler or objective_of(problem, last) < objective_of(problem, first):
-        return asked, last, settled
+    last = working.sampler.value_from(best.theta, best.kappa)
+    if worse or objective_of(problem, last) < objective_of(problem, first):
+        return working.sampler, last, settled
     return sampler, first, True
 
 
@@ -129,48 +126,21 @@ def _arrived(
     )
 
 
-def on_worse_plants(
-    sampler: Sampler,
-    models: Sequence[Evaluate],
-    best: JointPoint,
-    looks: Sequence[int],
-    within: float,
-    tell: Callable[[str], None] | None,
-) -> tuple[Sampler, JointPoint, float]:
-    """The sampler of the problem with the plants on which the controller exceeds a bound, the
-    controller adapted to them, and J there; `looks`: the searches for worse plants, one after the
-    other, each elsewhere in the box."""
-    J = np.inf
-    for look in looks:
-        problem = sampler.problem
-        uncertain = uncertain_plant(problem, best.theta, [model(best.theta) for model in models])
-        kappa, omega_b = np.array(best.kappa), best.bandwidth
-        scenarios = violations(problem, uncertain, kappa, omega_b, look, tell, within)[1]
-        if scenarios:
-            sampler = with_scenarios(sampler, scenarios)
-        best, J = JointModel(sampler.problem, models, best, 0.0).adapted()
-        if not np.isfinite(J):
-            break
-    return sampler, best, J
-
-
 def finished_on_worse_plants(
-    sampler: Sampler, start: JointPoint, final: int, tell: Callable[[str], None] | None
-) -> tuple[Sampler, JointPoint, bool]:
-    """The joint optimum near by with the worse plants found at it, the sampler of the problem that
-    has these, and whether it is one of all of them."""
-    best, has_basis = start, plant_of(sampler.problem).nearby is not None
-    looks, kinds = ((final, *AGAIN), (True, False)) if has_basis else ((final,), (False,))
+    working: WorkingSet, start: JointPoint, final: int, tell: Callable[[str], None] | None
+) -> tuple[WorkingSet, JointPoint, bool]:
+    """The joint optimum near by with the worse plants found at it, the set that has these, and
+    whether it is one of all of them: also where the last ones cost less of J than is promised at an
+    end."""
+    best, bent = start, plant_of(working.sampler.problem).nearby is not None
+    looks = (final, *AGAIN) if bent else (final,)
     for _ in range(ROUNDS):
-        for bent in kinds:
-            best, near = finished(sampler, best, bent, tell)
-            before, true = sampler, nearby(sampler.problem, (), best.theta)
-            sampler, best, _ = on_worse_plants(sampler, true, best, looks, WITHIN, tell)
-            if sampler is not before:
-                break
-        else:
-            return sampler, best, near
-    return sampler, best, False
+        best, J, near = finished(working.sampler, best, bent, tell)
+        before, true = working, nearby(working.sampler.problem, (), best.theta)
+        working, best, there = working.on_worse_plants(true, best, looks, WITHIN, tell)
+        if working is before or there - J <= KEPT * abs(J):
+            return working, best, near
+    return working, best, False
 
 
 def finished(
@@ -178,15 +148,13 @@ def finished(
     start: JointPoint,
     bent: bool = False,
     tell: Callable[[str], None] | None = None,
-) -> tuple[JointPoint, bool]:
-    """The joint optimum near by, on the plants from what is known at one place after the other: so
-    near that all rows meet which bind at a kink of ω_b*, as `theta_kkt` has to see it; and whether
-    it is that near, or was. With `bent` on reduced bases around these places, which go further;
-    else on the plants to first order, exact there."""
-    problem = sampler.problem
-    reach = REACH if bent else CLOSE
-    if not bent and plant_of(problem).nearby is not None:
-        reach *= FOLLOWING
+) -> tuple[JointPoint, float, bool]:
+    """The joint optimum near by, J there, and whether the start was as near or no more is promised.
+
+    From what is known at one place after the other: so near that all rows meet which bind at a kink
+    of ω_b*, as `theta_kkt` has to see it. With `bent` on reduced bases around these places, which
+    go further; else on the plants to first order, exact there."""
+    problem, reach = sampler.problem, REACH if bent else CLOSE
 
     def around(place: JointPoint) -> tuple[Evaluate, ...]:
         return nearby(problem, [place.theta] if bent else (), place.theta)
@@ -200,7 +168,7 @@ def finished(
         if tell is not None:
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
         if found.gain <= KEPT * abs(J):
-            return best, True
+            return best, J, True
         del make
         others = around(found.end)
         end, there = JointModel(problem, others, found.end, reach).adapted()
@@ -208,16 +176,7 @@ def finished(
         if there < J:
             best, J, models = end, there, others
         gc.collect()  # bases are large, and searches before hold theirs in circles
-    return best, first[1] - J <= SETTLED * abs(J)
-
-
-def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:
-    """The sampler of the problem with more plants: on these what was found before is worth
-    nothing."""
-    trace = sampler.trace
-    trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
-    known = structured_of(sampler.problem).scenarios
-    return sampler.of(with_structured(sampler.problem, scenarios=(*known, *scenarios)))
+    return best, J, first[1] - J <= SETTLED * abs(J)
 
 
 def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Array) -> Array:

@@ -20,7 +20,6 @@ direction left its two sides are all that there is, of several directions some a
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import scipy
@@ -34,6 +33,7 @@ from ccd_casadi.inner_problem.objective import (
     objective_gradient,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import (
     STEP,
     ActiveSet,
@@ -69,7 +69,7 @@ def theta_kkt(
     with slopes to its sides, or the second-order check where it has none. `beside`: where true
     values are dear, by how much J is larger at θ (n, n_θ) next to it on plants to first order.
     """
-    width, own = np.subtract(*box(problem)[::-1]), hardware_at(problem, np.array(sample.theta))
+    bounds, own = box(problem), hardware_at(problem, np.array(sample.theta))
     at = active_theta(problem, sample)
     if not np.isfinite(at.gradient).all():
         return at.certificate(np.zeros(len(at.labels)), np.inf, None)
@@ -77,8 +77,8 @@ def theta_kkt(
     residual = at.residual(nu)
     kink: Kink | None = None
     if residual > SMOOTH and envelope is not None:
-        direct = own.cost_gradient + problem.w2 * envelope.direct * width
-        to_theta = problem.w2 * envelope.to_theta * width
+        direct = own.cost_gradient + problem.w2 * envelope.direct * bounds.width
+        to_theta = problem.w2 * envelope.to_theta * bounds.width
         joint, mu, pair = joint_residual(envelope, direct, to_theta, at.rows, at.size)
         if joint < 0.5 * residual:
             multipliers = dict.fromkeys(envelope.names, 0.0)
@@ -87,24 +87,35 @@ def theta_kkt(
             kink, residual, nu = Kink(residual, (), multipliers), joint, pair
     Z = _steepest_first(at.free(nu), at.gradient)
     second = np.inf if Z.shape[1] == 0 else None
-    if Z.shape[1] and truth is not None and kink is not None:
-        more = beside or partial(_more, problem, truth, sample)
-        slopes = _slopes(problem, more, sample, Z, at.size)
+    if second is not None or truth is None:
+        return at.certificate(nu, residual, second, kink)
+
+    def more(thetas: Array) -> Array:
+        J = [objective(problem, one.theta, one.value)
+             for one in (sample, *truth.values(thetas, "certificate"))]  # fmt: skip
+        return np.array(J[1:]) - J[0]
+
+    def slope(z: Array) -> Array:
+        there = truth.values(bounds.lower + bounds.width * z, "certificate")[0]
+        return objective_gradient(problem, there)
+
+    if kink is not None:
+        slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.size)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
-    elif Z.shape[1] and truth is not None and beside is None:
-        second = reduced_curvature(Z, _hessian(problem, truth, sample, Z), at.size)
+    elif beside is None:  # λ's own curvature is left out
+        columns = hessian_products(slope, bounds.shares(sample.theta), Z, BESIDE)
+        second = reduced_curvature(Z, columns, at.size)
     return at.certificate(nu, residual, second, kink)
 
 
 def active_theta(problem: CoDesignProblem, sample: InnerSample) -> ActiveSet:
     """∇J at a sample, and what binds of λ and the bounds of θ."""
-    (lower, upper), theta = box(problem), np.array(sample.theta)
-    own = hardware_at(problem, theta)
+    own = hardware_at(problem, np.array(sample.theta))
     here = FirstOrder(
         objective_gradient(problem, sample), own.constraints, own.slopes,
         constraint_sizes(problem), plant_of(problem).constraint_names,
     )  # fmt: skip
-    return active_set((theta - lower) / (upper - lower), here, problem.names)
+    return active_set(box(problem).shares(sample.theta), here, problem.names)
 
 
 def joint_residual(
@@ -143,37 +154,14 @@ def _steepest_first(Z: Array, gradient: Array) -> Array:
 
 
 def _slopes(
-    problem: CoDesignProblem, more: Beside, sample: InnerSample, Z: Array, size: float
+    bounds: Box, more: Beside, theta: Array, Z: Array, size: float
 ) -> tuple[tuple[float, float], ...]:
     """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
     and over `size`; all are asked for at once."""
-    lower, upper = box(problem)
-    width, theta = upper - lower, np.array(sample.theta)
-    sides = np.array([sign * BESIDE * z * width for z in Z.T for sign in (-1.0, 1.0)])
-    ends = np.clip(theta + sides, lower, upper)
-    steps = np.linalg.norm((ends - theta) / width, axis=1)
+    sides = np.array([sign * BESIDE * z for z in Z.T for sign in (-1.0, 1.0)])
+    ends = np.clip(theta + sides * bounds.width, *bounds)
+    steps = np.linalg.norm((ends - theta) / bounds.width, axis=1)
     far = np.flatnonzero(steps > 0.5 * BESIDE)
     found = np.full(len(ends), np.nan)
     found[far] = more(ends[far]) / (steps[far] * size)
     return tuple((float(low), float(high)) for low, high in found.reshape(-1, 2))
-
-
-def _more(problem: CoDesignProblem, truth: Sampler, sample: InnerSample, thetas: Array) -> Array:
-    """By how much J is larger at θ (n, n_θ) than at a sample."""
-    J = objective(problem, sample.theta, sample.value)
-    there = truth.values(thetas, "certificate")
-    return np.array([objective(problem, one.theta, one.value) - J for one in there])
-
-
-def _hessian(
-    problem: CoDesignProblem, truth: Sampler, sample: InnerSample, Z: Array
-) -> Array | None:
-    """∇²J Z (n, k) by differences of true gradients; λ's own curvature is left out."""
-    lower, upper = box(problem)
-
-    def slope(z: Array) -> Array:
-        there = truth.values(lower + (upper - lower) * z, "certificate")[0]
-        return objective_gradient(problem, there)
-
-    z = (np.array(sample.theta) - lower) / (upper - lower)
-    return hessian_products(slope, z, Z, BESIDE)

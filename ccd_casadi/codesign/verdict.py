@@ -59,17 +59,17 @@ def optimal(
     gap: float,
     tolerance: float,
     better: str,
-    known: str,
+    searched: tuple[str, Mapping[str, Any]],
     unknown: str = "",
     saddle: float = SADDLE,
 ) -> VerdictLine:
     """KKT residual over θ up to `level`, and the whole inner problem at θ, `better` by `gap`.
 
-    `known`: where something better was looked for; `unknown`: why there may be no gradient; in
-    words.
+    `searched`: where something better was looked for, in words and figures; `unknown`: why there
+    may be no gradient, in words.
     """
-    residual, kink = kkt.stationarity, kkt.kink
-    figures: dict[str, Any] = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap}
+    residual, kink, (known, found) = kkt.stationarity, kkt.kink, searched
+    figures = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap, **found}
     if not gap <= tolerance:
         return VerdictLine(State.FAILED, f"not optimal: {better}; {known}", figures)
     if unknown and not math.isfinite(residual):
@@ -126,14 +126,9 @@ def search_evidence(
         known += f", {optima} distinct optima"
     if look is None or not look.points:
         return f"{known}, no global check over the box, {gap}", figures
-    figures |= {
-        "box_points": look.points,
-        "box_feasible": look.feasible,
-        "box_better": look.better,
-        "box_starts": look.starts,
-        "box_seed": look.seed,
-        "objective_before": look.before,
-    }
+    counted_up = ("points", "feasible", "better", "starts", "seed")
+    figures |= {f"box_{name}": getattr(look, name) for name in counted_up}
+    figures["objective_before"] = look.before
     how = f"{look.points} spread theta"
     said = f"none better at {how}"
     if look.moved:

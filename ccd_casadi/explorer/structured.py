@@ -64,10 +64,10 @@ def designed(task: tuple[CoDesignProblem, Knobs], tell: Progress) -> Designed:
     problem = with_range(problem)
     designs, inner = hashes_of(problem)
     own = sample_key(inner, knobs.theta, 0.0, 0.0)
-    rows, (_, theta, payload) = structured_unit(problem, designs, own, knobs.theta)
+    rows, payload = structured_unit(problem, designs, own, knobs.theta)
     kappa = np.array(payload["kappa"]) if payload["kappa"] else None
     return Designed(
-        problem, knobs, kappa, payload["shortfall"], tuple(rows), (own, inner, theta, payload)
+        problem, knobs, kappa, payload["shortfall"], tuple(rows), (own, inner, knobs.theta, payload)
     )
 
 

@@ -33,6 +33,7 @@ from ccd_casadi.support.threads import side_by_side
 T = TypeVar("T")
 R = TypeVar("R")
 
+AT_ONCE = 6  # coupled plants of a part at most: parts are computed side by side
 NOT_THERE = -1.0  # a pole that stands for none
 ALIKE = 1e-9  # relative: responses of channels that are one problem
 
@@ -109,6 +110,12 @@ class CompositeProblem(LoopProblem):
                     names[j] += f" of {own.name}"
         return names
 
+    def gains_of(self, constraints: Constraints) -> np.ndarray:
+        out = np.zeros((len(constraints.v), 2), int)
+        for number, (part, at, own) in enumerate(self.split(constraints)):
+            out[at] = part.problem.gains_of(own) + np.array([number, 0])
+        return out
+
     def plants_of(self, constraints: Constraints) -> np.ndarray:
         """Of all."""
         out = np.zeros(len(constraints.v), int)
@@ -147,11 +154,11 @@ def composite_problem(
                 continue
             problem = Problem(plant_set(singles[i], sampling), own, limits, box[:, place], margin)
             parts.append(Part(problem, place, members, i, lead))
-    if len(together):
-        matrices = plant_set([alike[j] for j in together], sampling, structure.decoupling)
+    for members in np.array_split(together, -(-len(together) // AT_ONCE)) if len(together) else ():
+        matrices = plant_set([alike[j] for j in members], sampling, structure.decoupling)
         place = structure.places
         whole = LoopProblem(matrices, structure.apart, bounds, box[:, place], margin)
-        parts.append(Part(whole, place, together))
+        parts.append(Part(whole, place, members))
     plant_units = parts[0].problem.plants
     return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
 

@@ -170,40 +170,32 @@ def line_problem(
     size = np.linalg.norm(G, axis=(1, 2))
     omega_0 = HZ * max(REACH * min(one[-1] for one in hz), SHORT * max(one[0] for one in hz))
     force = 1.0 / float(np.exp(np.log(size).mean()))
-    plants = _plants(HZ * every / omega_0, force * G, structure, omega_0, force, period)
+    omega, T = HZ * every / omega_0, None if period is None else period * omega_0
+    U, V = structure.directions
+    out, into = (np.ascontiguousarray(M, float) for M in (U.T, V))
+    poles, residues = _modes(omega, force * G, T)
+    plants = LinePlants((), omega_0, force, T, 0.0, poles, residues, out, into, omega)
     fastest = 3.0 * HZ * max(one[-1] for one in hz) / omega_0
     if plants.period is not None:
         fastest = min(fastest, 2.0 / plants.period)
     slowest = 0.1 * HZ * min(one[0] for one in hz) / omega_0
     gains = (1e-3 / (force * float(size.max())), 1e3 / (force * float(size.min())))
     box = structure.bounds((slowest, fastest), gains)
-    v = plants.variable(HZ * every / omega_0)
+    v = plants.variable(omega)
     starts = (0, *np.cumsum([len(one) for one in hz]).tolist())
     return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts,
                        effort)  # fmt: skip
 
 
-def _plants(
-    omega: Array,
-    G: np.ndarray,
-    structure: Structure | ChannelStructure,
-    omega_0: float,
-    force: float,
-    period: float | None,
-) -> LinePlants:
-    """A plant for each line with G (N, p, m) there: Re r and Im r solve G = r f + r̄ f̃."""
+def _modes(omega: Array, G: np.ndarray, period: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Pole and residue of each line with G (N, p, m) there: Re r and Im r solve G = r f + r̄ f̃."""
     count, p, m = G.shape
-    least = 0.0 if period is None else SLOWEST / (period * omega_0)
-    pole = POLE * np.maximum(omega, least)
+    pole = POLE * np.maximum(omega, 0.0 if period is None else SLOWEST / period)
     f, other = 1.0 / (1j * omega - pole), 1.0 / (1j * omega - pole.conj())
     both, apart = f + other, 1j * (f - other)
     basis = np.array([[both.real, apart.real], [both.imag, apart.imag]]).transpose(2, 0, 1)
     parts = np.linalg.solve(basis, np.stack([G.real, G.imag], axis=1).reshape(count, 2, p * m))
-    residues = (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
-    U, V = structure.directions
-    out, into = (np.ascontiguousarray(M, float) for M in (U.T, V))
-    T = None if period is None else period * omega_0
-    return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, out, into, omega)
+    return pole[:, None], (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
 
 
 @assess.register

@@ -179,6 +179,11 @@ class LoopProblem:
         """The number of the plant that each row is of: several rows of a plant are numbered on."""
         return constraints.plant % self.plants.count
 
+    def gains_of(self, constraints: "Constraints") -> np.ndarray:
+        """Of which part of the problem each row is, and which gain of a plant's matrix, (M, 2)."""
+        number = constraints.plant // self.plants.count
+        return np.column_stack([np.zeros_like(number), number])
+
     def kinds_of(self, constraints: "Constraints") -> list[str]:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
         return [LoopCurve(int(code)).name for code in constraints.curve]

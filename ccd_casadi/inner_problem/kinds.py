@@ -33,6 +33,10 @@ from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
+ENDS = {  # of the ranges, as slopes to (ln ω_S, ln ω_T)
+    "omega_S lower": (-1.0, 0.0), "omega_S upper": (1.0, 0.0),
+    "omega_T lower": (0.0, -1.0), "omega_T upper": (0.0, 1.0),
+}  # fmt: skip
 RESIDUAL = 1e-3  # relative; above it the point is no stationary one and has no envelope gradient
 
 
@@ -200,20 +204,11 @@ def bandwidth_gradient(
 
     `bounded` names the rows 1 to -2 of the optimum's values, as `InnerBounds.bounds` does.
     """
-    x = optimum.to_break_frequencies
-    columns, slopes = [], []
-    zero = np.zeros(optimum.to_theta.shape[1])
-    for name in active:
-        if name in bounded:
-            i = 1 + bounded.index(name)
-            columns.append(x[i])
-            slopes.append(optimum.to_theta[i])
-        else:
-            variable, end = name.split()
-            sign = 1.0 if end == "upper" else -1.0
-            columns.append(sign * np.eye(2)[0 if variable == "omega_S" else 1])
-            slopes.append(zero)
-    mu, residual = non_negative(np.reshape(columns, (-1, 2)), x[0])
+    x, theta, none = optimum.to_break_frequencies, optimum.to_theta, np.zeros_like(optimum.to_theta)
+    rows = {name: (x[i], theta[i]) for i, name in enumerate(bounded, 1)}
+    rows |= {name: (np.array(end), none[0]) for name, end in ENDS.items()}
+    mu, residual = non_negative(np.reshape([rows[name][0] for name in active], (-1, 2)), x[0])
     if residual > RESIDUAL:
-        return np.full_like(zero, np.nan)
-    return optimum.to_theta[0] - mu @ np.reshape(slopes, (len(mu), len(zero)))
+        return np.full_like(none[0], np.nan)
+    slopes = np.reshape([rows[name][1] for name in active], (len(mu), none.shape[1]))
+    return np.asarray(theta[0] - mu @ slopes)

@@ -119,16 +119,13 @@ class Hardware:
 
 def hardware_at(problem: CoDesignProblem, theta: Array) -> Hardware:
     """What θ costs and may not, to first order."""
-    lower, upper = box(problem)
-    width = upper - lower
     df, dlam = hardware_slopes(plant_of(problem), theta)
-    sizes = constraint_sizes(problem)
+    width, sizes = box(problem).width, constraint_sizes(problem)
     shares = constraint_shares(problem, theta)
     return Hardware(problem.w1 * df * width, shares, dlam * width / sizes[:, None])
 
 
 def objective_gradient(problem: CoDesignProblem, sample: InnerValue) -> Array:
     """∇J (n,) per share of the box; of one side, where v has a kink."""
-    lower, upper = box(problem)
     own = hardware_at(problem, np.array(sample.theta)).cost_gradient
-    return own + problem.w2 * np.array(sample.gradient) * (upper - lower)
+    return own + problem.w2 * np.array(sample.gradient) * box(problem).width

@@ -20,10 +20,10 @@ from ccd_casadi.inner_problem.figure import FigureOfMerit
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, sweep_inner
+from ccd_casadi.optim.box import Box
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -295,6 +295,6 @@ def _require_mixed(problem: CoDesignProblem) -> None:
         raise UserError(words)
 
 
-def box(problem: CoDesignProblem) -> tuple[Array, Array]:
-    """Lower and upper bounds of θ as arrays."""
-    return np.array(problem.lower), np.array(problem.upper)
+def box(problem: CoDesignProblem) -> Box:
+    """The bounds of θ."""
+    return Box(np.array(problem.lower), np.array(problem.upper))

@@ -45,8 +45,10 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> 
         if not usable:
             break
         X = np.array([points[i] for i in usable])
-        Y = np.array([[np.log(d.values[0]), *d.values[1:-1]] for d in (designs[i] for i in usable)])
-        dY = np.array([_slopes(designs[i], width) for i in usable])
+        Y = np.array([designs[i].values[:-1] for i in usable])
+        dY = np.array([designs[i].to_break_frequencies[:-1] * width for i in usable])
+        dY[:, 0] /= Y[:, :1]
+        Y[:, 0] = np.log(Y[:, 0])
         new = _next_point(problem, fine, _interpolate(X, Y, dY, fine), np.array(points), designs)
         if new is None:
             break
@@ -68,12 +70,6 @@ def _starts(problem: InnerBounds, rows: list[DesignFigures]) -> list[Point]:
 
     chosen = min((row for row in rows if row.certified), key=rank, default=None)
     return [] if chosen is None else [(chosen.omega_S, chosen.omega_T)]
-
-
-def _slopes(design: Sensitivities, width: Array) -> Array:
-    slopes = design.to_break_frequencies[:-1].copy()
-    slopes[0] /= design.values[0]
-    return slopes * width
 
 
 def _interpolate(X: Array, Y: Array, dY: Array, fine: Array) -> Array:

@@ -21,6 +21,7 @@ from ccd_casadi.fixed_structure.worst_plant import (
     WITHIN,
     BoundedLoop,
     Excess,
+    excesses,
     lattice,
     worst_plants,
 )
@@ -82,21 +83,27 @@ def violations(
     turn: int,
     progress: Progress | None = None,
     within: float = WITHIN,
+    others: Sequence[Scenario] = (),
 ) -> tuple[Excess, tuple[Scenario, ...]]:
-    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`."""
+    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`; the
+    `others` are known and tried besides."""
     structured = structured_of(problem)
     loop = BoundedLoop(structure_of(problem), kappa, bandwidth, bounds_of(problem),
                        structured.sampling)  # fmt: skip
+    known = [(option, np.array(point)) for option, point in others]
+    tried = excesses(uncertain, known, loop).tolist() if known else []
     heads, count = worst_plants(uncertain, loop, seed=structured.seed + turn)
+    heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
+    heads.sort(key=lambda head: -head.value)
     if progress is not None:
         progress(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
-    known = list(structured.scenarios)
+    counted = structured.scenarios
     found: list[Scenario] = []
     for head in heads:
         near = [
             float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
-            for option, point in (*known, *found)
+            for option, point in (*counted, *found)
             if option == head.option
         ]
         if head.value > within and (not near or min(near) > APART) and len(found) < AT_ONCE:

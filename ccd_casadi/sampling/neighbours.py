@@ -15,11 +15,10 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.inner_problem.objective import objective, objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.sampling.samples import InnerSample
-from ccd_casadi.support.arrays import Array
 
 WORTH = 1e-3  # relative: what another branch has to promise, and what a verdict counts as better
 MORE = 2  # neighbours, beside one for each parameter
@@ -65,7 +64,7 @@ def promising_starts(
         theta, before = there.theta, tried.get(there.theta, ())
         for one in _nearest(problem, samples, theta) if len(before) < TRIES else []:
             value = _branch(one, theta, there.gradient)
-            counts = float(_away(problem, best.theta, theta)) <= NEAR
+            counts = bool(box(problem).away(best.theta, theta) <= NEAR)
             counts = counts or objective(problem, theta, value) < objective_of(problem, best)
             gain = problem.figure.gain(value, there.value) if value > 0.0 else 0.0
             if counts and one.kappa not in before and gain > found.get(theta, (WORTH, ()))[0]:
@@ -91,11 +90,5 @@ def _nearest(
     others = [one for one in samples if one.theta != theta]
     if not others:
         return []
-    away = _away(problem, [one.theta for one in others], theta)
+    away = box(problem).away([one.theta for one in others], theta)
     return [others[i] for i in np.argsort(away, kind="stable")[: len(theta) + MORE]]
-
-
-def _away(problem: CoDesignProblem, thetas: Theta | Sequence[Theta], theta: Theta) -> Array:
-    """How far θ lie from one, in shares of the box."""
-    width = np.subtract(problem.upper, problem.lower)
-    return np.asarray(np.abs(np.subtract(thetas, theta) / width).max(-1))

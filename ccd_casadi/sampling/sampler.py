@@ -104,27 +104,26 @@ class Sampler:
         its neighbours is climbed anew (`neighbours`).
         """
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]
-        known, before = list(self.solved.values()), len(self.trace)
+        known = list(self.solved.values())
         new = [theta for theta in points if theta not in self.solved]
-        self._solve({theta: from_neighbour(self.problem, known, theta) for theta in new}, label)
-        self._improve()
-        self.report(before)
+        self._learn({theta: from_neighbour(self.problem, known, theta) for theta in new}, label)
         return [self.solved[theta] for theta in points]
 
     def value_from(self, theta: Sequence[float], kappa: Sequence[float]) -> InnerSample:
         """The sample at θ, where a controller (κ in SI) was found for it: also from that one."""
-        point, before = tuple(float(v) for v in theta), len(self.trace)
-        self._solve({point: from_controller(self.problem, kappa)}, "from a controller")
-        self._improve()
-        self.report(before)
+        point = tuple(float(v) for v in theta)
+        self._learn({point: from_controller(self.problem, kappa)}, "from a controller")
         return self.solved[point]
 
     def latest(self, samples: Sequence[InnerSample]) -> list[InnerSample]:
         """What is known by now at the θ of samples."""
         return [self.solved.get(sample.theta, sample) for sample in samples]
 
-    def _improve(self) -> None:
-        """Climb anew from their neighbours where samples fall short of them, until none does."""
+    def _learn(self, problems: Mapping[tuple[float, ...], CoDesignProblem], label: str) -> None:
+        """The inner problem at every θ; then climbs from their neighbours where samples fall short
+        of them, until none does."""
+        reported = len(self.trace)
+        self._solve(problems, label)
         while tasks := promising_starts(self.problem, self.solved.values(), self._tried):
             before = {theta: self.solved[theta] for theta in tasks}
             problems = {
@@ -134,6 +133,7 @@ class Sampler:
             for theta, kappa in tasks.items():
                 if self.solved[theta] is before[theta]:
                     self._tried.setdefault(theta, []).append(kappa)
+        self.report(reported)
 
     def _solve(self, problems: Mapping[tuple[float, ...], CoDesignProblem], label: str) -> None:
         """The inner problem at every θ, and the better one kept of it and what is known."""
@@ -143,7 +143,8 @@ class Sampler:
         missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
             tasks = [(problems[theta], self.hash, key, theta) for key, theta in missing.items()]
-            for rows, (key, theta, payload) in self.workers.map_unordered(inner_unit, tasks):
+            for key, (rows, payload) in self.workers.map_unordered(inner_unit, tasks):
+                theta = missing[key]
                 self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
                 if theta not in self.solved:  # who goes on from the store asks for it by this key
                     own = sample_key(self.inner_hash, theta, 0.0, 0.0)

@@ -17,14 +17,14 @@ from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult
 from ccd_casadi.sampling.rows import Sample, sample_key
 from ccd_casadi.sampling.samples import sample_of
 
-# Rows of the store; key, θ and payload of the inner problem.
-Unit = tuple[list[Sample], tuple[str, tuple[float, ...], dict]]
+NOTHING = (np.nan, np.nan)
+Unit = tuple[list[Sample], dict]  # rows of the store, and payload of the inner problem
 
 
-def inner_unit(task: tuple[CoDesignProblem, str, str, tuple[float, ...]]) -> Unit:
-    """Solve the inner problem at one θ; every synthesis becomes a row."""
+def inner_unit(task: tuple[CoDesignProblem, str, str, tuple[float, ...]]) -> tuple[str, Unit]:
+    """Solve the inner problem at one θ; every synthesis becomes a row. First the unit's key."""
     problem, problem_key, key, theta = task
-    return UNITS[type(problem.controller)](problem, problem_key, key, theta)
+    return key, UNITS[type(problem.controller)](problem, problem_key, key, theta)
 
 
 def mixed_unit(
@@ -34,26 +34,24 @@ def mixed_unit(
     began = perf_counter()
     result = true_inner(problem, theta)
     each = (perf_counter() - began) / max(result.syntheses, 1)
-    rows, payload = unit_of(problem_key, theta, result, problem.inner, each)
-    return rows, (key, theta, payload)
+    return unit_of(problem_key, theta, result, problem.inner, each)
 
 
 def unit_of(
     problem_key: str, theta: tuple[float, ...], result: InnerResult, inner: InnerBounds, each: float
-) -> tuple[list[Sample], dict]:
+) -> Unit:
     """Rows and payload of one θ's inner problem; `each` synthesis took so many seconds."""
     rows = {}
     for figures in result.rows:
         row_key = sample_key(problem_key, theta, figures.omega_S, figures.omega_T)
         rows[row_key] = sample_of(row_key, theta, figures, each)
-    optimum, slope = result.optimum, None
-    names = ("bandwidth", "omega_S", "omega_T")
-    if optimum is not None:
+    found = dict.fromkeys(("bandwidth", "omega_S", "omega_T", "gradient"))
+    if (optimum := result.optimum) is not None:
+        found = {name: getattr(optimum.figures, name, None) for name in found}
         gradient = bandwidth_gradient(optimum, result.active, tuple(inner.bounds))
-        slope = [_number(v) for v in gradient]
+        found["gradient"] = [_number(v) for v in gradient]
     payload = {
-        **{name: None if optimum is None else getattr(optimum.figures, name) for name in names},
-        "gradient": slope,
+        **found,
         "active": list(result.active),
         "shortfall": result.shortfall,
         "violation": _number(result.violation),
@@ -68,9 +66,8 @@ def structured_unit(
     """The best design of a fixed structure at one θ: one row, without weights' frequencies."""
     value = structured_value(problem, theta)
     design, judged = value.design, value.design.certificate
-    worst = None if judged is None or not judged.worst else max(judged.worst.values())
     peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]
-    highest = max(peaks, key=lambda plant: plant.S_peak, default=None)
+    highest = max(((plant.S_peak, plant.S_peak_frequency) for plant in peaks), default=NOTHING)
     row = Sample(
         key=key,
         theta=theta,
@@ -79,10 +76,10 @@ def structured_unit(
         outcome=design.outcome.name.lower(),
         reason=design.words,
         bandwidth=value.bandwidth,
-        sensitivity_peak=np.nan if highest is None else highest.S_peak,
-        sensitivity_peak_frequency=np.nan if highest is None else highest.S_peak_frequency,
+        sensitivity_peak=highest[0],
+        sensitivity_peak_frequency=highest[1],
         sensitivity_low=max((plant.S_low for plant in peaks), default=np.nan),
-        norm=np.nan if worst is None else worst,
+        norm=max({} if judged is None else judged.worst.values(), default=np.nan),
         norm_bound=1.0,
         certified=value.feasible,
         seconds=design.seconds,
@@ -97,7 +94,7 @@ def structured_unit(
         "violation": _number(np.log(max(design.short.values()))) if design.short else None,
         "syntheses": value.syntheses,
     }
-    return [row], (key, theta, payload)
+    return [row], payload
 
 
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.

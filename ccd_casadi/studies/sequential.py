@@ -95,13 +95,12 @@ def _least_cost(
     problem: CoDesignProblem, resonance: float, start: tuple[float, ...], evaluate: Evaluate | None
 ) -> tuple[Array, float]:
     """θ of the least cost near a start, and ω_1 there, by one way to evaluate the plant."""
-    lower, upper = box(problem)
     plant = plant_of(problem)
-    theta = ca.MX.sym("theta", len(lower))
+    theta = ca.MX.sym("theta", len(start))
     cost, lam = plant.hardware(theta)
     at = lru_cache(maxsize=None)(lambda point: first_resonance(problem, np.array(point), evaluate))
     callback = VectorCallback(
-        "first_resonance", len(lower), 1,
+        "first_resonance", len(start), 1,
         lambda x: np.array([np.log(at(tuple(x))[0] / resonance)]),
         lambda x: at(tuple(x))[1][None] / at(tuple(x))[0],
     )  # fmt: skip
@@ -109,8 +108,7 @@ def _least_cost(
         x=theta,
         f=cost / (abs(hardware_cost(plant, start)) or 1.0),
         g=ca.vertcat(-callback(theta), lam / ca.DM(constraint_sizes(problem))),
-        lower=lower,
-        upper=upper,
+        box=box(problem),
         exact_hessian=False,
     )
     try:

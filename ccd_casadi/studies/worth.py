@@ -30,10 +30,10 @@ from scipy.special import ndtr
 
 from ccd_casadi.cases.case import Case
 from ccd_casadi.codesign.nested import fit_bandwidth
-from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
+from ccd_casadi.codesign.outer_problem import OuterFailure, outer_program, solve_program
 from ccd_casadi.codesign.outer_structured import multistart_at, value_with_design
 from ccd_casadi.codesign.run import outer_of
-from ccd_casadi.codesign.theta_joint import with_scenarios
+from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_robustness import worst_case
@@ -155,7 +155,7 @@ def outlook(
     best = min(known, key=lambda sample: objective_of(problem, sample))
     process = fit_bandwidth(problem, learnt, seed, gradients=True)
     lower, upper = box(problem)
-    program = nested_program(problem, to_casadi(process, std=False))
+    program = outer_program(problem, to_casadi(process, std=False))
     starts = np.vstack([best.theta, design("sobol", lower, upper, 8, seed)])
     try:
         expected = solve_program(program, starts).best.x

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
-from ccd_casadi.codesign.outer_problem import OuterSolution, lifted_program, solve_program
+from ccd_casadi.codesign.outer_problem import OuterSolution, outer_program, solve_program
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -25,7 +25,7 @@ START = point(57.0, 56.5, 1700.0, 30.0)
 
 def solved(case: CoDesignProblem, start: np.ndarray) -> tuple[OuterSolution, TrueQuantities]:
     quantities = TrueQuantities(case)
-    program = replace(lifted_program(case, quantities), exact_hessian=False)
+    program = replace(outer_program(case, quantities), exact_hessian=False)
     return solve_program(program, start), quantities
 
 

@@ -16,12 +16,12 @@ from ccd_casadi.codesign.outer_problem import (
     NonlinearProgram,
     OuterFailure,
     lifted_bounds,
-    lifted_program,
-    nested_program,
+    outer_program,
     solve_program,
 )
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.optim.box import Box
 from ccd_casadi.studies.sequential import design_hardware, first_resonance
 
 W1, W2 = 0.0995, -0.9950
@@ -53,7 +53,7 @@ def constrained(folder: Path, least: float) -> CoDesignProblem:
 
 def test_interior_optimum_is_where_calculus_puts_it() -> None:
     bandwidth = surrogate(lambda a, b: 400.0 - (a - 60.0) ** 2 - 2.0 * (b - 62.0) ** 2)
-    program = nested_program(problem(), bandwidth)
+    program = outer_program(problem(), bandwidth)
     solution = solve_program(program, starts())
     # w1 + w2 (-2 (m1 - 60)) = 0, and likewise with 4 for m2
     expected = np.array([60.0 + W1 / (2.0 * W2), 62.0 + W1 / (4.0 * W2)])
@@ -76,29 +76,29 @@ def test_an_optimum_lies_on_the_bounds_that_the_slopes_lead_to(
     bandwidth = surrogate(
         lambda a, b: 300.0 + slopes[0] * a + slopes[1] * b - flat * (a - 61.0) ** 2
     )
-    program = nested_program(problem(), bandwidth)
+    program = outer_program(problem(), bandwidth)
     solution = solve_program(program, starts())
     expected = [61.0 if flat else corner[0], corner[1]]
     np.testing.assert_allclose(solution.best.x, expected, atol=1e-6)
-    assert (program.lower <= solution.best.x).all()
-    assert (solution.best.x <= program.upper).all()
+    assert (program.box.lower <= solution.best.x).all()
+    assert (solution.best.x <= program.box.upper).all()
 
 
 def test_a_hardware_constraint_is_respected(tmp_path: Path) -> None:
     def bowl(a: ca.SX, b: ca.SX) -> ca.SX:
         return 400.0 - (a - 56.0) ** 2 - (b - 58.0) ** 2
 
-    program = nested_program(constrained(tmp_path, 120.0), surrogate(bowl))
+    program = outer_program(constrained(tmp_path, 120.0), surrogate(bowl))
     best = solve_program(program, starts()).best
     # the nearest point to the bowl's centre (the cost is constant along m1 + m2 = 120)
     np.testing.assert_allclose(best.x, [59.0, 61.0], rtol=1e-8)
     assert 120.0 - best.x.sum() <= 1e-8
-    slack = solve_program(nested_program(constrained(tmp_path, 110.5), surrogate(bowl)), starts())
+    slack = solve_program(outer_program(constrained(tmp_path, 110.5), surrogate(bowl)), starts())
     assert slack.best.x.sum() < 115.0, "without the constraint the optimum is elsewhere"
 
 
 def test_constraints_that_cannot_be_met_are_a_failure(tmp_path: Path) -> None:
-    program = nested_program(constrained(tmp_path, 141.0), surrogate(lambda a, b: a + b))
+    program = outer_program(constrained(tmp_path, 141.0), surrogate(lambda a, b: a + b))
     with pytest.raises(OuterFailure, match="converged from none of 3 starts: Infeasible"):
         solve_program(program, starts(3))
 
@@ -111,7 +111,7 @@ def test_every_local_optimum_is_found_once_and_ranked() -> None:
         return 300.0 + 10.0 * wave + 0.4 * a - 0.3 * b
 
     bandwidth = surrogate(hills)
-    solution = solve_program(nested_program(problem(), bandwidth), starts(60))
+    solution = solve_program(outer_program(problem(), bandwidth), starts(60))
     values = [optimum.objective for optimum in solution.optima]
     assert values == sorted(values)
     assert solution.best is solution.optima[0]
@@ -143,7 +143,8 @@ def test_convex_problems_in_a_box_agree_with_scipy(seed: int, exact: bool) -> No
     lower = rng.uniform(-2.0, 0.0, 3)
     upper = lower + rng.uniform(0.1, 3.0, 3)
     x = ca.MX.sym("x", 3)
-    program = NonlinearProgram(x, ca.sumsqr(ca.DM(A) @ x - b), ca.MX(0, 1), lower, upper, exact)
+    within = Box(lower, upper)
+    program = NonlinearProgram(x, ca.sumsqr(ca.DM(A) @ x - b), ca.MX(0, 1), within, exact)
     best = solve_program(program, rng.uniform(lower, upper, (2, 3))).best
     reference = lsq_linear(A, b, (lower, upper), tol=1e-14)
     assert best.objective == pytest.approx(2.0 * reference.cost, rel=1e-6)
@@ -151,7 +152,7 @@ def test_convex_problems_in_a_box_agree_with_scipy(seed: int, exact: bool) -> No
 
 
 def test_starts_outside_the_box_are_put_onto_it() -> None:
-    program = nested_program(problem(), surrogate(lambda a, b: -((a - 60.0) ** 2) - b))
+    program = outer_program(problem(), surrogate(lambda a, b: -((a - 60.0) ** 2) - b))
     best = solve_program(program, np.array([[-1e3, 1e3]])).best
     np.testing.assert_allclose(best.x, [60.0 + W1 / (2.0 * W2), 55.0], atol=1e-5)
 
@@ -172,7 +173,7 @@ def test_lifted_problem_keeps_the_bounds_on_s() -> None:
         ],
     )  # fmt: skip
     case = problem()
-    program = lifted_program(case, quantities)
+    program = outer_program(case, quantities)
     lower, upper = lifted_bounds(case)
     np.testing.assert_allclose(np.exp(lower[2:]) / HZ, [10.0, 25.0])
     np.testing.assert_allclose(np.exp(upper[2:]) / HZ, [1800.0, 1000.0])
@@ -195,7 +196,7 @@ def test_lambda_and_the_bounds_on_s_are_kept_together(tmp_path: Path) -> None:
     x = ca.SX.sym("x", 4)
     q = ca.vertcat(100.0 * x[2] - x[0] - x[1], 0.3 * x[2] - 0.3 * np.log(60.0 * HZ), -9.0, 1.0)
     case = constrained(tmp_path, 130.0)
-    program = lifted_program(case, ca.Function("q", [x], [q]))
+    program = outer_program(case, ca.Function("q", [x], [q]))
     lower, upper = lifted_bounds(problem())
     best = solve_program(program, 0.5 * (lower + upper)[None, :]).best
     assert best.x[:2].sum() == pytest.approx(130.0, abs=1e-6)

@@ -197,10 +197,22 @@ def test_a_step_to_where_masses_are_no_longer_positive_is_no_step() -> None:
     assert model.at(model.start) is not None
 
 
+def test_with_sections_the_smaller_plan_is_sampled() -> None:
+    """Lifted and its 6 n designs, where nested has a grid of 5^n."""
+    case = load_case(ROOT / "runs" / "two_mass_built.toml")
+    coarse, default = case.sampling.points, type(case.sampling)()
+    assert coarse**2 < 12 < default.points**2
+    plain = replace(case, sampling=default)
+    assert [usual_name(plain, n) for n in (1, 2, 4)] == ["nested", "lifted", "lifted"]
+    assert usual_name(plain, 20) == "direct"
+    mixed = replace(plain, controller=replace(plain.controller, structure="h_infinity"))
+    assert usual_name(mixed, 2) == "nested"
+
+
 def test_where_each_theta_is_dear_none_is_sampled() -> None:
-    runs = ROOT / "runs"
-    chosen = {name: usual_name(load_case(runs / f"{name}.toml"), 6)
-              for name in ("rib_stage_built", "two_mass_built", "rib_stage")}  # fmt: skip
+    names = ("rib_stage_built", "two_mass_built", "rib_stage")
+    cases = {name: load_case(ROOT / "runs" / f"{name}.toml") for name in names}
+    chosen = {name: usual_name(case, len(case.theta)) for name, case in cases.items()}
     assert chosen == {
         "rib_stage_built": "direct", "two_mass_built": "nested", "rib_stage": "nested"
     }  # fmt: skip

@@ -61,8 +61,8 @@ def optimal_line(
     residual: float, gap: float = 0.0, look: GlobalCheck | None = None
 ) -> v.VerdictLine:
     kkt = KktCertificate(residual, 0.0, 0.0, {}, (), None, ())
-    known, _ = v.search_evidence(16, 2, look)
-    return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", known=known)
+    known = v.search_evidence(16, 2, look)
+    return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", searched=known)
 
 
 @given(st.floats(0.0, 10.0))
@@ -128,9 +128,7 @@ def test_a_differentiator_is_said_to_be_one() -> None:
 
 def test_a_prediction_at_its_own_sample_counts_without_it() -> None:
     """D6: 6e-12 at a training sample that the others miss by 2 % is no support."""
-    hollow = v.predicted(
-        error=6e-12, tolerance=1e-3, value=HZ * 1.56 / 0.022, left_out=(1.56, 3.5)
-    )
+    hollow = v.predicted(error=6e-12, tolerance=1e-3, value=HZ * 1.56 / 0.022, left_out=(1.56, 3.5))
     assert hollow.state is v.State.WARNED
     assert "1.6 Hz" in hollow.words
     assert "3.5 sigma" in hollow.words

@@ -12,6 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, solve_program
+from ccd_casadi.optim.box import Box
 from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.plant import build_plant, constraint_values, hardware_cost
 from ccd_casadi.solve import main
@@ -119,7 +120,7 @@ def test_ipopt_finds_the_least_cost_of_a_numeric_plant_as_of_the_exact_one() -> 
         theta = ca.MX.sym("theta", 2)
         f, lam = plant.hardware(theta)
         program = NonlinearProgram(
-            x=theta, f=f, g=lam, lower=np.array(LOWER), upper=np.array(UPPER),
+            x=theta, f=f, g=lam, box=Box(np.array(LOWER), np.array(UPPER)),
             exact_hessian=plant.exact_hessian,
         )  # fmt: skip
         ends.append(solve_program(program, np.array([[2.0, 3e-3]])).best)

@@ -42,7 +42,7 @@ def branches(cliff: float, asked: list[tuple]) -> Callable[[tuple], tuple]:
         if case.controller.figure.key == "move_time":  # less is better, and the slope is of that
             payload |= {"error": 1.0 / value, "gradient": [-slope / 15.0 / value**2, 0.0]}
         asked.append((theta, kappa))
-        return [], (key, theta, payload)
+        return key, ([], payload)
 
     return unit
 

@@ -142,14 +142,14 @@ def test_the_nearest_is_the_infeasible_theta_that_falls_short_least(
 ) -> None:
     shortfalls = {55.0: 0.3, 62.5: 0.1, 70.0: None}  # by m1; None: feasible
 
-    def unit(task: tuple[Any, ...]) -> tuple[list[Any], tuple[Any, ...]]:
+    def unit(task: tuple[Any, ...]) -> tuple[str, Any]:
         *_, key, theta = task
         violation = shortfalls[theta[0]]
         met = violation is None
         payload = {"bandwidth": 400.0 if met else None, "gradient": None, "active": []}
         payload |= {"omega_S": 9.0 if met else None, "omega_T": 9.0 if met else None}
         payload |= {"shortfall": "", "violation": 0.0 if met else violation, "syntheses": 1}
-        return [], (key, theta, payload)
+        return key, ([], payload)
 
     monkeypatch.setattr(module, "inner_unit", unit)
     for order in ([0, 1, 2, 3], [1, 3, 0, 2], [2, 3, 1, 0]):
@@ -201,10 +201,10 @@ def test_a_trace_tells_bandwidths_where_j_counts_an_error(
     """It had the error, in m, for the bandwidth."""
 
     def unit(task: Any) -> Any:
-        _, _, key, theta = task
+        _, _, key, _ = task
         payload: dict[str, Any] = {"bandwidth": 300.0, "error": 2e-9, "gradient": [0.0, 0.0]}
         payload |= {"active": [], "shortfall": "", "violation": 0.0, "syntheses": 1, "kappa": [1.0]}
-        return [], (key, theta, payload)
+        return key, ([], payload)
 
     monkeypatch.setattr(module, "inner_unit", unit)
     monkeypatch.setattr(module, "objective", lambda problem, _, v: 200.0 + problem.w2 * v)
@@ -227,9 +227,9 @@ def test_an_easier_problems_designs_are_counted_and_not_traced(tmp_path: Path) -
 
 def test_the_rows_of_a_unit_share_its_seconds() -> None:
     began = time.perf_counter()
-    rows, (key, theta, payload) = units.inner_unit((problem(), "p", "k", (60.0, 60.0)))
+    key, (rows, payload) = units.inner_unit((problem(), "p", "k", (60.0, 60.0)))
     elapsed = time.perf_counter() - began
-    assert (key, theta, payload["syntheses"]) == ("k", (60.0, 60.0), len(rows))
+    assert (key, payload["syntheses"]) == ("k", len(rows))
     assert len(rows) > 5
     assert 0.0 < sum(row.seconds for row in rows) <= elapsed
     (row,), _ = units.design_unit((problem(), [("d", tuple(X[0]))]))

@@ -67,6 +67,14 @@ TABLES = tuple(
 )  # fmt: skip
 
 
+def doubled(source: Source) -> Source:
+    """With twice the amplitude."""
+    if isinstance(source.spectrum, ShapedSpectrum):
+        return replace(source, spectrum=replace(source.spectrum, level=4.0 * source.spectrum.level))
+    density = tuple(4.0 * value for value in source.spectrum.density)
+    return replace(source, spectrum=replace(source.spectrum, density=density))
+
+
 def built(
     sampling: Sampling | None, seed: int = 1, structure: Structure | None = None
 ) -> tuple[Loop, Structure, Array]:
@@ -272,7 +280,7 @@ def test_sources_add_in_squares_and_scale() -> None:
     for item in whole.sources:
         assert (np.diff(item.cumulative) >= 0.0).all()
         np.testing.assert_allclose(np.sqrt(item.cumulative[-1]), item.error, rtol=1e-6)
-    twice = ErrorBudget(tuple(source.times(2.0) for source in (*SHAPED, *TABLES)), WINDOW)
+    twice = ErrorBudget(tuple(map(doubled, (*SHAPED, *TABLES))), WINDOW)
     double = evaluate_budget(made.plant, made.controller, twice)
     assert double is not None
     np.testing.assert_allclose([double.error, double.force], [2 * whole.error, 2 * whole.force])

@@ -171,6 +171,6 @@ def test_rounds_interpolate_where_a_fit_saw_noise(two_mass_run: Path) -> None:
         replace(p, hyperparameters=replace(p.hyperparameters, noise_variance=1e-2))
         for p in fit_quantities(problem, samples[:-1], 0)
     ]
-    for k, process in enumerate(update_quantities(problem, samples, tuple(fitted))):
+    for k, process in enumerate(update_quantities(samples, tuple(fitted))):
         value, span = samples[-1].values[k], float(np.ptp([s.values[k] for s in samples]))
         assert process.predict([samples[-1].x])[0] == pytest.approx(value, abs=1e-6 * span)

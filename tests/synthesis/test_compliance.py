@@ -11,7 +11,7 @@ import pytest
 from helpers import HZ, problem
 
 from ccd_casadi.codesign.kkt import TrueDesign, first_order
-from ccd_casadi.codesign.outer_problem import lifted_program
+from ccd_casadi.codesign.outer_problem import outer_program
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.kinds import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design, true_inner
@@ -107,7 +107,7 @@ def test_what_cannot_be_had_is_said() -> None:
 def test_it_is_a_constraint_of_the_outer_problem() -> None:
     case = bounded(2.7e-5)
     quantities = TrueQuantities(case)
-    program = lifted_program(case, quantities)
+    program = outer_program(case, quantities)
     x = np.array([*THETA, *np.log(POINT)])
     design = quantities.at(x)
     assert program.g.shape[0] == 3
