@@ -29,9 +29,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
+    from ccd_casadi.codesign.result import write_run
     from ccd_casadi.codesign.retraining import Job
     from ccd_casadi.codesign.run import outer_of, require_solvable
-    from ccd_casadi.codesign.run_files import write_run
     from ccd_casadi.codesign.stored import only_job, publish
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler

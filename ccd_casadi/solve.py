@@ -126,8 +126,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.formulations import formulation_of, slow_words, usual_name
+    from ccd_casadi.codesign.result import resolved, write_run
     from ccd_casadi.codesign.run import co_design
-    from ccd_casadi.codesign.run_files import resolved, write_run
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler

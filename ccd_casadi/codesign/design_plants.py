@@ -86,7 +86,7 @@ def best_over_design_plants(
     result = with_all_spent(found[best].result, sampler.spent.by_purpose)
     result["seconds"] = perf_counter() - terms.began
     if problem.robust is not None:
-        names = [_at(choice) for choice in choices]
+        names = [choice.robust.design_at for choice in choices if choice.robust]
         told = [{key: item.result[key] for key in TOLD if key in item.result} for item in found]
         tried = dict(zip(names, told, strict=True))
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
@@ -136,18 +136,14 @@ def search_words(problem: CoDesignProblem, thetas: int) -> str:
     made = ""
     if robust is not None and robust.shift:
         ends = {"low": "its lower end", "nominal": "its middle", "high": "its upper end"}
-        places = [ends[_at(choice)] for choice in design_choices(problem)]
+        places = [ends[choice.robust.design_at] for choice in design_choices(problem)
+                  if choice.robust]  # fmt: skip
         named = " and ".join(filter(None, (", ".join(places[:-1]), places[-1])))
         made = f", made on the plant at {named} of +-{100 * robust.shift:g} %"
     return (
         f"none found among the mixed-sensitivity H-infinity controllers{made} at {thetas} theta "
         f"({', '.join(box)} Hz)"
     )
-
-
-def _at(problem: CoDesignProblem) -> str:
-    assert problem.robust is not None
-    return problem.robust.design_at
 
 
 def remedies(problem: CoDesignProblem, share: float | None = None) -> str:

@@ -95,8 +95,12 @@ def mixed_answer(
     head = head_of(problem, theta)
     rows: tuple[DesignFigures, ...] = ()
     if point is not None:
-        problem = _best_at(problem, theta, point)
-        syntheses = 1
+        at = point
+
+        def peak(choice: CoDesignProblem) -> float:
+            return float(np.nan_to_num(true_design(choice, theta, *at).values[1], nan=np.inf))
+
+        problem, syntheses = min(design_choices(problem), key=peak), 1
     else:
         problem, found = best_choice(problem, theta)
         syntheses, rows = found.syntheses, found.rows
@@ -124,17 +128,6 @@ def mixed_answer(
     }
     status = "verified" if made.figures.certified else "not_verified"
     return InnerAnswer(status, answer, controller_dict(made.controller), rows)
-
-
-def _best_at(
-    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float]
-) -> CoDesignProblem:
-    """The problem with the design plant whose controller has the least peak of S there."""
-
-    def peak(choice: CoDesignProblem) -> float:
-        return float(np.nan_to_num(true_design(choice, theta, *point).values[1], nan=np.inf))
-
-    return min(design_choices(problem), key=peak)
 
 
 def measured_answer(

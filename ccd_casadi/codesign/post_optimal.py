@@ -103,7 +103,9 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
 
     bounds = lifted_bounds(problem)
     slope = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * bounds.width
-    own = [_Parameter(name, bound, np.zeros(n), {name: -1.0 / bound})
+    moved = {name: [name] for name in problem.inner.bounds}  # peaks besides the largest too
+    moved["S_max"] += [name for name in kkt.multipliers if name.startswith(OTHER_PEAK)]
+    own = [_Parameter(name, bound, np.zeros(n), dict.fromkeys(moved[name], -1.0 / bound))
            for name, (_, bound) in problem.inner.bounds.items()]  # fmt: skip
     known = _Parameter("w2", problem.w2, slope, cost=float(design.values[0]))
     return _responses(problem, x, bounds, kkt, active, hessian, [known, *own], slope)
@@ -169,10 +171,10 @@ def _responses(
     for parameter in _parameters(problem, x, bounds, slope_f, parameters):
         dz = np.full(n, np.nan)
         if determined:
-            level = [_level(parameter, name) for name in strong]
+            level = [parameter.levels.get(name, 0.0) for name in strong]
             dz = np.linalg.solve(system, -np.concatenate([parameter.gradient, level]))[:n]
         dx = tuple(map(float, dz * width))
-        change = sum(mu * _level(parameter, name) for name, mu in kkt.multipliers.items())
+        change = sum(kkt.multipliers.get(name, 0.0) * d for name, d in parameter.levels.items())
         responses.append(
             Response(
                 parameter=parameter.name,
@@ -186,12 +188,6 @@ def _responses(
         )
     weak = tuple(name for name in kkt.active if name not in strong)
     return PostOptimal(tuple(responses), kkt, weak, determined)
-
-
-def _level(parameter: _Parameter, constraint: str) -> float:
-    """∂g/∂p of a constraint; a peak besides the largest moves with S_max as that one does."""
-    name = "S_max" if constraint.startswith(OTHER_PEAK) else constraint
-    return parameter.levels.get(name, 0.0)
 
 
 def _parameters(

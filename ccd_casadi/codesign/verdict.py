@@ -126,14 +126,9 @@ def search_evidence(
         known += f", {optima} distinct optima"
     if look is None or not look.points:
         return f"{known}, no global check over the box, {gap}", figures
-    figures |= {
-        "box_points": look.points,
-        "box_feasible": look.feasible,
-        "box_better": look.better,
-        "box_starts": look.starts,
-        "box_seed": look.seed,
-        "objective_before": look.before,
-    }
+    counted_up = ("points", "feasible", "better", "starts", "seed")
+    figures |= {f"box_{name}": getattr(look, name) for name in counted_up}
+    figures["objective_before"] = look.before
     how = f"{look.points} spread theta"
     said = f"none better at {how}"
     if look.moved:

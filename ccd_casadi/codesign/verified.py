@@ -29,14 +29,17 @@ from surrogates import Quality
 class Verified(ABC):
     """A design at θ, judged on the truth.
 
-    `value` is what J counts of the controller, in SI. `inner_gap`: by how much (relative) a search
-    of the whole inner problem at θ beats it. `feasible`: certified, within its bounds, and
-    λ(θ) <= 0. `survival` and `damping`: off the model; None where the loop is not stable.
+    `design` has the `controller`, whether it is `certified`, and its `bandwidth`, unless its kind
+    reads these elsewhere. `value` is what J counts of the controller, in SI. `inner_gap`: by how
+    much (relative) a search of the whole inner problem at θ beats it. `feasible`: certified, within
+    its bounds, and λ(θ) <= 0. `survival` and `damping`: off the model; None where the loop is not
+    stable.
     `problem` has what a search has added to the case's: a plant set, controllers to start from.
     """
 
     problem: CoDesignProblem
     theta: tuple[float, ...]
+    design: Any
     value: float
     objective: float
     hardware_cost: float
@@ -50,19 +53,19 @@ class Verified(ABC):
     saddle: ClassVar[float] = SADDLE  # least curvature that is none downwards
 
     @property
-    @abstractmethod
     def controller(self) -> StateSpace:
         """The controller, SI."""
+        return self.design.controller
 
     @property
-    @abstractmethod
     def certified(self) -> bool:
         """Whether the closed loop is, apart from θ."""
+        return self.design.certified
 
     @property
-    @abstractmethod
     def bandwidth(self) -> float:
         """ω_b in rad/s, whatever J counts."""
+        return self.design.bandwidth
 
     @property
     def point(self) -> Array:

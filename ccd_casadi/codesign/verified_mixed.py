@@ -10,7 +10,6 @@ from ccd_casadi.codesign.verdict import State, VerdictLine, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
@@ -31,10 +30,6 @@ class VerifiedDesign(Verified):
     robust: RobustCheck | None = None
 
     kkt_level: ClassVar[float] = 1e-4  # the polish reaches 1e-6
-
-    @property
-    def controller(self) -> StateSpace:
-        return self.design.controller
 
     @property
     def certified(self) -> bool:

@@ -31,7 +31,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import Gap
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ, counted
@@ -87,19 +86,6 @@ class VerifiedStructured(Verified):
     # and differences of two such say nothing of a small curvature.
     kkt_level: ClassVar[float] = 1e-2
     saddle: ClassVar[float] = -math.inf
-
-    @property
-    def controller(self) -> StateSpace:
-        assert self.design.controller is not None
-        return self.design.controller
-
-    @property
-    def certified(self) -> bool:
-        return self.design.certified
-
-    @property
-    def bandwidth(self) -> float:
-        return self.design.bandwidth
 
     @property
     def set_is_met(self) -> bool:

@@ -14,7 +14,6 @@ from ccd_casadi.analysis.driven_plant import DrivenMechanics
 from ccd_casadi.analysis.motor import MotionAt
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import plants_of, structured_of, uncertain_plant
@@ -63,16 +62,11 @@ def exact_times(
     return np.maximum(found, profile.duration)
 
 
-def free_box(problem: CoDesignProblem, theta: Sequence[float]) -> UncertainPlant:
-    """What may differ from the model, with its rigid bodies free."""
-    return uncertain_plant(replace(problem, suspension=FREE), theta)
-
-
 def latest_plant(
     problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, seed: int
 ) -> tuple[float, int, Array]:
     """The exact time on the latest plant of a lattice of the box, its option and its point."""
-    uncertain = free_box(problem, theta)
+    uncertain = uncertain_plant(replace(problem, suspension=FREE), theta)
     points = lattice(uncertain, CHECKED, seed)
     times = exact_times(problem, motion_of(problem, theta), uncertain.plants(points), K)
     return float(times.max()), *points[int(times.argmax())]
@@ -83,9 +77,9 @@ def stated_time(
 ) -> tuple[float, Yield | None]:
     """The time that a design is told to need (s), whose smooth time on the set is `value`, and how
     many fresh plants need no longer."""
-    uncertain, seed = free_box(problem, theta), structured_of(problem).seed
-    motion, of_set = motion_of(problem, theta), plants_of(replace(problem, suspension=FREE), theta)
-    on_set = exact_times(problem, motion, of_set, K)
+    free, seed = replace(problem, suspension=FREE), structured_of(problem).seed
+    uncertain, motion = uncertain_plant(free, theta), motion_of(problem, theta)
+    on_set = exact_times(problem, motion, plants_of(free, theta), K)
     told = max(value, float(on_set.max()), latest_plant(problem, theta, K, seed + FRESH_SEED)[0])
     if not uncertain.names:
         return told, None

@@ -146,15 +146,10 @@ def refine(
 
     `limit` bounds the syntheses of each local solve.
     """
-    tried = list(rows)
-    best: Sensitivities | None = None
-    for start in starts:
-        for step in local_solve(at, problem, start, limit):
-            tried.append(step.figures)
-            if problem.feasible(step.figures) and (
-                best is None or step.figures.bandwidth > best.figures.bandwidth
-            ):
-                best = step
+    steps = [step for start in starts for step in local_solve(at, problem, start, limit)]
+    tried = [*rows, *(step.figures for step in steps)]
+    feasible = [step for step in steps if problem.feasible(step.figures)]
+    best = max(feasible, key=lambda step: step.figures.bandwidth, default=None)
     swept = (row for row in rows if problem.feasible(row))
     for row in sorted(swept, key=lambda row: -row.bandwidth):
         if best is not None and best.figures.bandwidth >= row.bandwidth:

@@ -12,7 +12,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.run_files import write_run
+from ccd_casadi.codesign.result import write_run
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.errors import UserError
 

@@ -24,9 +24,9 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.outer_structured import StructuredOuter
+from ccd_casadi.codesign.result import write_run
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
-from ccd_casadi.codesign.run_files import write_run
 from ccd_casadi.codesign.search import search_outer
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of

@@ -6,9 +6,7 @@ from hypothesis import strategies as st
 
 from ccd_casadi.codesign.working_set import EQUAL, NEAR, holding
 
-ROW = st.tuples(
-    st.integers(0, 7), st.integers(0, 2), st.floats(-1.0, 1.0), st.floats(-NEAR, NEAR)
-)
+ROW = st.tuples(st.integers(0, 7), st.integers(0, 2), st.floats(-1.0, 1.0), st.floats(-NEAR, NEAR))
 
 
 def columns(rows):

@@ -106,8 +106,8 @@ def rule_unit(case: CoDesignProblem, problem_key: str, key: str, theta: tuple[fl
 # 3. The design that a run ends with.
 @dataclass(frozen=True, kw_only=True)
 class VerifiedRule(Verified):
+    design: DesignFigures
     made: StateSpace
-    measured: DesignFigures
 
     kkt_level = 1e-3
 
@@ -116,19 +116,11 @@ class VerifiedRule(Verified):
         return self.made
 
     @property
-    def certified(self) -> bool:
-        return self.measured.certified
-
-    @property
-    def bandwidth(self) -> float:
-        return self.measured.bandwidth
-
-    @property
     def active(self) -> tuple[str, ...]:
         return self.kkt.active
 
     def figures(self) -> dict[str, Any]:
-        return figures_dict(self.measured)
+        return figures_dict(self.design)
 
     def evidence(self, predicted: float) -> dict[str, Any]:
         return {"surrogate_bandwidth_hz": predicted / HZ}
@@ -161,7 +153,7 @@ class RuleOuter(ThetaOuter):
             problem=self.problem, theta=theta, value=end.value, objective=end.objective,
             hardware_cost=hardware_cost(plant_of(self.problem), theta), kkt=end.kkt,
             inner_gap=end.gap, feasible=feasible, survival=None, damping=None, made=K,
-            measured=figures,
+            design=figures,
         )  # fmt: skip
 
 
