@@ -115,10 +115,9 @@ def by_ours(problem: Problem) -> tuple[float, float, str]:
 def floor(problem: Problem) -> float:
     """One ordered Schur form of the Hamiltonian: what every γ test has to do."""
     plant = problem.plant
-    A, B1, B2, C1, C2, d1, d2 = generalized_plant(
-        plant.A, plant.B, plant.C, problem.weights.scaled(plant.omega_0)
-    )
-    H0 = lqr_hamiltonian(A, B2, C1, d2, C2.shape[0], B2.shape[1])
+    gp = generalized_plant(plant.A, plant.B, plant.C, problem.weights.scaled(plant.omega_0))
+    _, B1, _, C1, _, d1, _ = gp
+    H0 = lqr_hamiltonian(gp)
     found = optimal_gamma(H0, B1, C1, d1, 0.5 * d1, 10.0, 1e-8, NOISE)[0]
     H = level_hamiltonian(H0, B1, C1, d1, (BACKOFF * found) ** 2 - d1**2)
     count = 20 if len(plant.A) < 100 else 1

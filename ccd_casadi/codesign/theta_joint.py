@@ -42,7 +42,6 @@ ROUNDS = 4  # last searches at most, while worse plants are found at their end
 AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
-FOLLOWING = 0.1  # of that reach, after a search on a reduced basis
 ENDINGS, KEPT = 12, 1e-5  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 1e-10  # of w2 ω_b
 
@@ -64,6 +63,7 @@ def joint_search(
         return sampler, first, True
     best, known = JointPoint(first.theta, first.kappa, first.bandwidth), [first.theta]
     reach, settled, working = REACH, False, WorkingSet(sampler)
+    bent = plant_of(problem).nearby is not None
     for turn in range(TURNS):
         models = nearby(problem, known, best.theta)
         within = LOOSE if turn else WITHIN
@@ -74,7 +74,7 @@ def joint_search(
             return sampler, first, False
         if not np.isfinite(J):
             break
-        make = partial(proposed, problem, models, best, reach)
+        make = partial(proposed, problem, models, best, reach, bent=bent)
         found = working.sampler.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
@@ -132,17 +132,13 @@ def finished_on_worse_plants(
     """The joint optimum near by with the worse plants found at it, the set that has these, and
     whether it is one of all of them: also where the last ones cost less of J than is promised at an
     end."""
-    best, has_basis = start, plant_of(working.sampler.problem).nearby is not None
-    looks, kinds = ((final, *AGAIN), (True, False)) if has_basis else ((final,), (False,))
+    best, bent = start, plant_of(working.sampler.problem).nearby is not None
+    looks = (final, *AGAIN) if bent else (final,)
     for _ in range(ROUNDS):
-        for bent in kinds:
-            best, J, near = finished(working.sampler, best, bent, tell)
-            true = nearby(working.sampler.problem, (), best.theta)
-            working, best, there = working.on_worse_plants(true, best, looks, WITHIN, tell)
-            if not there - J <= KEPT * abs(J):
-                working = working.reduced(true, best)
-                break
-        else:
+        best, J, near = finished(working.sampler, best, bent, tell)
+        before, true = working, nearby(working.sampler.problem, (), best.theta)
+        working, best, there = working.on_worse_plants(true, best, looks, WITHIN, tell)
+        if working is before or there - J <= KEPT * abs(J):
             return working, best, near
     return working, best, False
 
@@ -158,10 +154,7 @@ def finished(
     From what is known at one place after the other: so near that all rows meet which bind at a kink
     of ω_b*, as `theta_kkt` has to see it. With `bent` on reduced bases around these places, which
     go further; else on the plants to first order, exact there."""
-    problem = sampler.problem
-    reach = REACH if bent else CLOSE
-    if not bent and plant_of(problem).nearby is not None:
-        reach *= FOLLOWING
+    problem, reach = sampler.problem, REACH if bent else CLOSE
 
     def around(place: JointPoint) -> tuple[Evaluate, ...]:
         return nearby(problem, [place.theta] if bent else (), place.theta)

@@ -31,10 +31,12 @@ EQUAL = 1e-6  # ln: rows that differ by rounding, as of rigid bodies alike
 
 @dataclass(frozen=True)
 class WorkingSet:
-    """The sampler of the problem with the plants that count, and those that are aside."""
+    """The sampler of the problem with the plants that count, those that are aside, and those that
+    came back from there: they stay."""
 
     sampler: Sampler
     aside: tuple[Scenario, ...] = ()
+    back: frozenset[Scenario] = frozenset()
 
     def reduced(self, models: Sequence[Evaluate], at: JointPoint) -> "WorkingSet":
         """Without the plants that do not hold the controller there."""
@@ -52,12 +54,11 @@ class WorkingSet:
         rows = peaks.only(near[np.argsort(-peaks.value[near], kind="stable")])
         gains = np.column_stack([rows.curve, loops.gains_of(rows)]).tolist()
         kept = holding(loops.plants_of(rows), list(map(tuple, gains)), np.log(rows.v), rows.value)
-        if len(kept) == len(scenarios):
-            return self
+        kept |= {number for number, one in enumerate(scenarios) if one in self.back}
         counted = tuple(one for number, one in enumerate(scenarios) if number in kept)
         aside = (one for number, one in enumerate(scenarios) if number not in kept)
         changed = with_structured(problem, scenarios=counted)
-        return WorkingSet(self.sampler.of(changed), (*self.aside, *aside))
+        return WorkingSet(self.sampler.of(changed), (*self.aside, *aside), self.back)
 
     def on_worse_plants(
         self,
@@ -70,7 +71,7 @@ class WorkingSet:
         """With the plants on which the controller exceeds a bound, the controller adapted to them,
         and J there; `looks`: the searches for worse plants, one after the other, each elsewhere in
         the box."""
-        sampler, aside, J = self.sampler, self.aside, np.inf
+        sampler, aside, back, J = self.sampler, self.aside, self.back, np.inf
         for look in looks:
             problem, known = sampler.problem, [model(best.theta) for model in models]
             uncertain, kappa = uncertain_plant(problem, best.theta, known), np.array(best.kappa)
@@ -79,11 +80,13 @@ class WorkingSet:
             )[1]
             if scenarios:
                 sampler = with_scenarios(sampler, scenarios)
+                back |= set(aside) & set(scenarios)
                 aside = tuple(one for one in aside if one not in scenarios)
             best, J = JointModel(sampler.problem, models, best, 0.0).adapted()
             if not np.isfinite(J):
                 break
-        return (self if sampler is self.sampler else WorkingSet(sampler, aside)), best, J
+        working = self if sampler is self.sampler else WorkingSet(sampler, aside, back)
+        return working, best, J
 
 
 def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:

@@ -5,8 +5,9 @@ whole cache is dropped here when any source of this package is not the one it wa
 """
 
 import contextlib
-import os
 from pathlib import Path
+
+from surrogates.files import write_whole
 
 
 def sources() -> str:
@@ -27,9 +28,7 @@ def _drop_stale_cache() -> None:
         cache.mkdir(exist_ok=True)
         for file in (*cache.glob("*.nbi"), *cache.glob("*.nbc")):
             file.unlink(missing_ok=True)
-        draft = stamp.with_suffix(f".{os.getpid()}")
-        draft.write_text(now)
-        draft.replace(stamp)
+        write_whole(stamp, now)
 
 
 _drop_stale_cache()

@@ -52,9 +52,10 @@ def balancing(H):
 
 def in_coordinates(gp, τ):
     """The generalized plant with states x̂ = x/τ."""
-    A, B1, B2, C1, C2, d1, d2 = gp
     rows = τ.reshape(-1, 1)
-    return A * (τ / rows), B1 / rows, B2 / rows, C1 * τ, C2 * τ, d1, d2
+    return gp._replace(
+        A=gp.A * (τ / rows), B1=gp.B1 / rows, B2=gp.B2 / rows, C1=gp.C1 * τ, C2=gp.C2 * τ
+    )
 
 
 def rounding_noise(H0):

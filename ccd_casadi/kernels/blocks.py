@@ -64,21 +64,3 @@ def frobenius(M):
         for j in range(M.shape[1]):
             total += M[i, j] ** 2
     return np.sqrt(total)
-
-
-@compiled
-def ascending(x, count):
-    """The first `count` numbers of x in ascending order (Shell's sort)."""
-    out = x[:count].copy()
-    gap = 1
-    while gap < count:
-        gap = 3 * gap + 1
-    while gap > 1:
-        gap //= 3
-        for i in range(gap, count):
-            value, j = out[i], i
-            while j >= gap and out[j - gap] > value:
-                out[j] = out[j - gap]
-                j -= gap
-            out[j] = value
-    return out

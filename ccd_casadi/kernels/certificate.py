@@ -10,12 +10,12 @@ the spectral factor is used.
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import frobenius, place
+from ccd_casadi.kernels.blocks import add, frobenius, place
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import narrow, next_trial, promised, response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.sensitivity import axis_frequencies
-from ccd_casadi.kernels.small import add_real, invert, largest_singular, multiply
+from ccd_casadi.kernels.small import invert, largest_singular, multiply
 
 REFINED_FROM = 0.95  # of the largest gain on the grid: a peak this high is refined in any case
 REFINEMENTS = 40  # trials a peak; some six are used
@@ -37,7 +37,7 @@ def _stack(g, k, Dk, w, delta, ω):
         if delta > 0.0:
             return np.sqrt((W1 + (W2 + W3) * u2) * (1.0 + delta**2 * g2) / D2)
         return np.sqrt((W1 + W2 * u2 + W3 * T2) / D2)
-    k = add_real(k, Dk)
+    add(k, 0, 0, 1.0, Dk)
     L = multiply(g, k)
     M = L.copy()
     for i in range(p):
@@ -127,11 +127,8 @@ def level_test(G, K, Dk, w, delta, loop, level):
         return stack_gain(G, K, Dk, w, delta, 1.0) <= level
     # Between two neighbouring candidates the sign of gain - level cannot change.
     for i in range(n + 1):
-        if i == 0:
-            ω = 0.5 * candidates[0]
-        elif i == n:
-            ω = 2.0 * candidates[n - 1]
-        else:
+        ω = 0.5 * candidates[0] if i == 0 else 2.0 * candidates[n - 1]
+        if 0 < i < n:
             ω = np.sqrt(candidates[i - 1] * candidates[i])
         if not stack_gain(G, K, Dk, w, delta, ω) <= level:
             return False

@@ -30,6 +30,7 @@ from ccd_casadi.kernels import sources
 from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
+from surrogates.files import write_whole
 
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate", "rows", "curvature")
@@ -54,13 +55,12 @@ def compile_part(part: str) -> None:
     grid, none = np.geomspace(1e-2, 1e2, 41), np.zeros((1, 1))
     if part == "search":
         gp = generalized_plant(A, B, C, w)
-        A_, B1, B2, C1, _, d1, d2 = gp
-        H0 = riccati.lqr_hamiltonian(A_, B2, C1, d2, 1, 1)
+        H0 = riccati.lqr_hamiltonian(gp)
         squared_weights(w, 1.0)
         stable_subspace(H0)
         lyapunov_triangular(-np.eye(2), np.eye(2), False)
-        gamma.optimal_gamma(H0, B1, C1, d1, 0.6, 0.0, 1e-11, 1e-7)
-        synthesis.central_controller(*gp, H0, 10.0)
+        gamma.optimal_gamma(H0, gp.B1, gp.C1, gp.d1, 0.6, 0.0, 1e-11, 1e-7)
+        synthesis.central_controller(gp, H0, 10.0)
         row = synthesis.synthesise(A, B, C, w, grid, np.ones(41), 1.02, 0.0, False)[0]
         if row[0] != 0.0:
             raise SystemExit("the compiled kernels find no controller where there is one")
@@ -127,9 +127,7 @@ def ensure_compiled() -> None:
             return
         if done:
             with contextlib.suppress(OSError):
-                draft = stamp.with_suffix(f".{os.getpid()}")
-                draft.write_text(state)
-                draft.replace(stamp)
+                write_whole(stamp, state)
 
 
 def _compile(kernels: dict[str, Any], count: int) -> bool:

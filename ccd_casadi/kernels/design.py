@@ -4,7 +4,7 @@ from math import exp, isnan, log, nan
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import ascending, place
+from ccd_casadi.kernels.blocks import place
 from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import (
     loop_matrices,
@@ -44,7 +44,7 @@ def certificate_grid(wr, wi):
             half = min(abs(wr[i]), 0.5 * wi[i])
             grid[k], grid[k + 1], grid[k + 2] = wi[i] - half, wi[i], wi[i] + half
             k += 3
-    return ascending(grid, k)
+    return np.sort(grid[:k])
 
 
 @compiled
@@ -129,36 +129,28 @@ def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delt
     δ > 0 makes it the four-block problem of `disturbance`, which is solved whole. What fails is
     tried once more in balanced coordinates, whole, and then counts if it passes.
     """
-    plant = (A, B, C, w, delta)
-    channels = () if delta else channels
-    numbers = (grid, sigma, backoff, guess)
-    first = _attempt(plant, numbers, omega_low, channels, balanced=False)
-    if first[0][_CODE] in _PASSED:
-        return first
-    second = _attempt(plant, numbers, omega_low, (), balanced=True)
-    return second if second[0][_CODE] in _PASSED else first
+    first = None
+    for balanced in (False, True):
+        try:
+            if channels and not (balanced or delta):
+                made = _synthesise_channels(A, B, C, w, channels, backoff, guess)
+            else:
+                made = synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta)
+            row, Ak, Bk, Ck = made
+            row[_BALANCED] = balanced
+            if row[_CODE] == 0.0:
+                Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
+                gamma = backoff * row[_GAMMA_OPT]
+                judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
+        except np.linalg.LinAlgError:  # an infinite or undefined number on the way
+            made = failed_row(), *[np.full((1, 1), nan)] * 3
+        if made[0][_CODE] in _PASSED:
+            return made
+        first = first or made
+    return first
 
 
 _PASSED = (Code.CERTIFIED, Code.NO_BANDWIDTH)  # the certificate holds; no crossing in the second
-
-
-def _attempt(plant, numbers, omega_low, channels, balanced):
-    A, B, C, w, delta = plant
-    grid, sigma, backoff, guess = numbers
-    try:
-        if channels:
-            row, Ak, Bk, Ck = _synthesise_channels(A, B, C, w, channels, backoff, guess)
-        else:
-            row, Ak, Bk, Ck = synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta)
-        row[_BALANCED] = balanced
-        if row[_CODE] == 0.0:
-            Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
-            gamma = backoff * row[_GAMMA_OPT]
-            judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
-    except np.linalg.LinAlgError:  # an infinite or undefined number on the way
-        none = np.full((1, 1), nan)
-        return failed_row(), none, none, none
-    return row, Ak, Bk, Ck
 
 
 def failed_row():
@@ -186,8 +178,7 @@ def _synthesise_channels(A, B, C, w, channels, backoff, guess):
         gain = found[i][3]
         if i != top:
             gp = generalized_plant(c.A, c.B, c.C, w)
-            H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], c.C.shape[0], c.B.shape[1])
-            gain, ok = central_controller(*gp, H0, backoff * row[_GAMMA_OPT])[2:]
+            gain, ok = central_controller(gp, lqr_hamiltonian(gp), backoff * row[_GAMMA_OPT])[2:]
             if not ok:
                 row[Column.CODE] = Code.RICCATI_FAILED.value
         # filters turn with the signals that they see

@@ -20,7 +20,7 @@ import numpy as np
 
 from ccd_casadi.kernels.bound_peak import bound_terms
 from ccd_casadi.kernels.frequency import prepare, responses
-from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
+from ccd_casadi.kernels.generalized_plant import MixedPlant, first_order_weights, squared_weights
 from ccd_casadi.kernels.lapack import stable_subspace
 
 EDGE = 0.95  # squared: a peak of the bound below this share of the highest is not refined
@@ -56,7 +56,7 @@ def four_block_plant(A, B, C, w, delta):
 
 
 def innovations_plant(A, B, C, w, Y):
-    """A, B1, B2, C1, C2, d1, d of the equivalent problem; states as in `four_block_plant`.
+    """The plant of the equivalent problem; states as in `four_block_plant`.
 
     z = [W1 e; (d2 z2 + d3 z3)/d; (d2 z3 - d3 z2)/d] with d² = d2² + d3²: turned so that the
     feedthrough of u is [0; d I; 0], as the kernels of the first kind take it.
@@ -68,7 +68,7 @@ def innovations_plant(A, B, C, w, Y):
     d2, d3 = D12[p, 0], D12[p + m, 0]
     d = np.hypot(d2, d3)
     C1[p:] = np.kron(np.array([[d2, d3], [-d3, d2]]) / d, np.eye(m)) @ C1[p:]
-    return Ag, B1, B2, C1, C2, float(D11[0, 0]), float(d)
+    return MixedPlant(Ag, B1, B2, C1, C2, float(D11[0, 0]), float(d))
 
 
 # ---- what no controller passes ------------------------------------------------------------------

@@ -6,10 +6,24 @@ paper's equations (4) to (6); a weight vector is (M_S, A_S, ω_S, c_K, ω_K, A_l
 frequencies over the plant's ω₀, M_K absorbed in the unit of force.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from ccd_casadi.kernels.blocks import place
 from ccd_casadi.kernels.compiled import compiled
+
+
+class MixedPlant(NamedTuple):
+    """ẋ = A x + B1 w + B2 u, z = C1 x + [d1 w; 0; 0] + [0; d2 u; 0], e = C2 x + w."""
+
+    A: Any
+    B1: Any
+    B2: Any
+    C1: Any
+    C2: Any
+    d1: Any
+    d2: Any
 
 
 @compiled
@@ -35,10 +49,7 @@ def first_order_weights(w):
 
 @compiled
 def generalized_plant(A, B, C, w):
-    """A, B1, B2, C1, C2, d1, d2 of the generalized plant; D11 = [d1 I;0;0], D12 = [0;d2 I;0].
-
-    A (n, n), B (n, m), C (p, n) is the plant; the order is N = n + 2p + m.
-    """
+    """That of A (n, n), B (n, m), C (p, n), of the order N = n + 2p + m."""
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     f = first_order_weights(w)
     N = n + 2 * p + m
@@ -62,7 +73,7 @@ def generalized_plant(A, B, C, w):
         Ag[i2 + i, i2 + i] = -f[1, 0]
         B2[i2 + i, i] = f[1, 1]
         C1[p + i, i2 + i] = f[1, 2]
-    return Ag, B1, B2, C1, C2, f[0, 3], f[1, 3]
+    return MixedPlant(Ag, B1, B2, C1, C2, f[0, 3], f[1, 3])
 
 
 @compiled

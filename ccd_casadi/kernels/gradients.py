@@ -284,5 +284,4 @@ def _posed(made_for):
         gp, back = innovations_plant(A, B, C, w, Y), FourBlockPullback(A, B, C, w, Y, delta)
     else:
         gp, back = generalized_plant(A, B, C, w), MixedPullback(A, B, C, w)
-    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
-    return gp, H0, back
+    return gp, lqr_hamiltonian(gp), back

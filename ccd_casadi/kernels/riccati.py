@@ -27,9 +27,10 @@ NOISE = 1e-7  # |λ(X)| below which its sign may be rounding: see `riccati_level
 
 
 @compiled
-def lqr_hamiltonian(A, B2, C1, d2, p, m):
+def lqr_hamiltonian(gp):
     """H0 = [[Ã, -B2 B2ᵀ/d2²], [-Q̃, -Ãᵀ]], the Hamiltonian at γ = ∞ (2N x 2N)."""
-    N = A.shape[0]
+    A, _, B2, C1, C2, _, d2 = gp
+    N, p, m = A.shape[0], C2.shape[0], B2.shape[1]
     S2 = np.empty((m, N))
     place(S2, 0, 0, d2, C1[p : p + m])
     BS, BB, SS, CC = B2 @ S2, B2 @ transposed(B2), transposed(S2) @ S2, transposed(C1) @ C1

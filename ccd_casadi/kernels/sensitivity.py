@@ -8,11 +8,11 @@ Bruinsma & Steinbuch 1990.) Frequencies are in the units of A.
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import add, ascending, place, place_transposed, transposed
+from ccd_casadi.kernels.blocks import add, place, place_transposed, transposed
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import response, response_and_slope, responses
 from ccd_casadi.kernels.lapack import eigenvalues
-from ccd_casadi.kernels.small import add_real, invert, largest_singular, multiply
+from ccd_casadi.kernels.small import invert, largest_singular, multiply
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 
@@ -50,7 +50,7 @@ def axis_frequencies(A, B, C, D, level):
         if wi[i] > 0.0 and abs(wr[i]) <= 1e-3 * np.hypot(wr[i], wi[i]):
             found[count] = wi[i]
             count += 1
-    return ascending(found, count), info
+    return np.sort(found[:count]), info
 
 
 @compiled
@@ -62,7 +62,8 @@ def _gain(g, k, Dk):
         for i in range(k.shape[0]):
             T += g[0, i] * (k[i, 0] + Dk[i, 0])
         return 1.0 / abs(T)
-    L = multiply(g, add_real(k, Dk))
+    add(k, 0, 0, 1.0, Dk)
+    L = multiply(g, k)
     for i in range(p):
         L[i, i] += 1.0
     return largest_singular(invert(L))
@@ -89,7 +90,7 @@ def sensitivity_slope(G, K, Dk, ω):
     """σ_max(S(jω)) and dσ_max/dω = Re(u* (dS/dω) v), dS/dω = -S (G'K + GK') S."""
     g, dg = response_and_slope(G, ω)
     k, dk = response_and_slope(K, ω)
-    k = add_real(k, Dk)
+    add(k, 0, 0, 1.0, Dk)
     L, dgk, gdk = multiply(g, k), multiply(dg, k), multiply(g, dk)
     p = L.shape[0]
     if p == 1:
@@ -228,13 +229,8 @@ def peak(G, K, Dk, As, Bs, Cs, poles_re, poles_im):
             return best, at, False
         higher, where = best * (1.0 + 1e-9), 0.0
         for i in range(candidates.size):
-            for j in range(2):
-                if j == 0:
-                    ω = candidates[i]
-                elif i + 1 < candidates.size:
-                    ω = np.sqrt(candidates[i] * candidates[i + 1])
-                else:
-                    continue
+            for j in range(i, min(i + 2, candidates.size)):  # itself, and between it and the next
+                ω = candidates[i] if j == i else np.sqrt(candidates[i] * candidates[j])
                 gain = sensitivity_gain(G, K, Dk, ω)
                 if gain > higher:
                     higher, where = gain, ω

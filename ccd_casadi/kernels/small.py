@@ -21,16 +21,6 @@ def multiply(A, B):
 
 
 @compiled
-def add_real(Z, D):
-    """Z + D of a complex and a real matrix."""
-    out = Z.copy()
-    for i in range(Z.shape[0]):
-        for j in range(Z.shape[1]):
-            out[i, j] += D[i, j]
-    return out
-
-
-@compiled
 def invert(A):
     """A⁻¹ by Gauss-Jordan elimination with row exchanges; infinite where A is singular."""
     n = A.shape[0]

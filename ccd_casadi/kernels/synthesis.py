@@ -19,8 +19,9 @@ ENOUGH = 1e-8  # relative error of γ_opt above which it is looked for in balanc
 
 
 @compiled
-def central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, gamma):
+def central_controller(gp, H0, gamma):
     """A_K = A + B2 F - B1 C2, B_K = B1, C_K = F, F = -(B2ᵀX + D12ᵀC1)/d2², X at γ; and ok."""
+    Ag, B1, B2, C1, C2, d1, d2 = gp
     p, m = C2.shape[0], B2.shape[1]
     t = gamma**2 - d1**2
     _, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
@@ -41,14 +42,13 @@ def central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, gamma):
 def _search_and_control(gp, H0, bound, backoff, guess, noise):
     """γ_opt, never below `bound`, and the central controller at backoff·γ_opt: the row, K."""
     row = np.full(_COUNT, np.nan)
-    Ag, B1, B2, C1, C2, d1, d2 = gp
     gamma_opt, limited, forms, converged, error = optimal_gamma(
-        H0, B1, C1, d1, bound, guess, GAMMA_TOLERANCE, noise
+        H0, gp.B1, gp.C1, gp.d1, bound, guess, GAMMA_TOLERANCE, noise
     )
     row[Column.GAMMA_OPT], row[Column.GAMMA_LOWER_BOUND] = gamma_opt, bound
     row[Column.LIMITED_BY_BOUND], row[Column.SCHUR_FORMS] = limited, forms
     row[Column.GAMMA_ERROR] = error
-    Ak, Bk, Ck, ok = central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, backoff * gamma_opt)
+    Ak, Bk, Ck, ok = central_controller(gp, H0, backoff * gamma_opt)
     row[Column.CODE] = Code.CERTIFIED.value
     if not ok:
         row[Column.CODE] = Code.RICCATI_FAILED.value
@@ -58,14 +58,13 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
 
 
 @compiled
-def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
-    gp = generalized_plant(A, B, C, w)
-    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
+def _mixed(A, B, C, w, grid, sigma):
+    """The generalized plant of mixed sensitivity and γ_jω."""
     bound = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[0]
-    return _search_and_control(gp, H0, bound, backoff, guess, NOISE)
+    return generalized_plant(A, B, C, w), bound
 
 
-# What follows is plain NumPy: few designs come to it.
+# What follows is plain NumPy around these.
 
 
 def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
@@ -75,47 +74,25 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
     in balanced coordinates, with the noise of rounding measured; the controller is in the
     plant's own ones always. δ > 0 is the four-block problem of `disturbance`.
     """
-    posed = None
-    if balanced or delta:
-        posed = _posed(A, B, C, w, grid, sigma, delta)
-        if posed is None:
-            row = np.full(_COUNT, np.nan)
+    if delta == 0.0:
+        gp, bound = _mixed(A, B, C, w, grid, sigma)
+    else:
+        Y, ok = filter_solution(A, B, C, delta)
+        if not ok:
+            row, none = np.full(_COUNT, np.nan), np.full((1, 1), np.nan)
             row[Column.CODE], row[Column.LIMITED_BY_BOUND] = float(Code.FILTER_FAILED), 0.0
-            none = np.full((1, 1), np.nan)
             return row, none, none, none
+        gp, bound = innovations_plant(A, B, C, w, Y), disturbance_bound(A, B, C, w, delta, grid)[0]
     if balanced:
-        gp, bound = posed
         gp, H0, τ = _balanced(gp, bound)
         with np.errstate(all="ignore"):  # an undefined number is seen in the result
-            noise = rounding_noise(H0)
-            row, *K = _search_and_control(gp, H0, bound, backoff, guess, noise)
-            K = _in_own_coordinates(*K, τ)
-    else:
-        if delta:
-            gp, bound = posed
-            row, *K = _search_and_control(gp, _hamiltonian(gp), bound, backoff, guess, NOISE)
-        else:
-            row, *K = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
-        closed = row[Column.CODE] != Code.GAMMA_NOT_CONVERGED
-        if closed and ENOUGH < row[Column.GAMMA_ERROR] < np.inf:
-            gp, bound = posed or _posed(A, B, C, w, grid, sigma, delta)
-            row, *K = _with_a_better_optimum(row, K, gp, bound, backoff)
+            row, *K = _search_and_control(gp, H0, bound, backoff, guess, rounding_noise(H0))
+            return row, *_in_own_coordinates(*K, τ)
+    row, *K = _search_and_control(gp, lqr_hamiltonian(gp), bound, backoff, guess, NOISE)
+    closed = row[Column.CODE] != Code.GAMMA_NOT_CONVERGED
+    if closed and ENOUGH < row[Column.GAMMA_ERROR] < np.inf:
+        return _with_a_better_optimum(row, K, gp, bound, backoff)
     return row, *K
-
-
-def _posed(A, B, C, w, grid, sigma, delta):
-    """The generalized plant and γ_jω; None where the filter has no solution."""
-    if delta == 0.0:
-        bound = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[0]
-        return generalized_plant(A, B, C, w), bound
-    Y, ok = filter_solution(A, B, C, delta)
-    if not ok:
-        return None
-    return innovations_plant(A, B, C, w, Y), disturbance_bound(A, B, C, w, delta, grid)[0]
-
-
-def _hamiltonian(gp):
-    return lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], gp[4].shape[0], gp[2].shape[1])
 
 
 def _in_own_coordinates(Ak, Bk, Ck, τ):
@@ -126,11 +103,11 @@ def _in_own_coordinates(Ak, Bk, Ck, τ):
 
 def _balanced(gp, bound):
     """The generalized plant and H0 in balanced coordinates, and τ."""
-    t = max((1.3 * bound) ** 2 - gp[5] ** 2, 1e-12)  # where the search begins
+    t = max((1.3 * bound) ** 2 - gp.d1**2, 1e-12)  # where the search begins
     with np.errstate(all="ignore"):
-        τ = balancing(level_hamiltonian(_hamiltonian(gp), gp[1], gp[3], gp[5], t))
+        τ = balancing(level_hamiltonian(lqr_hamiltonian(gp), gp.B1, gp.C1, gp.d1, t))
         gp = in_coordinates(gp, τ)
-    return gp, _hamiltonian(gp), τ
+    return gp, lqr_hamiltonian(gp), τ
 
 
 def _with_a_better_optimum(row, K, gp, bound, backoff):
@@ -138,7 +115,7 @@ def _with_a_better_optimum(row, K, gp, bound, backoff):
     gp, H0, τ = _balanced(gp, bound)
     gamma_opt, error = float(row[Column.GAMMA_OPT]), float(row[Column.GAMMA_ERROR])
     again, at_bound, more, closed, left = optimal_gamma(
-        H0, gp[1], gp[3], gp[5], bound, gamma_opt, GAMMA_TOLERANCE, NOISE
+        H0, gp.B1, gp.C1, gp.d1, bound, gamma_opt, GAMMA_TOLERANCE, NOISE
     )
     row[Column.SCHUR_FORMS] += more
     # only what both agree on within their errors is the same optimum
@@ -146,6 +123,6 @@ def _with_a_better_optimum(row, K, gp, bound, backoff):
         return row, *K
     row[Column.GAMMA_OPT], row[Column.GAMMA_ERROR] = again, left
     row[Column.LIMITED_BY_BOUND] = at_bound
-    *K, ok = central_controller(*gp, H0, backoff * again)
+    *K, ok = central_controller(gp, H0, backoff * again)
     row[Column.CODE] = float(Code.CERTIFIED if ok else Code.RICCATI_FAILED)
     return row, *_in_own_coordinates(*K, τ)

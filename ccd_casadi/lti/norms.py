@@ -26,12 +26,9 @@ def gains(system: StateSpace, omega: Array) -> Array:
         part = finite[first : first + size]
         try:
             out[part] = _gains(system, omega[part])
-        except np.linalg.LinAlgError:  # of some of them: one by one
-            for i in part:
-                try:
-                    out[i] = _gains(system, omega[i : i + 1])[0]
-                except np.linalg.LinAlgError:
-                    out[i] = np.inf
+        except np.linalg.LinAlgError:  # of some of them
+            single = len(part) == 1
+            out[part] = np.inf if single else [gains(system, omega[[i]])[0] for i in part]
     return out
 
 

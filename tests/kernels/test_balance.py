@@ -170,5 +170,5 @@ def test_noise_is_what_rounding_leaves_of_a_positive_matrix() -> None:
     for item in LOST:
         A, B, C, w, *_ = arguments(item)
         gp = generalized_plant(A, B, C, w)
-        noise = rounding_noise(lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], len(C), B.shape[1]))
+        noise = rounding_noise(lqr_hamiltonian(gp))
         assert NOISE <= noise < 1e-2

@@ -80,10 +80,10 @@ def test_the_search_for_gamma_takes_few_schur_forms() -> None:
 def level():  # type: ignore[no-untyped-def]
     """`riccati_level` of a design as a function of t, t at γ_opt, and what `root_nearby` takes."""
     plant = two_mass(58.0, 63.0)
-    _, B1, B2, C1, _, d1, d2 = gp = generalized_plant(
+    _, B1, _, C1, _, d1, _ = gp = generalized_plant(
         plant.A, plant.B, plant.C, WEIGHTS.scaled(plant.omega_0)
     )
-    H0 = riccati.lqr_hamiltonian(gp[0], B2, C1, d2, 1, 1)
+    H0 = riccati.lqr_hamiltonian(gp)
     gamma = synthesise(plant, WEIGHTS, omega_low=OMEGA_LOW).figures.gamma_opt
 
     def at(t: float):  # type: ignore[no-untyped-def]
@@ -128,7 +128,7 @@ def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> 
     case = flexible_case(seed)
     plant, w = case.plant, case.weights.scaled(case.plant.omega_0)
     gp = generalized_plant(plant.A, plant.B, plant.C, w)
-    H0 = riccati.lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], 3, 3)
+    H0 = riccati.lqr_hamiltonian(gp)
     gamma = synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures.gamma_opt
     top = gamma**2 - gp[5] ** 2
     for off in (-0.1, -0.03, 0.03, 0.1):
@@ -143,8 +143,8 @@ def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
     """The spread of the root over random changes of H, against what `rounding_error` foretells."""
     case = flexible_case(seed)
     plant, w = case.plant, case.weights.scaled(case.plant.omega_0)
-    _, B1, B2, C1, _, d1, d2 = gp = generalized_plant(plant.A, plant.B, plant.C, w)
-    H0 = riccati.lqr_hamiltonian(gp[0], B2, C1, d2, 3, 3)
+    _, B1, _, C1, _, d1, _ = gp = generalized_plant(plant.A, plant.B, plant.C, w)
+    H0 = riccati.lqr_hamiltonian(gp)
     level = synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures.gamma_opt
     t = level**2 - d1**2
 
@@ -170,7 +170,7 @@ def test_gamma_that_rounding_would_spoil_is_found_in_balanced_coordinates(seed: 
     plant = flexible_case(seed).plant
     w = PAPER.at(0.1 * plant.omega_0, 10.0**-0.5 * plant.omega_0).scaled(plant.omega_0)
     gp = generalized_plant(plant.A, plant.B, plant.C, w)
-    H0 = riccati.lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], 3, 3)
+    H0 = riccati.lqr_hamiltonian(gp)
     data = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain, 1.02)
     row = kernel(*data, 0.0, False)[0]
     bound, tolerance = row[design.Column.GAMMA_LOWER_BOUND], 1e-11

@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ccd_casadi.case_studies.rib_stage import reduced
 from ccd_casadi.case_studies.rib_stage.geometry import Geometry, PointMass
 from ccd_casadi.case_studies.rib_stage.mesh import COARSE
 from ccd_casadi.case_studies.rib_stage.model import RibStage
 from ccd_casadi.case_studies.rib_stage.plant import plant_of_stage
+from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, faded
 from ccd_casadi.plants.plant import Mechanics, nearby_model
 from ccd_casadi.support.arrays import Array
 
@@ -18,6 +21,7 @@ HERE = np.array([1.2e-3, 3.3e-3, 5e-3, 5e-3, 14e-3, 74e-3])
 STEP = np.array([1e-4, 1e-4, 3e-4, -3e-4, 8e-4, 8e-4])
 BARE = RibStage(order=COARSE)
 LOADED = replace(BARE, geometry=Geometry(point_masses=(PointMass(0.03, 0.0, 0.05),)))
+FADING = replace(LOADED, fading=2)
 
 
 def reduced_at(stage: RibStage, known: Sequence[Array], theta: Array) -> Mechanics:
@@ -36,7 +40,7 @@ def strengths(system: Mechanics) -> Array:
     return np.asarray(system.C.T[:, :, None] * system.B[:, None, :])
 
 
-@pytest.mark.parametrize(("stage", "within"), [(BARE, 1e-7), (LOADED, 1e-3)])
+@pytest.mark.parametrize(("stage", "within"), [(BARE, 1e-7), (LOADED, 1e-3), (FADING, 1e-3)])
 def test_at_a_known_theta_it_has_the_modes_of_the_elements(stage: RibStage, within: float) -> None:
     known = [HERE, HERE + STEP]
     for theta in known:
@@ -44,6 +48,19 @@ def test_at_a_known_theta_it_has_the_modes_of_the_elements(stage: RibStage, with
         np.testing.assert_allclose(frequencies(told), frequencies(true), rtol=within)
         size = np.abs(strengths(true)).max()
         np.testing.assert_allclose(strengths(told), strengths(true), atol=10.0 * within * size)
+
+
+@pytest.mark.parametrize(
+    "stage", [BARE, replace(BARE, modes=TWENTY), replace(LOADED, modes=TWENTY), FADING]
+)
+def test_at_a_known_theta_displacements_move_as_those_of_the_elements(stage: RibStage) -> None:
+    """A search on a basis ends elsewhere where its slopes are not the elements'."""
+    told, true = reduced_at(stage, [HERE], HERE), stage.mechanics(tuple(HERE))
+    signs = np.sign(np.einsum("im,im->i", told.B, true.B))
+    seen = np.abs(true.B).max(1) > 1e-6 * np.abs(true.B).max()  # what corners neither drive nor see
+    moved = np.tensordot(STEP, true.derivatives[3], 1)[seen]
+    found = (signs[:, None] * np.tensordot(STEP, told.derivatives[3], 1))[seen]
+    np.testing.assert_allclose(found, moved, atol=5e-3 * np.abs(moved).max())
 
 
 def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
@@ -61,7 +78,7 @@ def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
     assert np.abs(frequencies(more) / true - 1.0).max() < 0.1 * missed(0.5)
 
 
-@pytest.mark.parametrize("stage", [BARE, LOADED])
+@pytest.mark.parametrize("stage", [BARE, LOADED, FADING])
 def test_its_derivatives_are_those_of_the_small_problem(stage: RibStage) -> None:
     known = [HERE, HERE + STEP, HERE - STEP]
     here, e = HERE + 0.3 * STEP, 1e-4
@@ -74,8 +91,43 @@ def test_its_derivatives_are_those_of_the_small_problem(stage: RibStage) -> None
     slope = dC.T[:, :, None] * told.B[:, None, :] + told.C.T[:, :, None] * dB[:, None, :]
     moved = (strengths(up) - strengths(down)) / (2.0 * e)
     # What masses bend of higher modes turns with θ; its slope is that of modes that stay.
-    within = 0.1 if stage is LOADED else 1e-4
+    within = 1e-4 if stage is BARE else 0.1
     np.testing.assert_allclose(slope, moved, atol=within * np.abs(moved).max())
+
+
+@given(st.lists(st.floats(1.0, 5.0), min_size=5, max_size=8), st.integers(1, 3))
+def test_what_fades_is_whole_at_one_end_and_gone_at_the_other(
+    steps: list[float], fading: int
+) -> None:
+    values, rates = np.cumsum(steps), np.array(steps[::-1])[None]
+    full = len(values) - 1 - fading
+    w, dw = faded(values, rates, full)
+    assert (w[:full] == 1.0).all()
+    assert (dw[:, :full] == 0.0).all()
+    assert (np.diff(w) <= 0.0).all()
+    assert (w > 0.0).all()
+    up, down = (faded(values + s * 1e-6 * rates[0], rates, full)[0] for s in (1.0, -1.0))
+    np.testing.assert_allclose(dw[0], (up - down) / 2e-6, atol=1e-8)
+    # The next one takes the place of the last one that counts whole, and one that is gone comes.
+    meet = np.insert(values, full, values[full - 1])[: len(values)]
+    assert faded(meet, np.zeros((1, len(meet))), full)[0][full] == 1.0
+
+
+def test_with_fading_modes_an_answer_moves_without_a_jump() -> None:
+    """Where the ribs move, the twentieth mode and the next meet and change their shapes."""
+    along = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0 * STEP[5]])
+    way = [HERE + share * along for share in np.linspace(0.35, 0.6, 16)]
+
+    def jump(stage: RibStage) -> float:
+        """The largest step of what a static force bends of the flexible modes."""
+        static = []
+        for theta in way:
+            found = reduced_at(stage, [HERE], theta)
+            B, lam = found.B[3:], np.diag(found.K)[3:]
+            static.append(B.T @ (B / lam[:, None]))
+        return float(np.abs(np.diff(static, axis=0)).max())
+
+    assert jump(replace(FADING, modes=TWENTY)) < 0.3 * jump(replace(LOADED, modes=TWENTY))
 
 
 def test_a_plant_evaluates_it_in_its_own_order_of_parameters() -> None:

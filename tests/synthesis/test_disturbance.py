@@ -107,7 +107,7 @@ def test_one_riccati_equation_stands_for_two_and_their_coupling(seed: int, p: in
     assert np.abs(residual).max() <= 1e-9 * max(1.0, np.abs(Y).max()) ** 2
     assert np.linalg.eigvalsh(Y).min() >= -1e-10 * np.abs(Y).max()
     gp = innovations_plant(A, B, C, w, Y)
-    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, p)
+    H0 = lqr_hamiltonian(gp)
     figures = made(plant, weights).figures
     standard, n = mixed_sensitivity(plant, weights), len(A)
     N = len(standard.A)

@@ -8,11 +8,17 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.case_studies.rib_stage import geometry as shape
-from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point, has_square_symmetry
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
 from ccd_casadi.case_studies.rib_stage.modes import Discretisation, discretise, functionals, slopes
 from ccd_casadi.case_studies.rib_stage.rigid import RIGID_NAMES, rigid_fields, rigid_values
-from ccd_casadi.case_studies.rib_stage.truncation import Mode, ModeCount, ModeSet, solve_modes
+from ccd_casadi.case_studies.rib_stage.truncation import (
+    Mode,
+    ModeCount,
+    ModeSet,
+    faded,
+    solve_modes,
+)
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
@@ -34,7 +40,9 @@ class RibStage:
     keeps that alone and the modes that it moves, of a stage whose point masses leave it apart.
     `truncation`: "symmetry" keeps `modes` of each symmetry, so that crossing frequencies do not
     make the model jump; "frequency" keeps as many of the lowest of all. A stage whose point
-    masses break the square has no symmetries and is truncated by frequency.
+    masses break the square has no symmetries and is truncated by frequency. `fading` modes more of
+    each of its groups count in part, see `truncation.faded`: the plant does not jump where the last
+    one kept and the next, whose shapes the masses couple, nearly meet.
     """
 
     geometry: Geometry = field(default_factory=Geometry)
@@ -44,6 +52,7 @@ class RibStage:
     outputs: str = "corners"
     modes: ModeCount = field(default_factory=ModeCount)
     truncation: str = "symmetry"
+    fading: int = 0
     damping_ratio: float = 0.01
 
     def __post_init__(self) -> None:
@@ -51,6 +60,8 @@ class RibStage:
             raise StageError(f"outputs is {self.outputs!r}; give one of {', '.join(OUTPUTS)}")
         if self.truncation not in ("symmetry", "frequency"):
             raise StageError(f"truncation is {self.truncation!r}; give symmetry or frequency")
+        if self.fading and (has_square_symmetry(self.geometry) or self.truncation != "symmetry"):
+            raise StageError("fading is for point masses that break the square; leave it out")
         for points in (self.actuator_points, self.sensor_points):
             if max(abs(v) for p in points for v in p) > 0.5 * self.geometry.side * (1 + 1e-12):
                 raise StageError("an actuator or a sensor is off the stage; move it inside")
@@ -125,13 +136,14 @@ def discretisation(stage: RibStage) -> Discretisation:
 
 def modes_at(stage: RibStage, theta: tuple[float, ...]) -> ModeSet:
     """The spectra at θ, whatever actuators, sensors and outputs it has; the last are kept."""
-    key = (stage.order, stage.geometry, stage.modes, stage.truncation, theta)
+    key = (stage.order, stage.geometry, stage.modes, stage.truncation, stage.fading, theta)
     if key not in _spectra:
         _spectra.clear()  # factorisations are large: they go before others are made
         by_frequency = stage.truncation == "frequency"
         _spectra[key] = solve_modes(
-            discretisation(stage), stage.geometry, np.array(theta), stage.modes, by_frequency
-        )
+            discretisation(stage), stage.geometry, np.array(theta), stage.modes, by_frequency,
+            stage.fading,
+        )  # fmt: skip
     return _spectra[key]
 
 
@@ -225,15 +237,22 @@ def _displacements(
         seen = [slice(k * len(points), (k + 1) * len(points)) for k in range(len(made))]
         for row, mode in own:
             u[row] = F[:, seen[mode.image]].T @ item.vectors[:, mode.place]
-        if not derivatives:
-            return
-        dF = np.concatenate([steps[:, :, 2] for _, steps in made], axis=2)
-        modes_dK, modes_du = slopes(disc, stage.geometry, item, keep, F, dF)
-        for row, mode in own:
-            du[:, row] = modes_du[:, seen[mode.image], mode.place]
-            for column, other in own:
-                if other.image == mode.image:
-                    dK[:, row, column] = modes_dK[:, mode.place, other.place]
+        next_one = keep + bool(stage.fading)
+        modes_dK = np.zeros((0, next_one, next_one))
+        if derivatives:
+            dF = np.concatenate([steps[:, :, 2] for _, steps in made], axis=2)
+            modes_dK, modes_du = slopes(disc, stage.geometry, item, next_one, F, dF)
+            for row, mode in own:
+                du[:, row] = modes_du[:, seen[mode.image], mode.place]
+                for column, other in own:
+                    if other.image == mode.image:
+                        dK[:, row, column] = modes_dK[:, mode.place, other.place]
+        if stage.fading:
+            lam = np.diagonal(modes_dK, 0, 1, 2)
+            w, dw = faded(item.values[:next_one], lam, keep - stage.fading)
+            for row, mode in own:
+                du[:, row] = w[mode.place] * du[:, row] + dw[:, mode.place, None] * u[row]
+                u[row] *= w[mode.place]
 
     kept = [index for index in range(len(found.spectra)) if found.kept(index)]
     side_by_side(fill, kept[::-1])  # the last one, of the tilts, takes longest

@@ -163,7 +163,7 @@ def slopes(
     """
     lam, V = found.values, found.vectors
     rigid, kept = found.rigid, V[:, :keep]
-    Q, R = _compress(F)
+    Q, R = compressed(F)
     resolvent = build_resolvent(found.pencil, np.hstack([rigid, V]), Q, lam[keep - 1])
     close = np.abs(lam[:keep, None] - lam[None, :]) <= CLUSTER * lam[None, :]
     adjoint = []
@@ -186,7 +186,7 @@ def slopes(
     return out_K, dU
 
 
-def _compress(F: Array) -> tuple[Array, Array]:
+def compressed(F: Array) -> tuple[Array, Array]:
     """F = Q R with as few columns as F has directions: corners differ by signs only."""
     Q, R, pivot = qr(F, mode="economic", pivoting=True)
     size = np.abs(np.diag(R))

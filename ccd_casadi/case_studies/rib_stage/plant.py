@@ -21,6 +21,7 @@ from ccd_casadi.plants.registry import Model
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
 MODES = {10: ModeCount(), 20: TWENTY, 44: FORTY_FOUR}
+MOST_FADING = 8
 Points = Sequence[Sequence[float]]
 
 
@@ -30,6 +31,7 @@ def rib_stage(
     outputs: str = "corners",
     mesh: str = "shipped",
     modes: int = 10,
+    fading: int = 0,
     side: float = 0.3,
     young: float = 68.9e9,
     poisson: float = 0.33,
@@ -43,8 +45,9 @@ def rib_stage(
 
     `actuators` and `sensors` are points [x, y] of the lower face in m (none: the corners),
     `point_masses` are [x, y, mass] in m and kg. Hardware cost: mass in kg; λ: the bays.
-    `modes` flexible ones are kept, 10, 20 or 44. References: the same stage on a finer mesh and
-    with 20 flexible modes, so far as it is not that itself.
+    `modes` flexible ones are kept, 10, 20 or 44, and `fading` more of each group that
+    point masses leave apart, in part. References: the same stage on a finer mesh and with 20
+    flexible modes, so far as it is not that itself.
     """
     if sorted(names) != sorted(NAMES):
         raise StageError(f"rib_stage has the parameters {', '.join(NAMES)}; give all of them")
@@ -52,6 +55,8 @@ def rib_stage(
         raise StageError(f"mesh is {mesh!r}; choose one of {', '.join(MESHES)}")
     if modes not in MODES:
         raise StageError(f"modes is {modes!r}; choose 10, 20 or 44")
+    if fading not in range(MOST_FADING + 1):
+        raise StageError(f"fading is {fading!r}; give a whole number from 0 to {MOST_FADING}")
     geometry = Geometry(
         side=side,
         material=Material(young, poisson, density),
@@ -65,6 +70,7 @@ def rib_stage(
         sensors=_points(sensors),
         outputs=outputs,
         modes=MODES[modes],
+        fading=fading,
         damping_ratio=zeta,
     )
     return plant_of_stage(stage, names)

@@ -1,7 +1,8 @@
 """The stage near θ that are known, by a reduced basis: Rayleigh and Ritz in what the modes span.
 
 A basis V of a symmetry holds its modes φ at some θ, what they move by, (K + σM)⁻¹(∂K - λ ∂M)φ, the
-rigid motions at every θ, and what forces at the point masses bend. In it
+rigid motions at every θ, and what forces at actuators, sensors and point masses bend: what a mode's
+move lacks in V counts with what these forces' answer lacks in it. In it
 
     Vᵀ K(θ) V = Σ c_q(θ) Vᵀ K_q V,   Vᵀ M(θ) V likewise,
 
@@ -32,11 +33,11 @@ from ccd_casadi.case_studies.rib_stage.model import (
 )
 from ccd_casadi.case_studies.rib_stage.modes import (
     CLUSTER,
-    EXTRA,
     SHIFT,
     SQUARE_GROUPS,
     Discretisation,
     Group,
+    compressed,
     discretise,
     functionals,
     groups_of,
@@ -45,13 +46,15 @@ from ccd_casadi.case_studies.rib_stage.modes import (
     spectrum,
 )
 from ccd_casadi.case_studies.rib_stage.symmetry import AS, mirror_signs, swap_displacements
-from ccd_casadi.case_studies.rib_stage.truncation import TWENTY
+from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, faded
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.threads import side_by_side
 
 KNOWN = 1e-4  # of its length: what of a mode's move is beside the basis and not worth a vector
 ROUNDING = 1e-8  # the same of a mode
+BEYOND = 4  # modes of a symmetry beyond those kept: shapes move by them
+LEVELS = 2  # of what forces bend, as of a Krylov space
 COUPLED = 24  # lowest modes of each symmetry that point masses couple
 RIGID = {"A1": 1, "A2": 1, "SA": 2, "AS": 2}  # rigid motions of a symmetry
 
@@ -107,23 +110,31 @@ def mechanics(stage: RibStage, known: Bases, theta: Sequence[float]) -> Mechanic
     small = [_modes(stage, group, basis, here) for group, basis in groups]
     of = {s: one for group, own in zip(SQUARE_GROUPS, small, strict=True)
           for (s,), one in zip(group.images, own, strict=True)}  # fmt: skip
-    n, row = 3 + stage.modes.total, 3
+    coupled, row, later = groups_of(stage.geometry), 3, 3 + stage.modes.total
+    n = later + stage.fading * len(coupled)
     lam, u, du = np.zeros(n), np.zeros((n, len(points))), np.zeros((len(here), n, len(points)))
     dK = np.zeros((len(here), n, n))
     u[:3], du[:, :3] = rigid_part(stage, here)
-    for group in groups_of(stage.geometry):
+    for group in coupled:
         rigid, count = sum(RIGID.get(s.name, 0) for s in group.solved), stage.modes.of(group)
         images = (
             [of[s] for (s,) in group.images]
             if not masses
             else [_coupled([of[s] for s in group.solved], [mass.mass for mass in masses])]
         )
+        kept = count + stage.fading
         for place, one in enumerate(images):
-            # A pair of modes of one frequency stands in turns.
+            # A pair of modes of one frequency stands in turns; those that fade follow all others.
             own = row + place + len(images) * np.arange(count)
-            lam[own] = one.values[rigid : rigid + count]
-            u[own], du[:, own], dK[:, own[:, None], own] = _slopes(one, rigid, count, len(points))
-        row += len(images) * count
+            own = np.append(own, later + np.arange(stage.fading))
+            lam[own] = one.values[rigid : rigid + kept]
+            u[own], du[:, own], dK[:, own[:, None], own] = _slopes(one, rigid, kept, len(points))
+            if stage.fading:
+                slopes = np.diagonal(_slopes(one, rigid, kept + 1, 0)[2], 0, 1, 2)
+                w, dw = faded(one.values[rigid : rigid + kept + 1], slopes, count)
+                du[:, own] = w[:, None] * du[:, own] + dw[:, :, None] * u[own]
+                u[own] *= w[:, None]
+        row, later = row + len(images) * count, later + stage.fading
     return assembled(stage, lam[3:], u, du, dK)
 
 
@@ -159,16 +170,19 @@ def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array)
 def _grown(
     stage: RibStage, disc: Discretisation, group: Group, basis: Basis, theta: Array
 ) -> Basis:
-    """With the modes at θ, what they move by, and what forces at the point masses bend."""
+    """With the modes at θ, what they move by, and what forces at the points bend."""
     masses = stage.geometry.point_masses
-    count = (TWENTY if masses else stage.modes).of(group) + EXTRA
+    count = max(TWENTY.of(group), stage.modes.of(group)) + BEYOND
     body, sector = replace(stage.geometry, point_masses=()), sector_of(disc, group.solved[0])
     found = spectrum(disc, body, theta, group, count)
     vectors, inverse = found.vectors, found.pencil.inverse
-    for image in group.images if masses else ():
-        forces = functionals(disc, image, theta, [(p.x, p.y) for p in masses])[0]
-        bent = inverse(forces.reshape(len(forces), -1))
-        vectors = np.hstack([vectors, bent, inverse(found.pencil.mass(bent))])
+    acting = [*points_of(stage), *((p.x, p.y) for p in masses)]
+    for image in group.images:
+        bent = compressed(functionals(disc, image, theta, acting)[0].reshape(len(vectors), -1))[0]
+        for _ in range(LEVELS):
+            bent = inverse(bent)
+            vectors = np.hstack([vectors, bent])
+            bent = found.pencil.mass(bent)
     basis = _wider(stage, disc, group, basis, vectors, ROUNDING)
     moved = disc.assembler.moved(sector, theta, found.values, found.vectors)
     return _wider(stage, disc, group, basis, inverse(moved), KNOWN)
@@ -246,7 +260,7 @@ def _modes(stage: RibStage, group: Group, basis: Basis, theta: Array) -> tuple[S
             fields.append((signs * known[here]).transpose(0, 2, 1))
         u, lam, left = np.stack(fields, 3), values, modes
         if masses:
-            lam, turn = _lowest(values, u[0, :, :, -len(masses) :])
+            lam, turn = _lowest(values, u[0])
             u, left = np.einsum("tjcp,ji->ticp", u, turn), modes @ turn
         right = left if masses else left[:, :kept]
         dK, dM = (left.T @ (part[1:] @ right) for part in (K, M))
@@ -264,12 +278,12 @@ def _whole(triangles: Array) -> Array:
 
 
 def _lowest(values: Array, G: Array) -> tuple[Array, Array]:
-    """λ (k,) and directions (m, k) of the lowest modes and what forces at masses bend of the others
+    """λ (k,) and directions (m, k) of the lowest modes and what forces at points bend of the others
     (m,), G (m, 3, p) being the displacements there."""
     few = min(COUPLED, len(values))
     high = values[few:]
     bent = G[few:].reshape(len(high), G.shape[1] * G.shape[2]) / (high + SHIFT)[:, None]
-    Q = np.linalg.qr(np.hstack([bent, bent / (high + SHIFT)[:, None] * SHIFT]))[0]
+    Q = compressed(np.hstack([bent, bent / (high + SHIFT)[:, None] * SHIFT]))[0]
     own, turn = np.linalg.eigh(Q.T @ (high[:, None] * Q))
     return np.append(values[:few], own), block_diag(np.eye(few), Q @ turn)
 

@@ -74,14 +74,36 @@ class ModeSet:
         return 1 + max((m.place for m in self.flexible if m.group == group), default=-1)
 
 
+def faded(values: Array, slopes: Array, full: int) -> tuple[Array, Array]:
+    """What is left of displacements of the modes of a group, and its slopes (θ, k).
+
+    `values` (k + 1,) and `slopes` (θ, k + 1) are λ of k modes that are kept and of the next one, b;
+    the first `full` count whole, a being the last of these, the others by
+
+        w = t²(3 - 2t),   t = (λ_b - λ)/(λ_b - λ_a).
+
+    Modes that nearly meet change places: w is one where a does with the next, and zero at b.
+    """
+    a, b = full - 1, len(values) - 1
+    span, slope = values[b] - values[a], (slopes[:, b] - slopes[:, a])[:, None]
+    t = np.minimum((values[b] - values[:b]) / span, 1.0)
+    dt = np.where(t < 1.0, (slopes[:, b, None] - slopes[:, :b] - t * slope) / span, 0.0)
+    return t * t * (3.0 - 2.0 * t), 6.0 * t * (1.0 - t) * dt
+
+
 def solve_modes(
-    disc: Discretisation, geometry: Geometry, theta: Array, count: ModeCount, by_frequency: bool
+    disc: Discretisation,
+    geometry: Geometry,
+    theta: Array,
+    count: ModeCount,
+    by_frequency: bool,
+    fading: int = 0,
 ) -> ModeSet:
     """Solve every symmetry (or direct sums of them) at θ and choose the modes of the model.
 
     By symmetry the order is A1, B1, B2, A2, then SA and AS in turns, or the even and the odd ones
     about an axis, lowest first in each: it does not change where frequencies of different
-    symmetries cross.
+    symmetries cross. So many `fading` ones of every group follow.
     """
     square = has_square_symmetry(geometry)
     wanted = {}
@@ -94,15 +116,16 @@ def solve_modes(
     boxes = disc.assembler.box_matrices(theta, SHIFT)
 
     def solved(group: Group) -> Spectrum:
-        return spectrum(disc, geometry, theta, group, wanted[group] + EXTRA, boxes)
+        return spectrum(disc, geometry, theta, group, wanted[group] + fading + EXTRA, boxes)
 
     largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
     found = dict(zip(largest_first, side_by_side(solved, largest_first), strict=True))
     spectra = tuple(found[group] for group in wanted)
     flexible = [
         _mode(item, index, place, image)
+        for first in (True, False)
         for index, (item, number) in enumerate(zip(spectra, wanted.values(), strict=True))
-        for place in range(number)
+        for place in (range(number) if first else range(number, number + fading))
         for image in range(len(item.group.images))
     ]
     if by_frequency:
