@@ -1,14 +1,17 @@
 """Structured synthesis beside SciPy's SLSQP from the same starts, on the same bounds, one judge.
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/structured_peers.py [--problems N] [--out FILE]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/structured_peers.py [--problems N] [--lot SEED]
+        [--patience X] [--out FILE]
 
 The problems are chains of benchmarks/random_sections.py with two or three masses, something
 uncertain and a lead or biquads. The search of this package runs with 12 starts. Its peer is what
 one would write with a general optimiser: max τ over (κ, τ), the largest peak of every curve and
 plant as a constraint with its exact slopes, SLSQP from one start after the other (those that the
-search draws, half by rules, half at random) until all are used or it has had `PATIENCE` times the
-processor time. Every end is given the largest ω_b that its controller has and passes the gate of
-every design: the judge. One line of JSON a problem, counts at the end.
+search draws, half by rules, half at random, then others drawn alike) until it has had `--patience`
+times the processor time. Every end is given the largest ω_b that its controller has and passes the
+gate of every design: the judge. One line of JSON a problem, counts at the end; what `--out` holds
+is not run again. With `--lot` the problems are run in an order by lot, so that a part of them is a
+sample of all.
 """
 
 import argparse
@@ -32,7 +35,6 @@ from ccd_casadi.fixed_structure.sections_design import DesignSearch
 from ccd_casadi.plants.scaling import ScaledPlant
 
 STARTS = 12
-PATIENCE = 10.0  # times the search's processor time that the peer may take
 STEPS = 300  # of SLSQP from one start
 INSIDE = 2e-6  # ln: what SLSQP's ends are pulled back by, so that the judge has no rounding to mind
 OUT = Path(__file__).with_suffix(".json")
@@ -96,45 +98,34 @@ def by_slsqp(problem: LoopProblem, start: Point, until: float) -> Point | None:
     return at_its_bandwidth(problem, end) if end.assessment.stable else None
 
 
-def peer(asked: Case, plants: list[ScaledPlant], seconds: float) -> tuple[float, int, float]:
-    """The best judged bandwidth in Hz (0: none), starts used, processor time."""
+def peer(
+    asked: Case, plants: list[ScaledPlant], own: float, seconds: float
+) -> tuple[float, float, int, float]:
+    """The best judged bandwidth in Hz (0: none) after `own` seconds and at the end, starts used,
+    processor time."""
     began = time.process_time()
     problem: Any = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
-    best, used = 0.0, 0
-    for kappa in _pool(problem, STARTS, np.random.default_rng(0)):
-        if time.process_time() - began > seconds:
-            break
-        used += 1
-        end = by_slsqp(problem, started(problem, kappa), began + seconds)
-        if end is not None:
-            made = DesignSearch(problem, plants, asked.sampling).designed(end, (), 1, 0)
-            if made.certified:
-                best = max(best, made.bandwidth / (2.0 * np.pi))
-    return best, used, time.process_time() - began
+    soon, best, used, turn = 0.0, 0.0, 0, 0
+    while time.process_time() - began < seconds:
+        for kappa in _pool(problem, STARTS, np.random.default_rng(turn), None):
+            if time.process_time() - began >= seconds:
+                break
+            used += 1
+            end = by_slsqp(problem, started(problem, kappa), began + seconds)
+            if end is not None:
+                made = DesignSearch(problem, plants, asked.sampling).designed(end, (), 1, 0)
+                if made.certified:
+                    best = max(best, made.bandwidth / (2.0 * np.pi))
+            if time.process_time() - began <= own:
+                soon = best
+        turn += 1
+    return soon, best, used, time.process_time() - began
 
 
-def main() -> None:
-    """Every problem, a line each, and the counts."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--problems", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=OUT)
-    options = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    for seed, asked in problems(options.problems):
-        plants = asked.uncertain.plants(asked.uncertain.corners())
-        began = time.process_time()
-        made = synthesise_sections(plants, asked.structure, asked.bounds, sampling=asked.sampling,
-                                   starts=STARTS, seed=0)  # fmt: skip
-        own = time.process_time() - began
-        theirs, used, spent = peer(asked, plants, PATIENCE * own)
-        rows.append({
-            "seed": seed, "hz": made.bandwidth / (2.0 * np.pi) if made.certified else 0.0,
-            "seconds": round(own, 2), "slsqp_hz": theirs, "slsqp_starts": used,
-            "slsqp_seconds": round(spent, 2),
-        })  # fmt: skip
-        print(json.dumps(rows[-1]), flush=True)
+def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """How often the search is as good, and better, than the peer at its end."""
     ratio = np.array([(row["hz"] + 1e-9) / (row["slsqp_hz"] + 1e-9) for row in rows])
-    counts = {
+    return {
         "problems": len(rows),
         "certified": sum(row["hz"] > 0.0 for row in rows),
         "slsqp_certified": sum(row["slsqp_hz"] > 0.0 for row in rows),
@@ -143,8 +134,40 @@ def main() -> None:
         "slsqp_time_over_ours": round(float(np.median(
             [row["slsqp_seconds"] / row["seconds"] for row in rows])), 2),
     }  # fmt: skip
-    print(json.dumps(counts))
-    options.out.write_text(json.dumps({"counts": counts, "rows": rows}, indent=1) + "\n")
+
+
+def main() -> None:
+    """Every problem, a line each, and the counts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--problems", type=int, default=20)
+    parser.add_argument("--lot", type=int)
+    parser.add_argument("--patience", type=float, default=10.0)
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    if options.out.exists():
+        rows = json.loads(options.out.read_text())["rows"]
+    todo = problems(options.problems)
+    if options.lot is not None:
+        todo = [todo[i] for i in np.random.default_rng(options.lot).permutation(len(todo))]
+    known = {row["seed"] for row in rows}
+    for seed, asked in todo:
+        if seed in known:
+            continue
+        plants = asked.uncertain.plants(asked.uncertain.corners())
+        began = time.process_time()
+        made = synthesise_sections(plants, asked.structure, asked.bounds, sampling=asked.sampling,
+                                   starts=STARTS, seed=0)  # fmt: skip
+        own = time.process_time() - began
+        soon, theirs, used, spent = peer(asked, plants, own, options.patience * own)
+        rows.append({
+            "seed": seed, "hz": made.bandwidth / (2.0 * np.pi) if made.certified else 0.0,
+            "seconds": round(own, 2), "slsqp_hz_in_that_time": soon, "slsqp_hz": theirs,
+            "slsqp_starts": used, "slsqp_seconds": round(spent, 2),
+        })  # fmt: skip
+        print(json.dumps(rows[-1]), flush=True)
+        options.out.write_text(json.dumps({"counts": judged(rows), "rows": rows}, indent=1) + "\n")
+    print(json.dumps(judged(rows)))
 
 
 if __name__ == "__main__":

@@ -50,18 +50,11 @@ def result_dict(
         tolerance=tolerance, better=verified.gap_words(), unknown=verified.no_gradient_words(),
         searched=verified.searched(outcome, look),
     )  # fmt: skip
+    judged = quality[0] if quality else None
     verdict = {  # in the order in which they matter
         "certified": verified.certified_line(),
         "optimal": optimality(gap=verified.inner_gap),
-        "predicted": predicted(
-            error=error,
-            tolerance=tolerance,
-            value=verified.value,
-            left_out=quality[0].at_point if quality else None,
-            extrapolates=quality[0].extrapolates if quality else (),
-            surrogate=bool(outcome.surrogates),
-            of=problem.figure,
-        ),
+        "predicted": predicted(error, tolerance, verified.value, problem.figure, judged),
         "survives": verified.survives_line(),
         "deployable": deployable(verified.survival, problem.sampling),
     }

@@ -17,9 +17,10 @@ from typing import Any
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.figure import BANDWIDTH, FigureOfMerit
+from ccd_casadi.inner_problem.figure import FigureOfMerit
 from ccd_casadi.optim.kkt import Kink, KktCertificate
 from ccd_casadi.support.units import counted, small_share, with_unit
+from surrogates import Quality
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -137,26 +138,19 @@ def search_evidence(
 
 
 def predicted(
-    *,
-    error: float,
-    tolerance: float,
-    value: float = math.nan,
-    left_out: tuple[float, float] | None = None,
-    extrapolates: Sequence[str] = (),
-    surrogate: bool = True,
-    of: FigureOfMerit = BANDWIDTH,
+    error: float, tolerance: float, value: float, of: FigureOfMerit, quality: Quality | None
 ) -> VerdictLine:
-    """Surrogate against truth at the design, whose `value` is in SI.
+    """Surrogate against truth at the design, whose `value` of a figure `of` merit is in SI.
 
     Where the design is itself one of the samples the surrogate reproduces it and `error` (relative)
-    shows nothing: `left_out` is the error there without it, in the unit of what is predicted, `of`,
-    for the eye, and in deviations.
+    shows nothing: its `quality` (None: no surrogate) has the error there without it.
     """
     what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
-    if not surrogate:
+    if quality is None:
         words = "nothing was predicted: the search used true values"
         return VerdictLine(State.PASSED, words, figures)
+    left_out = quality.at_point
     if left_out is not None:
         size, sigmas = abs(left_out[0]), left_out[1]
         share = size / (of.factor * value)
@@ -168,8 +162,8 @@ def predicted(
         return VerdictLine(State.FAILED, words, figures)
     if left_out is None:
         words = f"{what} predicted, error {small_share(error)}"
-        if extrapolates:
-            words += f"; the surrogate extrapolates there: {extrapolates[0]}"
+        if quality.extrapolates:
+            words += f"; the surrogate extrapolates there: {quality.extrapolates[0]}"
             return VerdictLine(State.WARNED, words, figures)
         return VerdictLine(State.PASSED, words, figures)
     words = (

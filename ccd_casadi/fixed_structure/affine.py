@@ -10,7 +10,7 @@ on, several times what double precision loses there.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from operator import add, mul, neg
 from typing import Any
 
@@ -30,20 +30,30 @@ class Affine:
     slope: np.ndarray
     rest: Array
 
-    @property
+    @cached_property
+    def middle(self) -> Array:
+        """|centre|."""
+        return np.asarray(np.abs(self.centre))
+
+    @cached_property
+    def reaches(self) -> Array:
+        """|slope| (n, N)."""
+        return np.asarray(np.abs(self.slope))
+
+    @cached_property
     def reach(self) -> Array:
         """How far from the centre the linear part goes at most."""
-        return np.asarray(np.abs(self.slope).sum(0))
+        return np.asarray(self.reaches.sum(0))
 
-    @property
+    @cached_property
     def size(self) -> Array:
         """Not below |f| anywhere."""
-        return np.asarray(np.abs(self.centre) + self.reach + self.rest)
+        return np.asarray(self.middle + self.reach + self.rest)
 
-    @property
+    @cached_property
     def lowest(self) -> Array:
         """Not above |f| anywhere; 0 where the enclosure touches 0."""
-        size = np.abs(self.centre)
+        size = self.middle
         with np.errstate(divide="ignore", invalid="ignore"):
             along = (self.slope * (self.centre.conj() / size)).real
         found = size - np.abs(along).sum(0) - self.rest
@@ -54,7 +64,7 @@ class Affine:
             self._same_variables(other)
             rest = self.rest + other.rest + ROUND * (self.size + other.size)
             return Affine(self.centre + other.centre, self.slope + other.slope, rest)
-        size = np.abs(self.centre) + np.abs(other)
+        size = self.middle + np.abs(other)
         return Affine(self.centre + other, self.slope, self.rest + ROUND * size)
 
     def __neg__(self) -> "Affine":
@@ -68,14 +78,11 @@ class Affine:
             rest = (self.rest + ROUND * self.size) * np.abs(other)
             return Affine(self.centre * other, self.slope * other, rest)
         self._same_variables(other)
-        a, b = self.reach, other.reach
+        a, b = self.middle + self.reach, other.middle + other.reach
         # t_i² lies in [0, 1]: half of it goes to the centre.
-        square = 0.5 * self.slope * other.slope
-        rest = a * b - np.abs(square).sum(0)
-        rest += self.rest * (np.abs(other.centre) + b) + other.rest * (np.abs(self.centre) + a)
-        rest += self.rest * other.rest
-        rest += ROUND * (np.abs(self.centre) + a) * (np.abs(other.centre) + b)
-        centre = self.centre * other.centre + square.sum(0)
+        rest = self.reach * other.reach - 0.5 * (self.reaches * other.reaches).sum(0)
+        rest += self.rest * b + other.rest * a + self.rest * other.rest + ROUND * a * b
+        centre = self.centre * other.centre + 0.5 * (self.slope * other.slope).sum(0)
         slope = self.centre * other.slope + other.centre * self.slope
         return Affine(centre, slope, np.where(np.isnan(rest), np.inf, rest))
 
@@ -114,7 +121,7 @@ def variable(low: Array, high: Array, index: int, variables: int) -> Affine:
 
 def inverse(f: Affine) -> Affine:
     """1/f; 1/(c + δ) = 1/c - δ/c² + δ²/(c²(c + δ))."""
-    size, low = np.abs(f.centre), f.lowest
+    size, low = f.middle, f.lowest
     with np.errstate(divide="ignore", invalid="ignore"):
         centre = 1.0 / f.centre
         deviation = f.reach + f.rest

@@ -101,12 +101,15 @@ def gain_of(structure: Structure, kappa: Array, axis: Axis, integrator: bool) ->
     values, x, y = np.exp(kappa), axis.x, axis.y
     one = Affine(np.ones(len(x.centre)), np.zeros_like(x.slope), np.zeros(len(x.centre)))
     above, below = one * values[0], one
+    xx, xy, yy = x * x, x * y, y * y
     for kind, sign, at in structure.factors[1:].tolist():
-        u = y * (1.0 / values[at])
+        over = 1.0 / values[at]
         if kind == INTEGRATOR:
             part = y + x * values[at]
+        elif kind == REAL:
+            part = x + y * over
         else:
-            part = x + u if kind == REAL else x * x + x * u * (2.0 * values[at + 1]) + u * u
+            part = xx + xy * (2.0 * over * values[at + 1]) + yy * over**2
         if sign > 0:
             above = above * part
         else:

@@ -70,36 +70,40 @@ def _fill(
     """Mode i's disc: of both poles as one form, since far above a resonance they nearly cancel, or
     a disc of each; times its strength, which may pass through 0."""
     (D, N), (E, M) = poles
-    whole = N * inverse(D) + M * inverse(E)
-    one, two = quotient(N, D, least), quotient(M, E, least)
+    first, second = inverse(D), inverse(E)
+    whole = N * first + M * second
+    one, two = quotient(N, D, least, first), quotient(M, E, least, second)
     middle, apart = one[0] + two[0], one[1] + two[1]
     moves = one[2] + two[2]
     if strength is not None:
-        whole, size, most = whole * strength, np.abs(strength.centre), np.abs(middle) + apart
+        whole, size, most = whole * strength, strength.middle, np.abs(middle) + apart
         apart = size * apart + (strength.reach + strength.rest) * most
-        middle, moves = strength.centre * middle, size * moves + np.abs(strength.slope) * most
+        middle, moves = strength.centre * middle, size * moves + strength.reaches * most
     radius = whole.reach + whole.rest
     near = ~(radius <= apart) | np.isinf(radius)
     discs.middle[i] = np.where(near, middle, whole.centre)
     discs.radius[i] = np.where(near, apart, radius) * (1.0 + 1e-12)
-    discs.shares[i, rows] = np.where(near, moves, np.abs(whole.slope))
+    discs.shares[i, rows] = np.where(near, moves, whole.reaches)
 
 
-def quotient(N: Affine, D: Affine, least: Array | float = 0.0) -> tuple[np.ndarray, Array, Array]:
+def quotient(
+    N: Affine, D: Affine, least: Array | float = 0.0, form: Affine | None = None
+) -> tuple[np.ndarray, Array, Array]:
     """Centre and radius of a disc around N/D, and how each variable moves it (n, N); Re D >= least.
 
-    1/D lies in that of 1/D as a form, or where Re e^{-jθ}D >= d in the disc of diameter 1/d that
+    1/D lies in that of 1/D as a `form`, or where Re e^{-jθ}D >= d in the disc of diameter 1/d that
     touches 0; N then turns and scales the latter, which keeps 0 on its edge. Around 0, |N|/d holds.
     """
-    form = inverse(D)
-    turned = TURNS.conj()[:, None] * D.centre
-    d = turned.real - np.abs((TURNS.conj()[:, None, None] * D.slope).real).sum(1) - D.rest
+    form = inverse(D) if form is None else form
+    x, y = TURNS.real[:, None], TURNS.imag[:, None]
+    along = x[..., None] * D.slope.real + y[..., None] * D.slope.imag
+    d = x * D.centre.real + y * D.centre.imag - np.abs(along).sum(1) - D.rest
     d[len(TURNS) // 2] = np.maximum(d[len(TURNS) // 2], least)
     best = np.argmax(d, axis=0)
     d = d[best, np.arange(len(best))]
     half = np.where(d > 0.0, 0.5 / np.where(d > 0.0, d, 1.0), np.inf) * (1.0 + 1e-15)
     centre, radius = form.centre, form.reach + form.rest
-    size = np.abs(N.centre)
+    size = N.middle
     spread = N.reach + N.rest
     outer = size * radius + spread * (np.abs(centre) + radius)
     along = N.slope / np.where(size == 0.0, 1.0, N.centre)
@@ -109,7 +113,7 @@ def quotient(N: Affine, D: Affine, least: Array | float = 0.0) -> tuple[np.ndarr
     touching = size * half * grown * (1.0 + bent)
     chosen = ~(outer <= touching)
     edge = N.centre * TURNS[best].conj() * half * grown
-    moves = np.abs(D.slope) / np.where(chosen, d, np.abs(D.centre)) + np.abs(along)
+    moves = D.reaches / np.where(chosen, d, D.middle) + np.abs(along)
     middle, radius = np.where(chosen, edge, N.centre * centre), np.where(chosen, touching, outer)
     plain = 2.0 * N.size * half
     middle, radius = np.where(plain < radius, 0.0, middle), np.fmin(plain, radius)

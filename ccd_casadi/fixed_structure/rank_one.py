@@ -93,6 +93,9 @@ def norm_with(A: np.ndarray, p: np.ndarray, q: np.ndarray, radius: Array) -> Arr
     A (N, k, l), p (n, N, k), q (n, N, l). Terms that A keeps apart count apart.
     """
     P, Q = _grams(p, q, radius)
+    if A.shape[1:] == (1, 1):
+        x, y, apart = P[:, 0, 0].real, Q[:, 0, 0].real, np.abs(A[:, 0, 0])
+        return np.asarray((1.0 + GUARD) * (0.5 * (x + y) + np.hypot(0.5 * (x - y), apart)))
     values = np.linalg.eigvalsh(np.block([[P, A], [A.conj().transpose(0, 2, 1), Q]]))
     return np.asarray(values[:, -1] + GUARD * np.abs(values).max(axis=1))
 
@@ -114,5 +117,7 @@ def norm(M: np.ndarray, loosely: bool = False) -> Array:
     """σ_max of matrices (..., p, q); `loosely` the root of the sum of squares, which it is where
     the rank is one and else not above."""
     if loosely or 1 in M.shape[-2:]:
+        if M.shape[-2:] == (1, 1):
+            return np.asarray(np.abs(M[..., 0, 0]))
         return np.asarray(np.sqrt((np.abs(M) ** 2).sum(axis=(-2, -1))))
     return np.asarray(np.linalg.norm(M, 2, axis=(-2, -1)))

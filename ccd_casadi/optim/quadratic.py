@@ -42,11 +42,13 @@ def solve_quadratic(
     rows, n = A.shape
 
     def kept(x: Array) -> bool:
-        missed = max((low - x).max(), (x - high).max())
+        missed = np.maximum(low - x, x - high).max()
         return bool((A @ x - upper).max(initial=-np.inf) <= KEPT and missed <= INSIDE)
 
-    above = np.minimum(np.concatenate([high, upper]), UNBOUNDED)
-    below = np.concatenate([np.maximum(low, -UNBOUNDED), np.full(rows, -UNBOUNDED)])
+    above, below = np.empty(n + rows), np.full(n + rows, -UNBOUNDED)
+    above[:n], above[n:] = high, upper
+    np.minimum(above, UNBOUNDED, out=above)
+    np.maximum(low, -UNBOUNDED, out=below[:n])
     matrix = np.ascontiguousarray(A, float)
     x, _, flag, info = daqp.solve(np.array(H, float), c, matrix, above, below, **TOLERANCES)
     if flag == 1 and kept(x):
@@ -83,18 +85,19 @@ def solve_elastic(
     if not free:
         hessian[n, n], ends[0, n] = SLACK * penalty / unit, 0.0
     upper, held = -value / radius, np.arange(min(m, AT_FIRST))
+    part: slice | np.ndarray = slice(len(held))  # the first ones are no copy
     while True:
-        found = solve_quadratic(hessian, cost, A[held], upper[held], *ends)
+        found = solve_quadratic(hessian, cost, A[part], upper[part], *ends)
         if found is None:
             return None
         if len(held) == m:
             break
         missed = A @ found.x - upper
-        missed[held] = -np.inf
+        missed[part] = -np.inf
         if missed.max() <= KEPT:
             break
         worst = np.argsort(-missed)[:ADDED]
-        held = np.concatenate([held, worst[missed[worst] > KEPT]])
+        held = part = np.concatenate([held, worst[missed[worst] > KEPT]])
     multipliers = np.zeros(m)
     multipliers[held] = unit * found.multipliers
     return radius * np.clip(found.x[:n], *ends[:, :n]), multipliers

@@ -227,7 +227,7 @@ def best_step(
     n = len(here.x)
     value, slopes = rows.value[chosen], rows.slopes[chosen]
     elastic = np.ones(len(chosen)) if rows.hard is None else 1.0 - rows.hard[chosen]
-    soft = elastic > 0.0
+    soft = slice(None) if rows.hard is None else elastic > 0.0
     unit = _unit(here, penalty if model.carried else 0.0)
     weight = ELASTIC * (unit + penalty) if model.growing else penalty
     multipliers = np.zeros(len(rows.value))
@@ -294,8 +294,8 @@ def best_step(
         multipliers[chosen] = mu
         if rows.curved:
             bend = curved @ p
-            at, offset = slopes.copy(), value.copy()
-            at[bent] += bend
+            at, offset = at if turn else slopes.copy(), value.copy()
+            at[bent] = slopes[bent] + bend
             offset[bent] -= 0.5 * bend @ p
             lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0)[bent], curved)
             active = at[holds]

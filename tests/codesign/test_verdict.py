@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +30,7 @@ from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.controller_problem import RobustSet
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import KktCertificate
@@ -126,15 +129,23 @@ def test_a_differentiator_is_said_to_be_one() -> None:
     assert "differentiator" not in v.survives(SOUND, S_max=2.0).words
 
 
+def predicted(
+    error: float, value: float = math.nan, left_out: tuple[float, float] | None = None
+) -> v.VerdictLine:
+    """Of a bandwidth, by a surrogate."""
+    quality: Any = SimpleNamespace(at_point=left_out, extrapolates=())
+    return v.predicted(error, 1e-3, value, BANDWIDTH, quality)
+
+
 def test_a_prediction_at_its_own_sample_counts_without_it() -> None:
     """D6: 6e-12 at a training sample that the others miss by 2 % is no support."""
-    hollow = v.predicted(error=6e-12, tolerance=1e-3, value=HZ * 1.56 / 0.022, left_out=(1.56, 3.5))
+    hollow = predicted(6e-12, HZ * 1.56 / 0.022, (1.56, 3.5))
     assert hollow.state is v.State.WARNED
     assert "1.6 Hz" in hollow.words
     assert "3.5 sigma" in hollow.words
-    far = v.predicted(error=2e-3, tolerance=1e-3)
+    far = predicted(2e-3)
     assert far.state is v.State.FAILED
-    assert v.predicted(error=1e-5, tolerance=1e-3).state is v.State.PASSED
+    assert predicted(1e-5).state is v.State.PASSED
 
 
 def test_deployable_is_not_known_before_deploy() -> None:

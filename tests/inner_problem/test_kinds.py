@@ -37,7 +37,7 @@ from ccd_casadi.synthesis import derivatives, synthesis
 KINDS = kinds()
 SYNTHESISE = [  # every way to a controller
     (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design"),
-    (structured_bandwidth, "synthesise"), (structured_bandwidth, "least_value"),
+    (structured_bandwidth, "synthesise_sections"), (structured_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design
     "mixed": (outer_mixed, "final_design"), "sections": (outer_structured, "worst_case"),

@@ -181,14 +181,14 @@ def test_an_impossible_case_says_what_falls_short(tmp_path: Path) -> None:
 def test_a_search_that_ended_early_goes_on_until_there_is_a_gradient(
     anchored: CoDesignProblem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest, initial = structured_bandwidth.synthesise, []
+    honest, initial = structured_bandwidth.synthesise_sections, []
 
     def early(*arguments: Any, **more: Any) -> SectionsDesign:
         made = honest(*arguments, **more)
         initial.append(more["initial"])
         return replace(made, kkt_residual=2.5e-2) if len(initial) == 1 else made
 
-    monkeypatch.setattr(structured_bandwidth, "synthesise", early)
+    monkeypatch.setattr(structured_bandwidth, "synthesise_sections", early)
     value = structured_value(anchored, (61.0, 58.0))
     assert value.feasible
     assert np.isfinite(value.gradient).all()
