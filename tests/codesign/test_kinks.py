@@ -230,8 +230,9 @@ def case() -> CoDesignProblem:
 def line(kkt: KktCertificate) -> Any:
     """The verdict's."""
     return optimal(
-        kkt, level=VerifiedStructured.kkt_level, gap=0.0, tolerance=1e-3, better="", known=""
-    )
+        kkt, level=VerifiedStructured.kkt_level, gap=0.0, tolerance=1e-3, better="",
+        searched=("", {}),
+    )  # fmt: skip
 
 
 def test_a_kink_is_an_optimum_where_both_sides_rise() -> None:
