@@ -181,9 +181,9 @@ def finished(
 
 def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Array) -> Array:
     """By how much J is larger at θ (n, n_θ) beside a sample, by climbs of its controller on the
-    plants to first order there; the best controller of them counts at every one."""
+    plants as a basis knows them, or to first order; the best of these counts at every one."""
     here = JointPoint(sample.theta, sample.kappa, sample.bandwidth)
-    models = nearby(problem, (), here.theta)
+    models = nearby(problem, [here.theta] if plant_of(problem).nearby else (), here.theta)
     places = [here.theta, *(tuple(theta.tolist()) for theta in thetas)]
 
     def climbed(start: JointPoint) -> list[tuple[JointPoint, float]]:

@@ -67,7 +67,8 @@ def theta_kkt(
 
     With `envelope`, of the design there, also where ω_b* has a kink; where `truth` may be evaluated
     with slopes to its sides, or the second-order check where it has none. `beside`: where true
-    values are dear, by how much J is larger at θ (n, n_θ) next to it on plants to first order.
+    values are dear, by how much J is larger at θ (n, n_θ) next to it, by climbs on plants as they
+    are known there: so exact that steps are a tenth as long, within which a kink stays alone.
     """
     bounds, own = box(problem), hardware_at(problem, np.array(sample.theta))
     at = active_theta(problem, sample)
@@ -100,7 +101,8 @@ def theta_kkt(
         return objective_gradient(problem, there)
 
     if kink is not None:
-        slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.size)
+        step = STEP if beside else BESIDE
+        slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.size, step)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
     elif beside is None:  # λ's own curvature is left out
         columns = hessian_products(slope, bounds.shares(sample.theta), Z, BESIDE)
@@ -154,14 +156,14 @@ def _steepest_first(Z: Array, gradient: Array) -> Array:
 
 
 def _slopes(
-    bounds: Box, more: Beside, theta: Array, Z: Array, size: float
+    bounds: Box, more: Beside, theta: Array, Z: Array, size: float, step: float
 ) -> tuple[tuple[float, float], ...]:
     """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
     and over `size`; all are asked for at once."""
-    sides = np.array([sign * BESIDE * z for z in Z.T for sign in (-1.0, 1.0)])
+    sides = np.array([sign * step * z for z in Z.T for sign in (-1.0, 1.0)])
     ends = np.clip(theta + sides * bounds.width, *bounds)
     steps = np.linalg.norm((ends - theta) / bounds.width, axis=1)
-    far = np.flatnonzero(steps > 0.5 * BESIDE)
+    far = np.flatnonzero(steps > 0.5 * step)
     found = np.full(len(ends), np.nan)
     found[far] = more(ends[far]) / (steps[far] * size)
     return tuple((float(low), float(high)) for low, high in found.reshape(-1, 2))

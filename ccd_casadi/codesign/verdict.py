@@ -92,7 +92,7 @@ def optimal(
     words = (
         f"locally optimal to first order at a kink of J: KKT residual {residual:.2g} over theta "
         f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
-        f"{'J by its controller, on plants to first order,' if kink.first_order else 'true J'} "
+        f"{'J by climbs of its controller' if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
     known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)

@@ -30,7 +30,7 @@ class Kink:
     some orthogonal directions, all that the active bounds leave; differences of true values, per
     share of the box, over ‖∇J‖∞; NaN where there is no design. multipliers: of the bounds on the
     loop by kind, change of ln of the inner value per ln of a bound. first_order: the slopes are on
-    plants to first order, climbed to from the design's controller.
+    plants as they are known nearby, climbed to from the design's controller.
     """
 
     one_gradient: float
