@@ -18,7 +18,7 @@ from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import FigureOfMerit
-from ccd_casadi.optim.kkt import Kink, KktCertificate
+from ccd_casadi.optim.kkt import STEP, Kink, KktCertificate
 from ccd_casadi.support.units import counted, small_share, with_unit
 from surrogates import Quality
 
@@ -89,10 +89,11 @@ def optimal(
     if kink.least_slope < -level:
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
         return VerdictLine(State.FAILED, f"{words}; {known}", figures)
+    beside = f"J by climbs of its controller, {STEP:g} of the box away,"
     words = (
         f"locally optimal to first order at a kink of J: KKT residual {residual:.2g} over theta "
         f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
-        f"{'J by climbs of its controller' if kink.first_order else 'true J'} "
+        f"{beside if kink.first_order else 'true J'} "
         f"{_sides(kink)}; {known}"
     )
     known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)
