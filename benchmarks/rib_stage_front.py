@@ -119,7 +119,7 @@ def on_the_whole_set(
     """
     sections = replace(structured_of(problem), warm_starts=(tuple(map(float, kappa)),))
     asked = replace(problem, controller=sections, start=theta)
-    asked, made = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
+    asked, made, _ = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
     if not made.certified or made.certificate is None:
         return {"certified": False, "reason": made.words}
     worst = worst_case(asked, theta, made, turn=ROUNDS)[0]

@@ -226,7 +226,7 @@ def on_the_whole_set(row: dict[str, Any]) -> dict[str, Any]:
 
 def climbed(asked: CoDesignProblem) -> dict[str, Any]:
     """The whole loop from its warm start, with the worst plants that are found; judge and proof."""
-    asked, made = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
+    asked, made, _ = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
     if not made.certified or made.certificate is None:
         return {"certified": False, "reason": made.words}
     worst = worst_case(asked, asked.start, made, turn=ROUNDS)[0]

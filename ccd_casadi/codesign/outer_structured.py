@@ -104,7 +104,7 @@ def with_initial_search(
 
     def searched() -> InitialSearch:
         tell = printer("search at the start", quiet)
-        anchored, made = prepared(problem, tell, workers)
+        anchored, made, _ = prepared(problem, tell, workers)
         anchored, made, _ = least_from(anchored, problem.start, made, tell)
         own, start = structured_of(anchored), problem.start
         words = "" if made.certified else made.words

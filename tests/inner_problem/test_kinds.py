@@ -18,7 +18,7 @@ from test_structured_error import CABLES
 from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
 from ccd_casadi.codesign import outer_mixed, outer_structured
-from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.inner_answer import measured_answer
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.result import FORMAT

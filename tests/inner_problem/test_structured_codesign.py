@@ -10,7 +10,7 @@ import pytest
 from helpers import problem
 
 from ccd_casadi.codesign import outer_structured
-from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer_theta import pieces_from
@@ -48,7 +48,7 @@ def quick(sections: StructuredProblem = PID) -> CoDesignProblem:
 
 @pytest.fixture(scope="module")
 def anchored() -> CoDesignProblem:
-    found, made = prepared(quick())
+    found, made, _ = prepared(quick())
     assert made.certified
     return found
 
