@@ -15,6 +15,7 @@ from ccd_casadi.kernels.loop_rows import close, levels
 from ccd_casadi.support.arrays import Array
 
 HIDDEN = 1e-2  # ln of the share of its bound above which a maximum between grid points is sought
+FAR = 1e3  # times the last root: there curves are what they are at infinity but for 1e-6
 APART = 1e-8  # relative: grid points that are closer count as one
 CLOSINGS = 40  # of a peak's bracket at most; most need four, a curve's kink all
 FLAT = 1e-9  # slope at a maximum
@@ -47,10 +48,13 @@ def frequency_grid(
     """
     own = np.tile(roots[np.abs(roots) > 0.0], (len(poles), 1))
     joint = np.concatenate([problem.fixed, flanked(own), flanked(poles)], axis=1)
-    bottom, top = problem.base[0], problem.base[-1]
+    # A loop may be faster than the base grid: past its last root no curve has a peak.
+    last = np.maximum(np.abs(np.concatenate([own, poles], axis=1)).max(axis=1), problem.base[-1])
+    joint = np.column_stack([joint, FAR * last])
+    bottom = problem.base[0]
     # Points that fall together would hide a peak between them: spares go below the base instead.
     spare = np.broadcast_to(bottom * np.linspace(0.5, 0.99, joint.shape[1]), joint.shape)
-    joint = np.where((joint >= bottom) & (joint <= top), joint, spare)
+    joint = np.where(joint >= bottom, joint, spare)
     order = np.argsort(joint, axis=1, kind="stable")
     v = np.take_along_axis(joint, order, axis=1)
     twice = np.zeros(v.shape, bool)

@@ -19,6 +19,7 @@ from fixed_structure_loops import (
 
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.certificate_curves import grid_through
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import (
@@ -32,7 +33,7 @@ from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.peak_search import Brackets
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
-from ccd_casadi.fixed_structure.starts import at_random
+from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.kernels import sections
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import in_w, sampled
@@ -160,6 +161,30 @@ def test_peaks_are_the_suprema_of_dense_grids(
             assert found.value[own].max() >= values.max() - 1e-9
             if not short.get(curve, True):
                 assert found.value[own].max() <= values.max() + 1e-2
+
+
+@pytest.mark.parametrize("sampling", [None, FAST, SLOW, LATE])
+def test_peaks_of_loops_faster_than_the_base_grid_are_those_of_the_judge(
+    sampling: Sampling | None,
+) -> None:
+    """A search found a peak of 23 "within 2" where |S| rises past the last of its frequencies."""
+    bounds = replace(BOUNDS, weighted_level=None, weights=None)
+    plants = [plant(), plant(0.03, 0.5)]
+    problem = problem_for(plants, Structure(lead=2, roll_off=0), bounds, sampling)
+    rng, P = np.random.default_rng(5), problem.plants
+    fastest = 3000.0 if P.period is None else 3.0 / P.period
+    kappas = at_random(problem, np.exp(rng.uniform(0.0, np.log(fastest), 1000)), rng)
+    kappas = stabilising(problem, kappas)[:8]
+    assert len(kappas) > 2
+    for kappa in kappas:
+        found = assess(problem, kappa, -1.0, depth=-60.0).peaks
+        assert found is not None
+        si = problem.structure.in_units(kappa, P.omega_0, P.force)
+        judged = certify(plants, problem.structure.state_space(si), bounds, sampling)
+        for i, figures in enumerate(judged.plants):
+            for curve, name in ((LoopCurve.S_MAX, "S_max"), (LoopCurve.GS, "GS")):
+                own = found.value[(found.plant == i) & (found.curve == curve)] - problem.margin
+                assert np.exp(own.max()) == pytest.approx(bounds.shares(figures)[name], rel=1e-5)
 
 
 def test_the_peak_of_s_is_its_h_infinity_norm() -> None:
