@@ -20,7 +20,7 @@ import numpy as np
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.catalogue import restricted
-from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 

@@ -157,7 +157,7 @@ def main() -> None:
                     draft.write_text(text + extra + BUDGET)
                     problem = replace(problem_of(load_case(draft)), start=theta)
                     began = time.process_time()
-                    ready, raced = prepared(problem)
+                    ready, raced, _ = prepared(problem)
                     K = raced.controller if raced.certified else None
                     told(label, raced.bandwidth / HZ, K, ready, began)
                     if bound or K is None:

@@ -65,7 +65,7 @@ def stage_row(
 
 def searched_stages(case: CoDesignProblem) -> None:
     """The stage of the largest bandwidth beside that of the least time."""
-    anchored, made = prepared(case)
+    anchored, made, _ = prepared(case)
     anchored, made, _ = least_from(anchored, case.start, made)
     with tempfile.TemporaryDirectory() as name, SampleStore(Path(name) / "s.sqlite") as store:
         fast = replace(with_structured(anchored, minimise="bandwidth"), w1=0.0, w2=-1.0)
@@ -95,7 +95,7 @@ def main() -> None:
         return
     at = dict(zip(case.names, case.start, strict=True)) | start
     case = replace(case, start=tuple(at.values()))
-    anchored, made = prepared(case)
+    anchored, made, _ = prepared(case)
     anchored, made, _ = least_from(anchored, case.start, made)
     print(
         f"   {varied} mm   mass kg   Hz    move ms at that   Hz of the least   least ms   "

@@ -32,8 +32,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner
-from ccd_casadi.synthesis.backends.mixed import solve_slicot
-from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, balance, mixed_sensitivity
+from ccd_casadi.synthesis.backends import StandardPlant, balance, mixed_sensitivity, solve_slicot
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 SB10AD_STATES = 30  # of the generalized plant; larger ones take it seconds

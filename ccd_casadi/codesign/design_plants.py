@@ -13,8 +13,8 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.codesign.direct import polish
 from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.search import conclude_at
 from ccd_casadi.codesign.verified import Solution

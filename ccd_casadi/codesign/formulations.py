@@ -1,13 +1,39 @@
-"""The three formulations of the outer problem under one name."""
+"""The three formulations of the outer problem under one name; the direct one has no surrogate."""
+
+from dataclasses import dataclass
 
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 
-Formulation = Nested | Lifted | Direct
 MANY = 12  # parameters up to which surrogates pay for their fit: docs/development/method.md
 SAMPLES = 1000  # inner problems of a plan over θ, some minutes
+
+
+@dataclass(frozen=True)
+class Direct:
+    """Options of the direct formulation: local solves on the truth.
+
+    Parameters
+    ----------
+    starts : int
+        The start of the case, and a Sobol set over the box.
+    tolerance : float
+        Of the inner problem.
+    box_points : int
+        True inner problems over the box in the global check at the end.
+    """
+
+    starts: int = 4
+    tolerance: float = 1e-3
+    box_points: int = 32
+
+    def sampled(self, variables: int) -> int:
+        """How many designs the plan has."""
+        return self.starts
+
+
+Formulation = Nested | Lifted | Direct
 
 
 def formulation_of(case: Case, name: str) -> Formulation:

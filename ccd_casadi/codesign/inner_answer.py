@@ -35,8 +35,8 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, with_structured
-from ccd_casadi.inner_problem.structured_robustness import checked_whole, worst_case
-from ccd_casadi.inner_problem.structured_search import least_from, with_range, with_worst_plant
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
+from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.closed_loop import equivalent_open_loop
@@ -195,13 +195,13 @@ def structured_answer(
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
         raise UserError(words)
     begin_at, progress, workers = options.begin_at, options.progress, options.workers
-    workers.begin(with_worst_plant.__module__)  # they start while the plants are made
+    workers.begin(prepared.__module__)  # they start while the plants are made
     head = head_of(problem, theta)
     asked = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
         kappa = sections_kappa(begin_at, structure_of(asked))
         asked = with_structured(asked, warm_starts=(kappa,))
-    asked, made, worst = with_worst_plant(asked, progress, workers, begin_at is not None)
+    asked, made, worst = prepared(asked, progress, workers, begin_at is not None)
     fastest = made.bandwidth
     asked, made, least = least_from(asked, theta, made, progress)
     if not made.certified:
@@ -216,9 +216,10 @@ def structured_answer(
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
+    on_box = DesignOnBox(asked, theta, made)
     if worst is None or least is not None:
-        worst = worst_case(asked, theta, made)[0]
-    wide, checked, proof = checked_whole(asked, theta, made, worst, workers)
+        worst = on_box.worst()[0]
+    wide, checked, proof = on_box.judged(worst, workers)
     assert made.controller is not None
     passed = wide.passed and not proof.refuted
     figures = head | {

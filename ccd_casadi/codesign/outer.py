@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples
-from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested

@@ -12,9 +12,8 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
-from ccd_casadi.codesign.direct import polish
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.kinked import SETTLED, descend
+from ccd_casadi.codesign.kinked import SETTLED, descend, polish
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds

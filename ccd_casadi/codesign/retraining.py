@@ -17,9 +17,8 @@ import numpy as np
 from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Terms
-from ccd_casadi.codesign.formulations import formulation_of
+from ccd_casadi.codesign.formulations import Direct, formulation_of
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import unmet_constraint

@@ -8,9 +8,8 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult, Terms
-from ccd_casadi.codesign.formulations import MANY, Formulation
+from ccd_casadi.codesign.formulations import MANY, Direct, Formulation
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter

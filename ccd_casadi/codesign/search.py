@@ -10,9 +10,8 @@ from itertools import count
 
 import numpy as np
 
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
-from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
 from ccd_casadi.codesign.global_check import global_check, perturbed
 from ccd_casadi.codesign.outer import End, Outer

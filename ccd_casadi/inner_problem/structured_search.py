@@ -29,7 +29,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_channels,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_robustness import worst_case
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
@@ -87,23 +87,14 @@ def prepared(
     progress: Progress | None = None,
     workers: Pool | None = None,
     only_warm_starts: bool = False,
-) -> tuple[CoDesignProblem, SectionsDesign]:
+) -> tuple[CoDesignProblem, SectionsDesign, Excess | None]:
     """The problem with warm starts and plants: searched at its start θ, worst plants added.
 
     With `only_warm_starts` the warm starts that it has alone are where searches start. The design
     is the search's last; where it is not certified the problem has no warm starts, and each θ is
     searched on its own. All of it is of the largest bandwidth, whatever the problem minimises.
+    Third the worst plant for the design, where it was searched.
     """
-    return with_worst_plant(problem, progress, workers, only_warm_starts)[:2]
-
-
-def with_worst_plant(
-    problem: CoDesignProblem,
-    progress: Progress | None,
-    workers: Pool | None,
-    only_warm_starts: bool,
-) -> tuple[CoDesignProblem, SectionsDesign, Excess | None]:
-    """What `prepared` gives, and the worst plant for the design where it was searched."""
     asked = structured_of(problem).minimise
     problem = with_range(with_structured(problem, minimise="bandwidth"))
     corners = uncertain_plant(problem, problem.start).corners()
@@ -130,7 +121,7 @@ def _wider(
     progress: Progress | None,
 ) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
     """The worst plant, and the problem with those that are worse than its own, if there are any."""
-    worst, found = worst_case(problem, theta, design, turn, progress)
+    worst, found = DesignOnBox(problem, theta, design).worst(turn, progress)
     scenarios = (*structured_of(problem).scenarios, *found)
     return worst, with_structured(problem, scenarios=scenarios) if found else None
 

@@ -20,8 +20,8 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign import outer_structured
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.result import write_run

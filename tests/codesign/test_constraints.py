@@ -8,7 +8,7 @@ from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.kkt import TrueDesign
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve

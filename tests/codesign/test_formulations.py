@@ -11,8 +11,14 @@ from helpers import HZ, problem
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.codesign import run
-from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulations import MANY, SAMPLES, formulation_of, slow_words, usual_name
+from ccd_casadi.codesign.formulations import (
+    MANY,
+    SAMPLES,
+    Direct,
+    formulation_of,
+    slow_words,
+    usual_name,
+)
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.inner_problem.plant_source import PlantSource

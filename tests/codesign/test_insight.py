@@ -12,7 +12,7 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Place
 from ccd_casadi.codesign.pareto import Front, pareto_front
 from ccd_casadi.codesign.post_optimal import post_optimal

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.linalg import null_space
 from test_kkt import MODEL, point
 
-from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.kkt import NEAR, TrueDesign, active_at, newton_step
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.plant_source import PlantSource

@@ -18,7 +18,7 @@ from test_structured_error import CABLES
 from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
 from ccd_casadi.codesign import outer_mixed, outer_structured
-from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.inner_answer import measured_answer
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.result import FORMAT
@@ -40,7 +40,7 @@ SYNTHESISE = [  # every way to a controller
     (structured_bandwidth, "synthesise_sections"), (structured_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design
-    "mixed": (outer_mixed, "final_design"), "sections": (outer_structured, "worst_case"),
+    "mixed": (outer_mixed, "final_design"), "sections": (outer_structured, "_worst_plants"),
 }  # fmt: skip
 EVERY = {  # beside the schema's
     "compliance_max", "compliance_words", "cost_unit", "force_step_max", "globality", "iterates",

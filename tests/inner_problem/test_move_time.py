@@ -211,7 +211,7 @@ def test_the_example_is_a_case_of_move_time() -> None:
 
 @pytest.mark.slow
 def test_the_envelope_gradient_is_the_slope_of_the_least_time() -> None:
-    problem, made = prepared(small())
+    problem, made, _ = prepared(small())
     problem, made, _ = least_from(problem, problem.start, made)
     assert made.certified
     theta = np.array([0.0155, 0.85])

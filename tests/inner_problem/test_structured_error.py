@@ -14,7 +14,7 @@ from test_structured_codesign import PID, quick
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.outer_structured import with_initial_search

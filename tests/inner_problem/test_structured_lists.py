@@ -8,7 +8,7 @@ from test_structured_codesign import PID, quick
 
 from ccd_casadi.codesign import outer_structured, structured_lists
 from ccd_casadi.codesign.catalogue import restricted
-from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.structured_lists import ListedStructured

@@ -67,7 +67,7 @@ def anchored() -> CoDesignProblem:
     assert isinstance(problem.controller, StructuredProblem)
     # where |S| may leap at ω_b the optimum lies on a kink
     few = replace(problem.controller, starts=4, shape_ends=ShapeEnd.CROSSING)
-    found, made = prepared(replace(problem, controller=few))
+    found, made, _ = prepared(replace(problem, controller=few))
     assert made.certified
     return found
 

@@ -22,14 +22,15 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space
 from ccd_casadi.support.errors import MissingPackage, require
-from ccd_casadi.synthesis.backends.mixed import (
+from ccd_casadi.synthesis.backends import (
     AGREE,
     SOLVERS,
     BackendResult,
+    StandardPlant,
+    mixed_sensitivity,
     synthesise_with,
     verdicts,
 )
-from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, mixed_sensitivity
 
 ROOT = Path(__file__).resolve().parents[2]
 

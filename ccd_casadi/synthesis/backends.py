@@ -1,6 +1,13 @@
 """Mixed sensitivity by any back end, every design judged by the same certificate.
 
-SLICOT's SB10AD: two Riccati equations (Glover & Doyle 1988), any standard plant. It accepts a γ
+A back end answers for the standard plant of H∞ control,
+
+    ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
+
+`riccati` is the package's own and serves stable plants in mixed sensitivity; `slicot` (SB10AD)
+serves any standard plant and is optional. `benchmarks/lmi.py` is a third one.
+
+SLICOT's SB10AD: two Riccati equations (Glover & Doyle 1988). It accepts a γ
 when its Riccati solver reports no error and the loop is stable; it tests neither X >= 0 nor the
 norm. Its γ is therefore only a search variable: a design counts when the certificate passes, and
 not otherwise. Left to itself it starts at 1e100 and goes on in steps of 0.1, which does not end;
@@ -11,28 +18,91 @@ call it through `worker_process.Runner` where the plant is not known.
 import math
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.kernels.disturbance import four_block_plant
+from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import MissingPackage, require
 from ccd_casadi.support.worker_process import Overrun, Runner
-from ccd_casadi.synthesis.backends.standard_plant import (
-    Attempt,
-    Solver,
-    StandardPlant,
-    balance,
-    mixed_sensitivity,
-)
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 STARTS = (1e3, 1e6)  # finite γ to bisect from; the second where the first is too low
 BISECT, SUBOPTIMAL = 1, 4  # SB10AD's jobs
+AGREE = 1e-3  # relative: what an interior-point method is good for
+BELOW = 1e-6  # relative: a claim this far below the bound is wrong
+
+
+@dataclass(frozen=True)
+class StandardPlant:
+    """(A, [B1 B2], [C1; C2], [D11 D12; D21 D22]), partitioned."""
+
+    A: Array
+    B1: Array
+    B2: Array
+    C1: Array
+    C2: Array
+    D11: Array
+    D12: Array
+    D21: Array
+    D22: Array
+
+    def whole(self) -> StateSpace:
+        """The plant as one state space."""
+        return StateSpace(
+            self.A,
+            np.hstack([self.B1, self.B2]),
+            np.vstack([self.C1, self.C2]),
+            np.block([[self.D11, self.D12], [self.D21, self.D22]]),
+        )
+
+
+def mixed_sensitivity(plant: ScaledPlant, weights: Weights) -> StandardPlant:
+    """[W_S S; W_KS KS; W_T T] as r to z, with y = e = r - Gu, in the plant's scaled units.
+
+    With `weights.disturbance` the four blocks, (r, d) to [W_S e; W_KS u; W_T u].
+    """
+    p, m = len(plant.C), plant.B.shape[1]
+    given = (plant.A, plant.B, plant.C, weights.scaled(plant.omega_0))
+    if weights.delta:
+        A, B1, B2, C1, C2, D11, D12 = four_block_plant(*given, weights.delta)
+        return StandardPlant(A, B1, B2, C1, C2, D11, D12, np.eye(p, p + m), np.zeros((p, m)))
+    A, B1, B2, C1, C2, d1, d2 = generalized_plant(*given)
+    D11, D12 = np.zeros((2 * p + m, p)), np.zeros((2 * p + m, m))
+    D11[:p], D12[p : p + m] = d1 * np.eye(p), d2 * np.eye(m)
+    return StandardPlant(A, B1, B2, C1, C2, D11, D12, np.eye(p), np.zeros((p, m)))
+
+
+def balance(plant: StandardPlant) -> StandardPlant:
+    """The same plant in balanced coordinates of its state."""
+    whole = plant.whole()
+    A, B, C = balanced(whole.A, whole.B, whole.C)
+    w, z = plant.D11.shape[1], len(plant.D11)
+    return replace(plant, A=A, B1=B[:, :w], B2=B[:, w:], C1=C[:z], C2=C[z:])
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """γ_opt as the back end has it, and a controller that is to reach `gamma`, e or y to u.
+
+    `controller` is None where there is none; `reason` then says why.
+    """
+
+    gamma_opt: float
+    gamma: float
+    controller: StateSpace | None
+    reason: str = ""
+
+
+# (plant, gamma_backoff=1.02): H∞ synthesis for any standard plant at that many times its own γ_opt
+Solver = Callable[..., Attempt]
 
 
 def solve_slicot(plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt:
@@ -130,10 +200,6 @@ def _timed(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[A
     began = time.perf_counter()
     attempt = solve(plant, gamma_backoff=gamma_backoff)
     return attempt, time.perf_counter() - began
-
-
-AGREE = 1e-3  # relative: what an interior-point method is good for
-BELOW = 1e-6  # relative: a claim this far below the bound is wrong
 
 
 def verdicts(results: Sequence[BackendResult]) -> list[BackendResult]:
