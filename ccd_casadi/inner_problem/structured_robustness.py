@@ -28,7 +28,7 @@ from ccd_casadi.fixed_structure.worst_plant import (
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import goal_of
+from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     structure_of,
@@ -76,7 +76,7 @@ class DesignOnBox:
             problem, self.uncertain, design.kappa, design.bandwidth, turn, progress
         )
         if problem.figure is MOVE_TIME and design.controller is not None:
-            value = float(np.exp(goal_of(problem, theta, ()).at(design.kappa)[0]))
+            value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
             seed = structured_of(problem).seed + turn
             time, option, point = latest_plant(problem, theta, design.controller, seed)
             if progress is not None:
