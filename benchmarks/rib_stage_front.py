@@ -40,7 +40,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structured_of,
     with_options,
 )
-from ccd_casadi.inner_problem.structured_robustness import worst_case
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import ROUNDS, prepared, with_range
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -122,7 +122,7 @@ def on_the_whole_set(
     asked, made, _ = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
     if not made.certified or made.certificate is None:
         return {"certified": False, "reason": made.words}
-    worst = worst_case(asked, theta, made, turn=ROUNDS)[0]
+    worst = DesignOnBox(asked, theta, made).worst(turn=ROUNDS)[0]
     return {
         "certified": True,
         "bandwidth_hz": made.bandwidth / HZ,

@@ -55,12 +55,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structured_of,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_robustness import (
-    certify_lattice,
-    fresh_yield,
-    proof_of,
-    worst_case,
-)
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import ROUNDS, prepared
 from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
@@ -229,9 +224,10 @@ def climbed(asked: CoDesignProblem) -> dict[str, Any]:
     asked, made, _ = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
     if not made.certified or made.certificate is None:
         return {"certified": False, "reason": made.words}
-    worst = worst_case(asked, asked.start, made, turn=ROUNDS)[0]
-    judged, count = certify_lattice(asked, asked.start, made.controller, worst)
-    fresh = fresh_yield(asked, asked.start, made)
+    on_box = DesignOnBox(asked, asked.start, made)
+    worst = on_box.worst(turn=ROUNDS)[0]
+    judged, count = on_box.on_lattice(worst)
+    fresh = on_box.fresh_yield()
     assert fresh is not None
     return {
         "certified": True,
@@ -240,7 +236,7 @@ def climbed(asked: CoDesignProblem) -> dict[str, Any]:
         "worst_excess": float(np.expm1(worst.value)),
         "judged": {"plants": count, "passed": judged.passed},
         "fresh": {"plants": fresh.draws, "survived": fresh.survived},
-        "proof": proof_of(asked, asked.start, made).words,
+        "proof": on_box.proof().words,
         "GS": max(plant.GS for plant in made.certificate.plants),
         "kappa": made.kappa.tolist(),
     }

@@ -35,7 +35,7 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, with_structured
-from ccd_casadi.inner_problem.structured_robustness import checked_whole, worst_case
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
@@ -216,9 +216,10 @@ def structured_answer(
             "largest_bandwidth_hz": fastest / HZ,
             "steps": least.steps,
         }
+    on_box = DesignOnBox(asked, theta, made)
     if worst is None or least is not None:
-        worst = worst_case(asked, theta, made)[0]
-    wide, checked, proof = checked_whole(asked, theta, made, worst, workers)
+        worst = on_box.worst()[0]
+    wide, checked, proof = on_box.judged(worst, workers)
     assert made.controller is not None
     passed = wide.passed and not proof.refuted
     figures = head | {

@@ -49,13 +49,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_structured,
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
-from ccd_casadi.inner_problem.structured_robustness import (
-    checked_whole,
-    fresh_yield,
-    tolerance_prices,
-    worse_elsewhere,
-    worst_case,
-)
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import (
     least_from,
     prepared,
@@ -262,6 +256,7 @@ class StructuredOuter(ThetaOuter):
         end = cast(StructuredEnd, end)
         sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
+        on_box = DesignOnBox(problem, best.theta, design)
         multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
         assert design.controller is not None
         loops = loops_of(problem, best.theta, design.controller)
@@ -271,10 +266,9 @@ class StructuredOuter(ThetaOuter):
         kkt = None if known else certificate()  # which spreads values over the workers itself
 
         def judged() -> tuple[SetCertificate, int, Proof, Yield | None]:
-            whole = checked_whole(problem, best.theta, design, worst, sampler.workers)
-            if whole[-1].conclusive:
-                return *whole, None
-            return *whole, fresh_yield(problem, best.theta, design, sampler.workers)
+            whole = on_box.judged(worst, sampler.workers)
+            drawn = None if whole[-1].conclusive else on_box.fresh_yield(sampler.workers)
+            return *whole, drawn
 
         judgement = alongside(judged)
         with Progress(1, "what limits it", quiet=sampler.quiet) as bar:
@@ -282,7 +276,7 @@ class StructuredOuter(ThetaOuter):
             make = partial(costs_of, problem, best.theta, design.kappa)
             costs = sampler.cached("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
-            prices = tolerance_prices(problem, best.theta, design)
+            prices = on_box.tolerance_prices()
             survival = survived(problem, loops, design.bandwidth)[0] if design.certified else None
             damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
@@ -325,13 +319,14 @@ def _worst_plants(
     """The worst plant found for a design and those to add, by one search and, where that finds
     none, by several elsewhere in the box: before a multi-start search, which they would outdate."""
     problem, tell = sampler.problem, printer("at the end", sampler.quiet)
-    worst, scenarios = worst_case(problem, best.theta, design, 0, tell)
+    on_box = DesignOnBox(problem, best.theta, design)
+    worst, scenarios = on_box.worst(0, tell)
     if scenarios or not np.isfinite(objective_of(problem, best)):
         return worst, scenarios
     few = is_expensive(problem)
     turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
     workers = Workers(1) if few else sampler.workers
-    other, scenarios = worse_elsewhere(problem, best.theta, design, turns, workers, tell)
+    other, scenarios = on_box.worst_elsewhere(turns, workers, tell)
     return max(worst, other, key=lambda one: one.value), scenarios
 
 

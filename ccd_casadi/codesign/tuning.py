@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.grid import frequency_grid, root_flanks
-from ccd_casadi.lti.hold import delay_parts, delayed, in_w, sampled, tustin
+from ccd_casadi.lti.hold import delay_parts, delayed, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
@@ -220,8 +220,7 @@ def _peak(G: StateSpace, K: StateSpace | None) -> tuple[float, float]:
     """‖S‖∞ of the sampled loop and its ω in rad/s; infinite where it is not stable."""
     if K is None:
         return np.inf, np.nan
-    norm, v = hinf_norm(in_w(closed_loop(G, tustin(K, G.period)).S))
-    return norm, float(2.0 / G.period * np.arctan(0.5 * v * G.period))
+    return hinf_norm(closed_loop(G, tustin(K, G.period)).S)
 
 
 def _finer(response: MeasuredResponse, G: StateSpace, omega: list[float]) -> MeasuredResponse:

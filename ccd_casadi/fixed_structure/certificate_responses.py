@@ -6,11 +6,13 @@ so are confirmed by Hamiltonian matrices (`lti.norms`), which begin at them.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import schur
 
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
@@ -77,7 +79,7 @@ class LoopTable:
     def at(self, which: np.ndarray, omega: Array) -> dict[str, Array]:
         """Every curve (N, k) of the plants `which` (N,) at ω (N, k) in rad/s."""
         matrices = self._matrices(which, omega)
-        found = {name: _gain(M) for name, M in matrices.items()}
+        found = {name: sigma_max(M) for name, M in matrices.items()}
         weights = self.bounds.weights
         if weights is not None:
             _, W_KS, W_T = np.abs(weights.responses(omega.ravel())).reshape(3, *omega.shape)
@@ -95,7 +97,7 @@ class LoopTable:
     ) -> Array:
         """σ_max(S), or ‖rᵀS‖ of a row r, as `at`."""
         S = self._loops(which, omega)[0]
-        return _gain(S) if row is None else _length(row, S)
+        return sigma_max(S) if row is None else _length(row, S)
 
     def singular(self, which: np.ndarray, omega: Array) -> Array:
         """(4, N, k, p) all singular values of S, KS, T and GS, the largest first."""
@@ -120,15 +122,6 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(a * b if a.shape[-1] == 1 else a @ b)
 
 
-def _gain(M: np.ndarray) -> Array:
-    """σ_max of matrices (..., p, m): the root of the largest eigenvalue of MMᴴ, which squaring
-    leaves as exact as singular values are, in two thirds of their time."""
-    if M.shape[-2:] == (1, 1):
-        return np.abs(M[..., 0, 0])
-    squared = M @ M.conj().swapaxes(-1, -2)
-    return np.asarray(np.sqrt(np.linalg.eigvalsh(squared)[..., -1]))
-
-
 def _length(row: Sequence[float], M: np.ndarray) -> Array:
     """‖rᵀM‖ of a row r and matrices (..., p, m)."""
     return np.asarray(np.linalg.norm(np.array(row) @ M, axis=-1))
@@ -141,17 +134,7 @@ def norms(
 
     `loops` are S, or a row of it, of sampled loops in z.
     """
-    w = at if period is None else np.tan(0.5 * at * period)
-    each = [hinf_norm(_over_w(loop, period), v)[0] for loop, v in zip(loops, w, strict=True)]
+    run = (replace(loop, period=period or 0.0) for loop in loops)
+    each = [hinf_norm(loop, omega)[0] for loop, omega in zip(run, at, strict=True)]
     found = np.maximum(peak, each)
     return found, np.abs(found / peak - 1.0) <= CONFIRMED
-
-
-def _over_w(S: StateSpace, period: float | None) -> StateSpace:
-    """S, of a sampled loop over w, z = (1 + w)/(1 - w)."""
-    if period is None:
-        return S
-    inverse = np.linalg.inv(S.A + np.eye(len(S.A)))
-    root = np.sqrt(2.0)
-    A = inverse @ (S.A - np.eye(len(S.A)))
-    return StateSpace(A, root * inverse @ S.B, root * S.C @ inverse, S.D - S.C @ inverse @ S.B)

@@ -62,12 +62,12 @@ def assess(
     several = len(plants.out) > 1
     within = WITHIN_OF_SEVERAL if several else WITHIN
     depth = (RELEVANT_OF_SEVERAL if several else RELEVANT) if depth is None else depth
-    v, regular = frequency_grid(problem, problem.roots(kappa), poles)
+    v, regular, answers = frequency_grid(problem, problem.roots(kappa), poles)
     P, curves, loop = len(v), np.array(problem.curves, np.int64), problem.loop(kappa, tau)
     crossing = plants.variable(np.exp(tau + problem.leads))  # by number
     end = np.where(problem.short[:, None], crossing, np.inf)
     every = np.arange(P)
-    value = levels(np.tile(curves, (P, 1)), every, v, loop, min(depth, -within))
+    value = levels(np.tile(curves, (P, 1)), every, v, loop, min(depth, -within), answers)
     value = np.where(v[..., None, None] <= end, value, -np.inf)
     peaks = local_peaks(loop, curves, v, value, depth, end)
     peaks = peaks.and_those(hidden := hidden_peaks(curves, v, value))

@@ -30,6 +30,7 @@ from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.loop_curvature import second
+from ccd_casadi.kernels.loop_grid import NONE
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.loop_rows import levels, rows
 from ccd_casadi.support.arrays import Array
@@ -218,7 +219,7 @@ def _(
     loop = problem.loop(kappa, tau)
     codes = np.array(problem.curves, np.int64)
     every = np.arange(lines)
-    value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT)[:, 0]
+    value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT, NONE)[:, 0]
     value = np.where(problem.short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
     i, c, k = np.nonzero(value > RELEVANT)
     at_low = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.S_LOW]))

@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.limits import HALF_POWER, Limit, LoopCurve
 from ccd_casadi.kernels.loop_point import LoopArrays
+from ccd_casadi.kernels.modes import responses
 from ccd_casadi.lti.grid import root_flanks
 from ccd_casadi.support.arrays import Array
 
@@ -69,10 +70,26 @@ class LoopProblem:
     def fixed(self) -> Array:
         """The base grid and the flanks of every plant's poles and zeros, (P, k)."""
         roots = [np.append(np.linalg.eigvals(G.A), G.zeros()) for G in self.plants.systems]
+        roots = [own[own.imag >= 0.0] for own in roots]
         found = np.full((len(roots), max(map(len, roots))), np.nan, complex)
         for i, own in enumerate(roots):
             found[i, : len(own)] = own
         return np.concatenate([np.tile(self.base, (len(found), 1)), flanked(found)], axis=1)
+
+    @cached_property
+    def answers(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the plants answer at `fixed`, with hold and delay and without, (P, k, p, m)."""
+        P, v = self.plants, self.fixed
+        which = np.repeat(np.arange(P.count), v.shape[1])
+        free = P.modes._replace(period=0.0, delay=0.0)
+        pairs = ((P.modes, v), (free, P.frequency(v)))
+        shape = (*v.shape, *P.residues.shape[2:])
+        held, bare = (responses(modes, which, at.ravel())[:, 0] for modes, at in pairs)
+        return held.reshape(shape).copy(), bare.reshape(shape).copy()
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without what another process computes as fast as it reads it."""
+        return {key: value for key, value in vars(self).items() if key != "answers"}
 
     @cached_property
     def curves(self) -> tuple[LoopCurve, ...]:

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.loop_problem import Columns, LoopProblem, flanked
+from ccd_casadi.fixed_structure.loop_problem import Columns, LoopProblem
+from ccd_casadi.kernels.loop_grid import NONE, Answers, maxima, merged, unseen
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.loop_rows import close, levels
+from ccd_casadi.lti.grid import FLANKS
 from ccd_casadi.support.arrays import Array
 
 HIDDEN = 1e-2  # ln of the share of its bound above which a maximum between grid points is sought
@@ -41,31 +43,17 @@ class Brackets(Columns):
 
 def frequency_grid(
     problem: LoopProblem, roots: np.ndarray, poles: np.ndarray
-) -> tuple[Array, np.ndarray]:
-    """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base.
+) -> tuple[Array, np.ndarray, Answers]:
+    """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base,
+    and what the plants answer there.
 
-    `roots`: the zeros and the poles of K.
+    `roots`: the zeros and the poles of K. A loop may be faster than the base: the grid goes on past
+    its last root.
     """
-    own = np.tile(roots[np.abs(roots) > 0.0], (len(poles), 1))
-    joint = np.concatenate([problem.fixed, flanked(own), flanked(poles)], axis=1)
-    # A loop may be faster than the base grid: past its last root no curve has a peak.
-    last = np.maximum(np.abs(np.concatenate([own, poles], axis=1)).max(axis=1), problem.base[-1])
-    joint = np.column_stack([joint, FAR * last])
-    bottom = problem.base[0]
-    # Points that fall together would hide a peak between them: spares go below the base instead.
-    spare = np.broadcast_to(bottom * np.linspace(0.5, 0.99, joint.shape[1]), joint.shape)
-    joint = np.where(joint >= bottom, joint, spare)
-    order = np.argsort(joint, axis=1, kind="stable")
-    v = np.take_along_axis(joint, order, axis=1)
-    twice = np.zeros(v.shape, bool)
-    twice[:, 1:] = np.diff(v, axis=1) < APART * v[:, 1:]
-    regular = (order < len(problem.base)) & ~twice
-    v = np.where(twice, spare * 0.5, v)
-    order = np.argsort(v, axis=1)
-    v, regular = np.take_along_axis(v, order, axis=1), np.take_along_axis(regular, order, axis=1)
-    # Conjugate roots fall together, so that nearly half were spares; one below the base is enough.
-    useless = slice(1, max(1, int((v < bottom).sum(axis=1).min())))
-    return np.delete(v, useless, axis=1), np.delete(regular, useless, axis=1)
+    fixed, base = problem.fixed, problem.base
+    own, ends = roots[np.abs(roots) > 0.0], (float(base[0]), float(base[-1]))
+    v, place = merged(fixed, own, poles, FLANKS, ends, APART, FAR)
+    return v, (place >= 0) & (place < len(base)), Answers(place, *problem.answers)
 
 
 def local_peaks(
@@ -76,38 +64,23 @@ def local_peaks(
     Brackets stop at `end` (C, numbers) in v; those near their bounds are narrowed where singular
     values may cross.
     """
-    (P, count), first = v.shape, loop.out.shape[1]
-    tops = value > depth
-    tops[:, 1:] &= value[:, 1:] >= value[:, :-1]
-    tops[:, :-1] &= value[:, :-1] > value[:, 1:]
-    i, at, c, k = np.nonzero(tops)
-    low, high = v[i, np.maximum(at - 1, 0)], v[i, np.minimum(at + 1, count - 1)]
-    found = Brackets(curves[c], i + k * P, v[i, at], low, np.minimum(high, end[c, k]))
+    P, first = len(v), loop.out.shape[1]
+    places, beside = maxima(value, v, end, depth)
+    i, at, c, k = places.T
+    found = Brackets(curves[c], i + k * P, v[i, at], *beside.T)
     if first == 1:
         return found
     near = np.flatnonzero((value[i, at, c, k] > -CLOSE) & (found.low < found.high))
     inside = np.geomspace(found.low[near], found.high[near], FINER, axis=1)
     inside = np.sort(np.concatenate([inside, found.start[near, None]], axis=1), axis=1)
-    level = levels(found.curve[near, None], i[near], inside, loop, -2.0 * CLOSE)
+    level = levels(found.curve[near, None], i[near], inside, loop, -2.0 * CLOSE, NONE)
     return split(found, near, inside, level[:, :, 0], P, first)
 
 
 def hidden_peaks(curves: np.ndarray, v: Array, value: Array) -> Brackets:
-    """Steps of the grid near a bound in which a flat maximum may lie that no grid point shows.
-
-    A parabola through a step and the point before it ends with a slope of the other sign.
-    """
-    i, at, c, k = np.nonzero(np.maximum(value[:, 1:-2], value[:, 2:-1]) > -HIDDEN)
-    beside = at[:, None] + np.arange(4)
-    places = v[i[:, None], beside]
-    with np.errstate(invalid="ignore"):
-        rise = np.diff(value[i[:, None], beside, c[:, None], k[:, None]], axis=1)
-        before, step, after = (rise / np.diff(np.log(places), axis=1)).T
-        rises = (before > 0.0) & (step > 0.0) & (2.0 * step < before)
-        falls = (after < 0.0) & (step < 0.0) & (2.0 * step > after)
-        shown = (rises & (after <= 0.0)) | (falls & (before >= 0.0))
-    hidden = (rises | falls) & ~shown
-    i, c, k, (_, low, end, _) = i[hidden], c[hidden], k[hidden], places[hidden].T
+    """Steps of the grid near a bound in which a flat maximum may lie that no grid point shows."""
+    found, ends = unseen(value, v, -HIDDEN)
+    (i, c, k), (low, end) = found.T, ends.T
     return Brackets(curves[c], i + k * len(v), end, low, end)
 
 

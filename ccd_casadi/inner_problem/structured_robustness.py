@@ -5,7 +5,7 @@ of the box beside them, branch and bound at all of it.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import call
 
 import numpy as np
@@ -51,28 +51,128 @@ FRESH, FRESH_OF_SEVERAL = 3000, 300
 FRESH_SEED = 2000  # apart from those of the search and of the lattice
 
 
-def worst_case(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    design: SectionsDesign,
-    turn: int = 0,
-    progress: Progress | None = None,
-) -> tuple[Excess, tuple[Scenario, ...]]:
-    """The worst plant of the box for a design, and those to add: past a bound, each a new one.
+@dataclass(frozen=True)
+class DesignOnBox:
+    """A design of a problem at θ, held against the whole box of plants there."""
 
-    Where a move's time counts the plant that settles latest besides, if it is later than v.
-    """
-    uncertain = uncertain_plant(problem, theta)
-    worst, found = violations(problem, uncertain, design.kappa, design.bandwidth, turn, progress)
-    if problem.figure is MOVE_TIME and design.controller is not None:
-        value = float(np.exp(goal_of(problem, theta, ()).at(design.kappa)[0]))
-        seed = structured_of(problem).seed + turn
-        time, option, point = latest_plant(problem, theta, design.controller, seed)
-        if progress is not None:
-            progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
-        if time > value:
-            found = (*found, (option, tuple(map(float, point))))
-    return worst, found
+    problem: CoDesignProblem
+    theta: Sequence[float]
+    design: SectionsDesign
+
+    @property
+    def uncertain(self) -> UncertainPlant:
+        """The box."""
+        return uncertain_plant(self.problem, self.theta)
+
+    def worst(
+        self, turn: int = 0, progress: Progress | None = None
+    ) -> tuple[Excess, tuple[Scenario, ...]]:
+        """The worst plant of the box, and those to add: past a bound, each a new one.
+
+        Where a move's time counts the plant that settles latest besides, if it is later than v.
+        """
+        problem, theta, design = self.problem, self.theta, self.design
+        worst, found = violations(
+            problem, self.uncertain, design.kappa, design.bandwidth, turn, progress
+        )
+        if problem.figure is MOVE_TIME and design.controller is not None:
+            value = float(np.exp(goal_of(problem, theta, ()).at(design.kappa)[0]))
+            seed = structured_of(problem).seed + turn
+            time, option, point = latest_plant(problem, theta, design.controller, seed)
+            if progress is not None:
+                progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
+            if time > value:
+                found = (*found, (option, tuple(map(float, point))))
+        return worst, found
+
+    def worst_elsewhere(
+        self, turns: range, workers: Pool, progress: Progress
+    ) -> tuple[Excess, tuple[Scenario, ...]]:
+        """The worst plant of several searches, and those to add of the first that finds any; as
+        many at a time as there are workers."""
+        seen: list[Excess] = []
+        for first in turns[:: workers.count]:
+            own = range(first, min(first + workers.count, turns.stop))
+            found = dict(results(workers, self.worst, {turn: (turn,) for turn in own}))
+            seen += [worst for worst, _ in found.values()]
+            largest = max(seen, key=lambda one: one.value)
+            words = f"{100.0 * np.exp(largest.value):.6g} % of a bound at most"
+            progress(f"{words}, searched from elsewhere")
+            added = next((found[turn][1] for turn in own if found[turn][1]), ())
+            if added:
+                break
+        return largest, added
+
+    def on_lattice(self, worst: Excess, workers: Pool | None = None) -> tuple[SetCertificate, int]:
+        """The independent judge on a lattice of the box and the worst plant; how many plants it
+        saw.
+
+        The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
+        """
+        structured, uncertain = structured_of(self.problem), self.uncertain
+        points = [*lattice(uncertain, CHECKED, structured.seed + 1000), (worst.option, worst.point)]
+        if not uncertain.names:
+            points = uncertain.corners()[: 1 + len(structured.uncertainty.options)]
+        plants, K = uncertain.plants(points), self.design.controller
+        assert K is not None
+        return _judged(self.problem, plants, K, workers), len(points)
+
+    def fresh_yield(self, workers: Pool | None = None) -> Yield | None:
+        """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
+
+        The options are drawn alike often. None where there is no box to draw from.
+        """
+        structured, uncertain = structured_of(self.problem), self.uncertain
+        if not uncertain.names or self.design.controller is None:
+            return None
+        count = FRESH if plant_of(self.problem).outputs == 1 else FRESH_OF_SEVERAL
+        plants = uncertain.drawn(np.random.default_rng((structured.seed, FRESH_SEED)), count)
+        found = _judged(self.problem, plants, self.design.controller, workers).plants
+        bounds = bounds_of(self.problem).looser(LOOSE)
+        least = self.design.bandwidth * (1.0 - LOOSE)
+        kept = [
+            one.stable and one.confirmed and one.bandwidth >= least
+            and max((bounds.shares(one) | bounds.channel_shares(one.channels)).values())
+            <= 1.0 + TOLERANCE
+            for one in found
+        ]  # fmt: skip
+        return Yield(sum(kept), count)
+
+    def proof(self, workers: Pool | None = None) -> Proof:
+        """Branch and bound over the whole box."""
+        design, problem = self.design, self.problem
+        return prove(
+            self.uncertain, design.structure, design.kappa, design.bandwidth, bounds_of(problem),
+            problem.sampling, workers=workers,
+        )  # fmt: skip
+
+    def judged(self, worst: Excess, workers: Pool) -> tuple[SetCertificate, int, Proof]:
+        """On a lattice and by proof, at one time; of several options, whose proofs are spread over
+        the workers, one after the other."""
+        if structured_of(self.problem).uncertainty.options:
+            return *self.on_lattice(worst, workers), self.proof(workers)
+        tasks = {"proof": (self.proof,), "lattice": (self.on_lattice, worst)}
+        found = dict(results(workers, call, tasks))
+        return *found["lattice"], found["proof"]
+
+    def tolerance_prices(self) -> dict[str, float]:
+        """dω_b*/d ln t in rad/s of every tolerance t of [robust], at an optimal design.
+
+        Where t grows by 1 % every plant p of the set goes (p - model)/100 further off the model, so
+        that with the multipliers μ of its rows c, dω_b*/d ln t = -Σ μ_j ∂c_j/∂p (p - model). None
+        are known at a design that is not stationary or where J counts another figure.
+        """
+        problem, uncertain, plants = self.problem, self.uncertain, []
+        if problem.figure is not BANDWIDTH or not uncertain.names:
+            return {}
+        for option, point in structured_of(problem).scenarios or uncertain.corners():
+            plant = uncertain.sloped(np.array(point), option)
+            further = (np.array(point) - uncertain.nominal)[:, None, None]
+            slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
+            plants.append(replace(plant, **slopes))
+        found = bandwidth_envelope(plants, bounds_of(problem), self.design, problem.sampling)
+        gradient = [] if found is None else found.gradient.tolist()
+        return dict(zip(uncertain.names, gradient, strict=False))
 
 
 def violations(
@@ -111,132 +211,10 @@ def violations(
     return heads[0], tuple(found)
 
 
-def worse_elsewhere(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    design: SectionsDesign,
-    turns: range,
-    workers: Pool,
-    progress: Progress,
-) -> tuple[Excess, tuple[Scenario, ...]]:
-    """The worst plant of several searches, and those to add of the first that finds any; as many at
-    a time as there are workers."""
-    seen: list[Excess] = []
-    for first in turns[:: workers.count]:
-        own = range(first, min(first + workers.count, turns.stop))
-        tasks = {turn: (problem, theta, design, turn) for turn in own}
-        found = dict(results(workers, worst_case, tasks))
-        seen += [worst for worst, _ in found.values()]
-        largest = max(seen, key=lambda one: one.value)
-        words = f"{100.0 * np.exp(largest.value):.6g} % of a bound at most"
-        progress(f"{words}, searched from elsewhere")
-        added = next((found[turn][1] for turn in own if found[turn][1]), ())
-        if added:
-            break
-    return largest, added
-
-
-def certify_lattice(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    controller: StateSpace,
-    worst: Excess,
-    workers: Pool | None = None,
-) -> tuple[SetCertificate, int]:
-    """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
-
-    The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
-    """
-    structured, uncertain = structured_of(problem), uncertain_plant(problem, theta)
-    points = [*lattice(uncertain, CHECKED, structured.seed + 1000), (worst.option, worst.point)]
-    if not uncertain.names:
-        points = uncertain.corners()[: 1 + len(structured.uncertainty.options)]
-    return _judged(problem, uncertain.plants(points), controller, workers), len(points)
-
-
-def fresh_yield(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    design: SectionsDesign,
-    workers: Pool | None = None,
-) -> Yield | None:
-    """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
-
-    The options are drawn alike often. None where there is no box to draw from.
-    """
-    structured, uncertain = structured_of(problem), uncertain_plant(problem, theta)
-    if not uncertain.names or design.controller is None:
-        return None
-    count = FRESH if plant_of(problem).outputs == 1 else FRESH_OF_SEVERAL
-    plants = uncertain.drawn(np.random.default_rng((structured.seed, FRESH_SEED)), count)
-    found = _judged(problem, plants, design.controller, workers).plants
-    bounds, least = bounds_of(problem).looser(LOOSE), design.bandwidth * (1.0 - LOOSE)
-    kept = [
-        one.stable and one.confirmed and one.bandwidth >= least
-        and max((bounds.shares(one) | bounds.channel_shares(one.channels)).values())
-        <= 1.0 + TOLERANCE
-        for one in found
-    ]  # fmt: skip
-    return Yield(sum(kept), count)
-
-
-def proof_of(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    design: SectionsDesign,
-    workers: Pool | None = None,
-) -> Proof:
-    """Branch and bound over the whole box of plants at θ."""
-    return prove(
-        uncertain_plant(problem, theta), design.structure, design.kappa, design.bandwidth,
-        bounds_of(problem), problem.sampling, workers=workers,
-    )  # fmt: skip
-
-
-def checked_whole(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    design: SectionsDesign,
-    worst: Excess,
-    workers: Pool,
-) -> tuple[SetCertificate, int, Proof]:
-    """`certify_lattice` and `proof_of` at one time; of several options, whose proofs are spread
-    over the workers, one after the other."""
-    assert design.controller is not None
-    lattice = (problem, theta, design.controller, worst)
-    if structured_of(problem).uncertainty.options:
-        return *certify_lattice(*lattice, workers), proof_of(problem, theta, design, workers)
-    tasks = {"proof": (proof_of, problem, theta, design), "lattice": (certify_lattice, *lattice)}
-    found = dict(results(workers, call, tasks))
-    return *found["lattice"], found["proof"]
-
-
-def tolerance_prices(
-    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
-) -> dict[str, float]:
-    """dω_b*/d ln t in rad/s of every tolerance t of [robust], at an optimal design.
-
-    Where t grows by 1 % every plant p of the set goes (p - model)/100 further off the model, so
-    that with the multipliers μ of its rows c, dω_b*/d ln t = -Σ μ_j ∂c_j/∂p (p - model). None are
-    known at a design that is not stationary or where J counts another figure.
-    """
-    uncertain, plants = uncertain_plant(problem, theta), []
-    if problem.figure is not BANDWIDTH or not uncertain.names:
-        return {}
-    for option, point in structured_of(problem).scenarios or uncertain.corners():
-        plant = uncertain.sloped(np.array(point), option)
-        further = (np.array(point) - uncertain.nominal)[:, None, None]
-        slopes = {name: further * getattr(plant, name) for name in ("dA", "dB", "dC")}
-        plants.append(replace(plant, **slopes))
-    found = bandwidth_envelope(plants, bounds_of(problem), design, problem.sampling)
-    gradient = [] if found is None else found.gradient.tolist()
-    return dict(zip(uncertain.names, gradient, strict=False))
-
-
 def certify_corners(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
 ) -> SetCertificate:
-    """The same on the model of every option and the corners of the box."""
+    """The judge on the model of every option and the corners of the box."""
     uncertain = uncertain_plant(problem, theta)
     return _judged(problem, uncertain.plants(uncertain.corners()), controller)
 

@@ -29,7 +29,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_channels,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_robustness import worst_case
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
@@ -121,7 +121,7 @@ def _wider(
     progress: Progress | None,
 ) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
     """The worst plant, and the problem with those that are worse than its own, if there are any."""
-    worst, found = worst_case(problem, theta, design, turn, progress)
+    worst, found = DesignOnBox(problem, theta, design).worst(turn, progress)
     scenarios = (*structured_of(problem).scenarios, *found)
     return worst, with_structured(problem, scenarios=scenarios) if found else None
 

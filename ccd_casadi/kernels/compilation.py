@@ -81,7 +81,14 @@ def compile_part(part: str) -> None:
 
 
 def _compile_rows(curvature: bool) -> None:
-    from ccd_casadi.kernels import loop_curvature, loop_point, loop_rows, modes, plant_slopes
+    from ccd_casadi.kernels import (
+        loop_curvature,
+        loop_grid,
+        loop_point,
+        loop_rows,
+        modes,
+        plant_slopes,
+    )
     from ccd_casadi.kernels.limits import Limit
 
     one, first, square = np.ones(1), np.zeros(1, np.int64), np.eye(1)
@@ -97,7 +104,10 @@ def _compile_rows(curvature: bool) -> None:
         slopes = plant_slopes.PlantSlopes(terms, side, side, side, apart, four, four, 0.0, 0.0)
         plant_slopes.form_slopes(slopes, first, one, side[0], side[0], False)
     else:
-        loop_rows.levels(first[None], first, square, loop, 0.0)
+        loop_rows.levels(first[None], first, square, loop, 0.0, loop_grid.NONE)
+        loop_grid.merged(square, one + 0j, square + 0j, one, (0.5, 2.0), 1e-8, 1e3)
+        loop_grid.maxima(square[..., None, None], square, square, 0.0)
+        loop_grid.unseen(square[..., None, None], square, 0.0)
         loop_rows.rows(first, first, first, one, loop)
         loop_rows.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
 
@@ -158,7 +168,7 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    names = ("design", "gradients", "loop_curvature", "loop_rows", "plant_slopes")
+    names = ("design", "gradients", "loop_curvature", "loop_grid", "loop_rows", "plant_slopes")
     for name in names:  # with them all the others
         import_module(f"{PACKAGE}.{name}")
     found = {}

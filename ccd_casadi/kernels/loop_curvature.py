@@ -53,9 +53,10 @@ def second(curve, number, which, v, loop):
     back, ahead = np.empty((m, c), z), np.empty((m, c), z)
     for j in range(v.size):
         gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
-        response(terms, residues, T, delay, which[j], v[j], False, at, G)
+        ω, chain = warped(T, v[j])
+        response(terms, residues, T, delay, which[j], ω, chain, False, at, G)
         if curve[j] == LoopCurve.GS:
-            response(terms, residues, 0.0, 0.0, which[j], warped(T, v[j])[0], False, at, FREE)
+            response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, False, at, FREE)
         closed(into, out, of[K], at)
         σ, place = gain_of(curve[j], number[j], into, out, own, at, of, sigma)
         columns = m if curve[j] == LoopCurve.GS else p

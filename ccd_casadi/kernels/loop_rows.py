@@ -31,42 +31,52 @@ from ccd_casadi.kernels.small import largest_gain, singular
 
 
 @compiled
-def levels(curves, which, v, loop, least):
+def levels(curves, which, v, loop, least, answers):
     """ln of the gains over their bounds, (N, k, curves, numbers), of the curves (N, C) of each of N
     plants `which` at v (N, k); -inf where none can be above `least`, and where nothing bounds one.
+
+    What the plants answer is looked up in `answers` (`loop_grid`) where it is known.
     """
     count, most = v.shape
     at, of, _, sigma = room(loop)
     factors, values, into, outputs = loop.factors, loop.values, loop.into, loop.out
     terms, residues, T, d = loop.terms, loop.residues, loop.period, loop.delay
-    limits, own = loop.limits, loop.rows
+    limits, own, places = loop.limits, loop.rows, answers.place
     k, matrix_room, vectors = of[K], at[M], at[V]
-    p, numbers = outputs.shape[1], limits.shape[1]
+    p, numbers, m = outputs.shape[1], limits.shape[1], into.shape[0]
     out = np.full((count, most, curves.shape[1], numbers), -np.inf)
     sensitivity = np.empty(p)
     for i in range(count):
         for j in range(most):
             ω, chain = warped(T, v[i, j])
             gains(factors, values, complex(0.0, v[i, j]), k)
-            response(terms, residues, T, d, which[i], v[i, j], False, at, G)
+            place = places[i, j] if places.size else -1
+            if place < 0:
+                response(terms, residues, T, d, which[i], ω, chain, False, at, G)
+            else:
+                for a in range(p):
+                    for b in range(m):
+                        at[G, a, b] = answers.held[which[i], place, a, b]
+                        at[FREE, a, b] = answers.free[which[i], place, a, b]
             closed(into, outputs, k, at)
-            largest, known = np.nan, False  # of S
+            height, known = np.nan, False  # of S: ln of its largest gain, and of all others
             for c in range(curves.shape[1]):
                 curve = curves[i, c]
                 of_s = curve != LoopCurve.KS and curve != LoopCurve.T and curve != LoopCurve.GS
-                if curve == LoopCurve.GS:
-                    response(terms, residues, 0.0, 0.0, which[i], ω, False, at, FREE)
-                rows, columns, top = p, p, largest
-                if not of_s or np.isnan(largest):
+                if curve == LoopCurve.GS and place < 0:
+                    response(terms, residues, 0.0, 0.0, which[i], ω, 1.0, False, at, FREE)
+                rows, columns, top = p, p, height
+                if not of_s or np.isnan(height):
                     rows, columns = matrix(curve, into, outputs, k, at)
                     top = abs(at[M, 0, 0])
                     if rows + columns > 2:
                         top = largest_gain(matrix_room, rows, columns)
-                largest = top if of_s else largest
+                    top = np.log(top)
+                    height = top if of_s else height
                 level = offset(curve, 0, ω, chain, limits)[0]
                 if rows + columns == 2:
-                    out[i, j, c, 0] = np.log(top) + level
-                elif np.log(top) + level > least:
+                    out[i, j, c, 0] = top + level
+                elif top + level > least:
                     if not (of_s and known):
                         matrix(curve, into, outputs, k, at)
                         singular(matrix_room, rows, columns, vectors, sigma, False)
@@ -103,10 +113,10 @@ def rows(curve, number, which, v, loop):
         known = j > 0 and v[j] == v[before] and which[j] == which[before]
         if not known:
             gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
-            response(terms, residues, T, delay, which[j], v[j], True, at, G)
+            response(terms, residues, T, delay, which[j], ω, chain, True, at, G)
             closed(into, out, of[K], at)
         if of_gs and not (known and curve[before] == LoopCurve.GS):
-            response(terms, residues, 0.0, 0.0, which[j], ω, True, at, FREE)
+            response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
         σ, place = gain_of(curve[j], number[j], into, out, own, at, of, sigma)
         level, rise = offset(curve[j], number[j], ω, chain, limits)
         for i in range(c):

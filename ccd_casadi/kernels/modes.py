@@ -32,15 +32,16 @@ class Plants(NamedTuple):
 
 
 @compiled
-def response(terms, residues, T, d, i, v, sloped, at, place):
-    """Fills G (p, m) of plant i at jv, and with `sloped` ∂G/∂ln v: at[place], at[place + 1].
+def response(terms, residues, T, d, i, ω, chain, sloped, at, place):
+    """Fills G (p, m) of plant i at ω, and with `sloped` ∂G/∂ln v: at[place], at[place + 1]; `chain`
+    is ∂ln ω/∂ln v.
 
     With T = 0 free of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d
-    so; v is ω then.
+    so.
     """
-    ω, chain = warped(T, v)
-    s = complex(0.0, ω)
-    z = complex(np.cos(ω * T), np.sin(ω * T))
+    s, z = complex(0.0, ω), 1.0 + 0.0j
+    if T > 0.0:
+        z = complex(np.cos(ω * T), np.sin(ω * T))
     _, count, _, rows, columns = residues.shape
     for a in range(rows):
         for b in range(columns):
@@ -101,8 +102,9 @@ def responses(plants, which, v):
     """G (N, p, m) of the plants `which` at jv and ∂G/∂ln v."""
     out = np.empty((v.size, 2, plants.residues.shape[3], plants.residues.shape[4]), np.complex128)
     for j in range(v.size):
+        ω, chain = warped(plants.period, v[j])
         response(
-            plants.terms, plants.residues, plants.period, plants.delay, which[j], v[j], True,
+            plants.terms, plants.residues, plants.period, plants.delay, which[j], ω, chain, True,
             out[j], 0,
         )  # fmt: skip
     return out

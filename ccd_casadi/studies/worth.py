@@ -36,7 +36,7 @@ from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.structured_robustness import worst_case
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
@@ -194,7 +194,7 @@ def search_error(sampler: Sampler, best: InnerSample) -> float:
     alone = len(ends) == 2 and ends[0].count == 1
     apart = ends[0].bandwidth - ends[1].bandwidth if alone else 0.0
     design = value_with_design(sampler, best).design
-    if plants := worst_case(sampler.problem, best.theta, design)[1]:
+    if plants := DesignOnBox(sampler.problem, best.theta, design).worst()[1]:
         wider = with_scenarios(sampler, plants).value_from(best.theta, best.kappa)
         apart += best.value - float(np.nan_to_num(wider.value))
     return apart

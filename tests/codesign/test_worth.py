@@ -80,7 +80,7 @@ def test_what_a_search_may_have_missed_is_stated(monkeypatch, count, with_plants
     plants = () if with_plants is None else ((0, (0.03,)),)
     monkeypatch.setattr(worth, "multistart_at", lambda *at: searched)
     monkeypatch.setattr(worth, "value_with_design", lambda *at: searched)
-    monkeypatch.setattr(worth, "worst_case", lambda *at: (None, plants))
+    monkeypatch.setattr(worth.DesignOnBox, "worst", lambda *at: (None, plants))
     monkeypatch.setattr(worth, "with_scenarios", lambda *at: wider)
     best = SimpleNamespace(kappa=(1.0,), theta=(0.1,), value=10.0)
     assert search_error(SimpleNamespace(problem=None), best) == pytest.approx(expected)

@@ -40,7 +40,7 @@ SYNTHESISE = [  # every way to a controller
     (structured_bandwidth, "synthesise_sections"), (structured_bandwidth, "least_value"),
 ]  # fmt: skip
 AT_THE_END = {  # what is asked of a polished design
-    "mixed": (outer_mixed, "final_design"), "sections": (outer_structured, "worst_case"),
+    "mixed": (outer_mixed, "final_design"), "sections": (outer_structured, "_worst_plants"),
 }  # fmt: skip
 EVERY = {  # beside the schema's
     "compliance_max", "compliance_words", "cost_unit", "force_step_max", "globality", "iterates",

@@ -21,12 +21,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
-from ccd_casadi.inner_problem.structured_robustness import (
-    certify_corners,
-    certify_lattice,
-    tolerance_prices,
-    worst_case,
-)
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, certify_corners
 from ccd_casadi.inner_problem.structured_search import ENOUGH, prepared, with_range
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -83,17 +78,15 @@ def test_the_price_of_a_tolerance_is_what_another_solve_finds(anchored: CoDesign
         return with_structured(anchored, uncertainty=own, scenarios=())
 
     here = structured_value(wider(), theta)
-    prices = tolerance_prices(wider(), theta, here.design)
+    prices = DesignOnBox(wider(), theta, here.design).tolerance_prices()
     assert list(prices) == ["resonance_shift", "damping", "gain"]
     for name, key in zip(prices, ("shift", "damping", "gain"), strict=True):
         ends = [structured_value(wider(**{key: 1.0 + sign * h}), theta) for sign in (1.0, -1.0)]
         numeric = (ends[0].bandwidth - ends[1].bandwidth) / (2.0 * h)
         assert prices[name] == pytest.approx(numeric, rel=1e-2, abs=1e-4 * here.bandwidth)
     assert min(prices.values()) < -1e-2 * here.bandwidth
-    assert (
-        tolerance_prices(with_structured(anchored, uncertainty=Uncertainty()), theta, here.design)
-        == {}
-    )
+    alone = with_structured(anchored, uncertainty=Uncertainty())
+    assert DesignOnBox(alone, theta, here.design).tolerance_prices() == {}
 
 
 def test_a_theta_has_one_value_whoever_asks(anchored: CoDesignProblem, tmp_path: Path) -> None:
@@ -147,10 +140,11 @@ def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) 
     """The judge on two hundred plants between and beside those that were designed for."""
     theta = anchored.start
     made = structured_value(anchored, theta).design
-    worst, missing = worst_case(anchored, theta, made)
+    on_box = DesignOnBox(anchored, theta, made)
+    worst, missing = on_box.worst()
     assert not missing
     assert made.controller is not None
-    judged, plants = certify_lattice(anchored, theta, made.controller, worst)
+    judged, plants = on_box.on_lattice(worst)
     assert judged.passed
     assert plants > 200
     wild = replace(made.controller, C=1.2 * made.controller.C)
@@ -199,9 +193,9 @@ def test_a_search_that_ended_early_goes_on_until_there_is_a_gradient(
 def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With another S_max in the same folder the anchors and words of the first were taken."""
 
-    def raced(case: CoDesignProblem, *_: object) -> tuple[CoDesignProblem, SimpleNamespace]:
+    def raced(case: CoDesignProblem, *_: object) -> tuple[CoDesignProblem, SimpleNamespace, None]:
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
-        return with_structured(case, warm_starts=((case.inner.S_max,),)), design
+        return with_structured(case, warm_starts=((case.inner.S_max,),)), design, None
 
     monkeypatch.setattr(outer_structured, "prepared", raced)
     case = quick(PID)

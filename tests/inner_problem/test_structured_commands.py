@@ -163,7 +163,7 @@ def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
     for more, survived in ((1.0, 40), (1.05, 0)):
         bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
         made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
-        drawn = structured_robustness.fresh_yield(run.problem, run.theta, made)
+        drawn = structured_robustness.DesignOnBox(run.problem, run.theta, made).fresh_yield()
         assert drawn is not None
         assert (drawn.survived, drawn.draws) == (survived, 40)
 

@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decouplin
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.peak_search import CLOSINGS, FLAT, NARROW, Brackets
-from ccd_casadi.kernels import loop_rows
+from ccd_casadi.kernels import loop_grid, loop_rows
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -99,7 +99,8 @@ def gaps(model: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Arr
     """How far each singular value is from the next one of its matrix, relative."""
     which = model.plants_of(rows)
     loop = model.loop(kappa, tau)
-    level = loop_rows.levels(rows.curve[:, None], which, rows.v[:, None], loop, -np.inf)[:, 0, 0]
+    places = (rows.curve[:, None], which, rows.v[:, None])
+    level = loop_rows.levels(*places, loop, -np.inf, loop_grid.NONE)[:, 0, 0]
     every, number = np.arange(len(which)), rows.plant // len(model.plants.plants)
     whole = number < model.first
     size = np.exp(level[:, : model.first])

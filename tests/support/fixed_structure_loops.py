@@ -9,6 +9,7 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, Problem
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
+from ccd_casadi.kernels.loop_grid import NONE
 from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
 from ccd_casadi.plants.modal import Perturbation, modal_plant
@@ -57,7 +58,7 @@ def by_curve(
 ) -> dict[LoopCurve, Array]:
     """The levels of all plants at v (P, k) by curve, without the margin."""
     codes, loop = np.tile(np.array(curves, np.int64), (len(v), 1)), problem.loop(kappa, tau)
-    found = levels(codes, np.arange(len(v)), v, loop, -np.inf)
+    found = levels(codes, np.arange(len(v)), v, loop, -np.inf, NONE)
     return {curve: found[:, :, i, 0] for i, curve in enumerate(curves)}
 
 
