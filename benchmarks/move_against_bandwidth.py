@@ -28,7 +28,7 @@ from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import goal_of, structured_value
+from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import plants_of, with_structured
 from ccd_casadi.inner_problem.structured_search import least_from, prepared
 from ccd_casadi.plants.plant import hardware_cost
@@ -48,9 +48,9 @@ def stage_row(
     words: str, problem: CoDesignProblem, theta: tuple[float, ...], design: SectionsDesign
 ) -> None:
     """A stage with a controller: times on the set, and what limits its setpoint."""
-    motion, plants = motion_of(problem, theta), plants_of(problem, theta)
+    motion = motion_of(problem, theta)
     assert design.controller is not None
-    smooth = 1e3 * np.exp(goal_of(problem, theta, plants).at(design.kappa)[0])
+    smooth = 1e3 * np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0])
     free = plants_of(replace(problem, suspension=FREE), theta)
     exact = 1e3 * exact_times(problem, motion, free, design.controller).max()
     cycle, mass = motion.cycle, hardware_cost(plant_of(problem), theta)

@@ -16,14 +16,7 @@ from ccd_casadi.fixed_structure import (
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import (
-    LATTICE,
-    WITHIN,
-    BoundedLoop,
-    Excess,
-    lattice,
-    worst_plants,
-)
+from ccd_casadi.fixed_structure.worst_plant import LATTICE, WITHIN, Excess, LoopOnBox, lattice
 from ccd_casadi.support.arrays import Array
 
 AT_ONCE = 3  # plants added in one round
@@ -67,8 +60,8 @@ def synthesise_robustly(
     )
     worst = Excess(0, uncertain.nominal, np.nan)
     while made.certified:
-        loop = BoundedLoop(structure, made.kappa, made.bandwidth, bounds, sampling)
-        heads, _ = worst_plants(uncertain, loop, seed=seed + turn, count=count)
+        loop = LoopOnBox(uncertain, structure, made.kappa, made.bandwidth, bounds, sampling)
+        heads, _ = loop.worst_plants(seed + turn, count)
         worst = heads[0]
         turn += 1
         if worst.value <= WITHIN or turn > rounds:

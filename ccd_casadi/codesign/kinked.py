@@ -145,7 +145,7 @@ def _bend(here: Iterate[_Design], there: Iterate[_Design], bend: float) -> float
         if tag[0] == "shelf" and size > 1e-6:
             same = there.data.same(tag)
             if same is None and value + row @ d > -BAND:
-                return min(4.0 * bend, SHELF)
+                return 4.0 * bend
             if same is not None:
                 seen.append(abs(there.data.g[same] - value - float(row @ d)) / size**2)
     return max(0.25 * bend, 2.0 * max(seen), FLATTEST) if seen else bend

@@ -117,8 +117,7 @@ class Outer(ABC):
         if isinstance(formulation, Direct):
             with self.sampler.spent.on("search"):
                 return self.solve_on_truth(formulation.starts, seed)
-        lifted = isinstance(formulation, Lifted)
-        if isinstance(formulation, Lifted):
+        if lifted := isinstance(formulation, Lifted):
             if self.extra_variables:
                 return solve_lifted(self.sampler, formulation, seed=seed, given=given)
             formulation = Nested(**vars(formulation) | {

@@ -37,12 +37,11 @@ from ccd_casadi.inner_problem.move_figures import stated_time
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import (
+    ProblemAt,
     StructuredValue,
     structured_value,
-    value_of_design,
 )
 from ccd_casadi.inner_problem.structured_plant_set import (
-    plants_of,
     structure_of,
     structured_of,
     uncertain_plant,
@@ -105,7 +104,7 @@ def with_initial_search(
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
         if made.certified and alone and problem.figure is BANDWIDTH:
             # No plant was found worse: this is the search that an end at the start would ask for.
-            make = partial(value_of_design, anchored, start, plants_of(anchored, start), made, 1)
+            make = partial(ProblemAt(anchored, start).value_of, made, 1)
             Sampler(anchored, store, Workers(1)).cached("race", start, StructuredValue, make)
         return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
 
@@ -122,7 +121,7 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
 
     def multistart() -> StructuredValue:
         made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
-        found = value_of_design(problem, theta, plants_of(problem, theta), made, 1)
+        found = ProblemAt(problem, theta).value_of(made, 1)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
     sampler.count_multistart(sample_key(sampler.hash, theta, 0.0, 0.0))

@@ -98,18 +98,13 @@ class RmsError:
     def _summed(self, kappa: Array, changes: Sequence[Sequence[Change]]) -> tuple[float, Array]:
         """ln e and its derivatives to what the changes of each plant's loop are of."""
         K, budget = self.structure.state_space(kappa), replace(self.budget, window=None)
-        total = None
+        variance, slopes = 0.0, np.zeros(len(changes[0]))
         for plant, own in zip(self.plants, changes, strict=True):
             found = variance_slopes(Loop(plant.plant_si(), K, self.hold), budget, own)
             if found is None:
                 return np.inf, np.full(len(own), np.nan)
-            total = found if total is None else replace(
-                total, value=total.value + found.value, gradient=total.gradient + found.gradient
-            )  # fmt: skip
-        assert total is not None
-        variance = total.value[0]
-        value = 0.5 * float(np.log(variance / len(self.plants)))
-        return value, 0.5 * total.gradient[0] / variance
+            variance, slopes = variance + found.value[0], slopes + found.gradient[0]
+        return 0.5 * float(np.log(variance / len(self.plants))), 0.5 * slopes / variance
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
-from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge_all
+from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge
 from ccd_casadi.fixed_structure.race import finished, run_race
 from ccd_casadi.fixed_structure.sections_design import MARGIN, in_problem_units, titled
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
@@ -149,9 +149,7 @@ def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int
     structure, bounds, plants = problem.structure, problem.bounds, problem.plants
     si = structure.in_units(kappa, plants.omega_0, plants.force)
     K = structure.state_space(si)
-    figures = judge_all(
-        problem.responses, K, bounds, period=period, integrator=structure.integrator
-    )
+    figures = judge(problem.responses, K, bounds, period=period, integrator=structure.integrator)
     shares = bounds.shares(figures).items()
     broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in shares
               if figures.stable and not ratio <= 1.0 + EXCEEDED]  # fmt: skip

@@ -66,18 +66,21 @@ def controller_response(K: StateSpace, hz: Array, period: float | None = None) -
 
 
 def judge(
-    measured: MeasuredResponse,
+    measured: MeasuredResponse | Sequence[MeasuredResponse],
     K: StateSpace,
     bounds: Bounds,
     *,
     period: float | None = None,
     integrator: bool = True,
 ) -> MeasuredFigures:
-    """The figures of an SI controller (e in, u out) on the lines.
+    """The figures of an SI controller (e in, u out) on the lines; of several responses the worst.
 
     `period` in s: K is sampled, and G was measured as the controller sees it, hold and delay in it.
     `integrator` of K: then the shape counts from 0 on, else from ω_low.
     """
+    if not isinstance(measured, MeasuredResponse):
+        return _worst([judge(one, K, bounds, period=period, integrator=integrator)
+                       for one in measured])  # fmt: skip
     if period is not None and measured.hz[-1] > 0.5 / period:
         raise UserError("the lines reach beyond half the sampling rate; drop those above")
     whole, hz, G = measured.followed, measured.hz, measured.matrix
@@ -120,16 +123,7 @@ def judge(
     )
 
 
-def judge_all(
-    responses: Sequence[MeasuredResponse],
-    K: StateSpace,
-    bounds: Bounds,
-    *,
-    period: float | None = None,
-    integrator: bool = True,
-) -> MeasuredFigures:
-    """The worst figures of a controller on all responses of a set."""
-    each = [judge(one, K, bounds, period=period, integrator=integrator) for one in responses]
+def _worst(each: Sequence[MeasuredFigures]) -> MeasuredFigures:
     if len(each) == 1:
         return each[0]
     words = "; ".join(f"response {i}: {one.words}" for i, one in enumerate(each, 1))

@@ -40,17 +40,6 @@ CLIMBS = 4  # rounds of them
 
 
 @dataclass(frozen=True)
-class BoundedLoop:
-    """A controller κ in SI and its ω_b (rad/s), with the bounds that its loops have to keep."""
-
-    structure: Structure | ChannelStructure
-    kappa: Array
-    bandwidth: float
-    bounds: Bounds
-    sampling: Sampling | None = None
-
-
-@dataclass(frozen=True)
 class Excess:
     """The largest c of one plant: (option, point), and its value in logarithms of its bound."""
 
@@ -82,123 +71,121 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
     return found + [(i % share, point) for i, point in enumerate(points)]
 
 
-def excesses(
-    uncertain: UncertainPlant, points: Sequence[tuple[int, Array]], loop: BoundedLoop
-) -> Array:
-    """The largest c of the loop with every plant."""
-    return _looked_at(uncertain.plants(points), loop)[0]
+@dataclass(frozen=True)
+class LoopOnBox:
+    """A controller κ in SI with its ω_b (rad/s) on a box of plants, and the bounds that its loops
+    have to keep."""
 
+    uncertain: UncertainPlant
+    structure: Structure | ChannelStructure
+    kappa: Array
+    bandwidth: float
+    bounds: Bounds
+    sampling: Sampling | None = None
 
-def _looked_at(
-    plants: Sequence[ScaledPlant], loop: BoundedLoop
-) -> tuple[Array, LoopProblem, Constraints | None]:
-    """The largest c of every plant's loop; the problem, and the constraints it is one of."""
-    problem = problem_for(plants, loop.structure, loop.bounds, loop.sampling)
-    scaled = in_problem_units(problem, loop.kappa)
-    tau = float(np.log(loop.bandwidth / problem.plants.omega_0))
-    found = assess(problem, scaled, tau, each=True)
-    out = np.full(len(plants), -np.inf)
-    if found.peaks is not None:
-        np.maximum.at(out, problem.plants_of(found.peaks), found.peaks.value - problem.margin)
-    grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
-    value = np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
-    return value, problem, found.peaks
+    def excesses(self, points: Sequence[tuple[int, Array]]) -> Array:
+        """The largest c of the loop with every plant."""
+        return self._looked_at(self.uncertain.plants(points))[0]
 
+    def _looked_at(
+        self, plants: Sequence[ScaledPlant]
+    ) -> tuple[Array, LoopProblem, Constraints | None]:
+        """The largest c of every plant's loop; the problem, and the constraints it is one of."""
+        problem = problem_for(plants, self.structure, self.bounds, self.sampling)
+        scaled = in_problem_units(problem, self.kappa)
+        tau = float(np.log(self.bandwidth / problem.plants.omega_0))
+        found = assess(problem, scaled, tau, each=True)
+        out = np.full(len(plants), -np.inf)
+        if found.peaks is not None:
+            np.maximum.at(out, problem.plants_of(found.peaks), found.peaks.value - problem.margin)
+        grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
+        value = np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
+        return value, problem, found.peaks
 
-def worst_plants(
-    uncertain: UncertainPlant, loop: BoundedLoop, *, seed: int = 0, count: int = LATTICE
-) -> tuple[list[Excess], int]:
-    """The worst plants found, the worst first, and how many were looked at."""
-    n = len(uncertain.names)
-    if n > FEW:
-        return _climbed(uncertain, loop, min(count, UNDAMPED), seed)
-    points = lattice(uncertain, count, seed)
-    value = excesses(uncertain, points, loop)
-    looked, first = len(points), np.argsort(-value)[:SEARCHES]
-    heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
-    if n == 0:
-        return heads, looked
-    box = uncertain.box
-    step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
-    for _ in range(ROUNDS):
-        moves = [
-            (row, np.clip(head.point + sign * step * unit, *box))
-            for row, head in enumerate(heads)
-            for unit in np.eye(n)
-            for sign in (1.0, -1.0)
+    def worst_plants(self, seed: int = 0, count: int = LATTICE) -> tuple[list[Excess], int]:
+        """The worst plants found, the worst first, and how many were looked at."""
+        uncertain, n = self.uncertain, len(self.uncertain.names)
+        if n > FEW:
+            return self._climbed(min(count, UNDAMPED), seed)
+        points = lattice(uncertain, count, seed)
+        value = self.excesses(points)
+        looked, first = len(points), np.argsort(-value)[:SEARCHES]
+        heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
+        if n == 0:
+            return heads, looked
+        box = uncertain.box
+        step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
+        for _ in range(ROUNDS):
+            moves = [
+                (row, np.clip(head.point + sign * step * unit, *box))
+                for row, head in enumerate(heads)
+                for unit in np.eye(n)
+                for sign in (1.0, -1.0)
+            ]
+            # At an end of the box half of them lead nowhere.
+            moves = [(row, point) for row, point in moves if (point != heads[row].point).any()]
+            self._tried(heads, moves)
+            looked, step = looked + len(moves), 0.5 * step
+        return sorted(heads, key=lambda head: -head.value), looked
+
+    def _tried(self, heads: list[Excess], steps: Sequence[tuple[int, Array]]) -> bool:
+        """Moves heads by steps (a head's number, a point) that raise them; whether one by
+        `WITHIN`."""
+        before = [head.value for head in heads]
+        ends = self.excesses([(heads[row].option, point) for row, point in steps]).tolist()
+        for (row, point), end in zip(steps, ends, strict=True):
+            if end > heads[row].value:
+                heads[row] = Excess(heads[row].option, point, end)
+        return any(head.value > value + WITHIN for head, value in zip(heads, before, strict=True))
+
+    def _climbed(self, count: int, seed: int) -> tuple[list[Excess], int]:
+        """`worst_plants` of many parameters: ascents from the worst plants of distinct peaks."""
+        uncertain = self.uncertain
+        own = np.array([name == "damping" for name in uncertain.names])
+        points = [
+            (option, np.where(own & (i % EVENLY > 0), uncertain.box[0], point))
+            for i, (option, point) in enumerate(lattice(uncertain, count, seed))
         ]
-        # At an end of the box half of them lead nowhere.
-        moves = [(row, point) for row, point in moves if (point != heads[row].point).any()]
-        _tried(uncertain, heads, moves, loop)
-        looked, step = looked + len(moves), 0.5 * step
-    return sorted(heads, key=lambda head: -head.value), looked
+        value, problem, peaks = self._looked_at(uncertain.plants(points))
+        found = dict[tuple[int, ...], Excess]()
+        for i in np.argsort(-value).tolist():
+            option, point = points[i]
+            key: tuple[int, ...] = (option, -i)
+            if peaks is not None and -np.inf < value[i] < UNSTABLE:
+                rows = np.flatnonzero(problem.plants_of(peaks) == i)
+                row = rows[np.argmax(peaks.value[rows])]
+                key = (option, int(peaks.curve[row]), round(float(np.log(peaks.v[row])) / PEAK))
+            found.setdefault(key, Excess(option, point, float(value[i])))
+        heads, looked = list(found.values())[:SEARCHES], len(points)
+        for _ in range(CLIMBS):
+            steps = self._towards_corners(heads)
+            if not steps:
+                break
+            looked += len(steps)
+            if not self._tried(heads, steps):
+                break
+        return sorted(heads, key=lambda head: -head.value), looked
 
-
-def _tried(
-    uncertain: UncertainPlant, heads: list[Excess], steps: Sequence[tuple[int, Array]],
-    loop: BoundedLoop,
-) -> bool:  # fmt: skip
-    """Moves heads by steps (a head's number, a point) that raise them; whether one by `WITHIN`."""
-    before = [head.value for head in heads]
-    points = [(heads[row].option, point) for row, point in steps]
-    for (row, point), end in zip(steps, excesses(uncertain, points, loop).tolist(), strict=True):
-        if end > heads[row].value:
-            heads[row] = Excess(heads[row].option, point, end)
-    return any(head.value > value + WITHIN for head, value in zip(heads, before, strict=True))
-
-
-def _climbed(
-    uncertain: UncertainPlant, loop: BoundedLoop, count: int, seed: int
-) -> tuple[list[Excess], int]:
-    """`worst_plants` of many parameters: ascents from the worst plants of distinct peaks."""
-    own = np.array([name == "damping" for name in uncertain.names])
-    points = [
-        (option, np.where(own & (i % EVENLY > 0), uncertain.box[0], point))
-        for i, (option, point) in enumerate(lattice(uncertain, count, seed))
-    ]
-    value, problem, peaks = _looked_at(uncertain.plants(points), loop)
-    found = dict[tuple[int, ...], Excess]()
-    for i in np.argsort(-value).tolist():
-        option, point = points[i]
-        key: tuple[int, ...] = (option, -i)
-        if peaks is not None and -np.inf < value[i] < UNSTABLE:
-            rows = np.flatnonzero(problem.plants_of(peaks) == i)
-            row = rows[np.argmax(peaks.value[rows])]
-            key = (option, int(peaks.curve[row]), round(float(np.log(peaks.v[row])) / PEAK))
-        found.setdefault(key, Excess(option, point, float(value[i])))
-    heads, looked = list(found.values())[:SEARCHES], len(points)
-    for _ in range(CLIMBS):
-        steps = _towards_corners(uncertain, heads, loop)
-        if not steps:
-            break
-        looked += len(steps)
-        if not _tried(uncertain, heads, steps, loop):
-            break
-    return sorted(heads, key=lambda head: -head.value), looked
-
-
-def _towards_corners(
-    uncertain: UncertainPlant, heads: Sequence[Excess], loop: BoundedLoop
-) -> list[tuple[int, Array]]:
-    """Steps from every head that is stable: the head's number and the point."""
-    box = uncertain.box
-    plants = [uncertain.sloped(head.point, head.option) for head in heads]
-    _, problem, peaks = _looked_at(plants, loop)
-    if peaks is None:
-        return []
-    of = problem.plants_of(peaks)
-    chosen = [
-        own[np.argsort(-peaks.value[own])[:LARGEST]]
-        for own in (np.flatnonzero(of == row) for row in range(len(heads)))
-    ]
-    rows = np.concatenate(chosen)
-    slopes = to_theta(problem, in_problem_units(problem, loop.kappa), peaks.only(rows))
-    found: list[tuple[int, Array]] = []
-    for row, slope in zip(of[rows].tolist(), slopes, strict=True):
-        head = heads[row]
-        corner = np.where(slope > 0.0, box[1], np.where(slope < 0.0, box[0], head.point))
-        for step in STEPS:
-            point = head.point + step * (corner - head.point)
-            if np.abs(point - head.point).max() > 0.0:
-                found.append((row, point))
-    return found
+    def _towards_corners(self, heads: Sequence[Excess]) -> list[tuple[int, Array]]:
+        """Steps from every head that is stable: the head's number and the point."""
+        box = self.uncertain.box
+        plants = [self.uncertain.sloped(head.point, head.option) for head in heads]
+        _, problem, peaks = self._looked_at(plants)
+        if peaks is None:
+            return []
+        of = problem.plants_of(peaks)
+        chosen = [
+            own[np.argsort(-peaks.value[own])[:LARGEST]]
+            for own in (np.flatnonzero(of == row) for row in range(len(heads)))
+        ]
+        rows = np.concatenate(chosen)
+        slopes = to_theta(problem, in_problem_units(problem, self.kappa), peaks.only(rows))
+        found: list[tuple[int, Array]] = []
+        for row, slope in zip(of[rows].tolist(), slopes, strict=True):
+            head = heads[row]
+            corner = np.where(slope > 0.0, box[1], np.where(slope < 0.0, box[0], head.point))
+            for step in STEPS:
+                point = head.point + step * (corner - head.point)
+                if np.abs(point - head.point).max() > 0.0:
+                    found.append((row, point))
+        return found

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
+from ccd_casadi.inner_problem.plant_source import Ends, Names, PlantSource, plant_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, hardware_slopes
 from ccd_casadi.support.arrays import Array
@@ -70,13 +70,7 @@ def binding(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple
 
 
 @lru_cache(maxsize=8)
-def _sizes(
-    source: PlantSource,
-    names: tuple[str, ...],
-    lower: tuple[float, ...],
-    upper: tuple[float, ...],
-    start: tuple[float, ...],
-) -> Array:
+def _sizes(source: PlantSource, names: Names, lower: Ends, upper: Ends, start: Ends) -> Array:
     plant = plant_from(source, names, lower, upper)
     if not plant.constraint_names:
         return np.ones(0)

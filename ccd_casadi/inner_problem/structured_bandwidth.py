@@ -8,6 +8,7 @@ search of a few seeded starts is run at that θ, which is a function of θ too; 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -53,68 +54,101 @@ class StructuredValue(InnerValue):
     envelope: Envelope | None = None
 
 
-def searched(
-    problem: CoDesignProblem,
-    plants: Sequence[ScaledPlant],
-    initial: Sequence[Array],
-    starts: int | None = None,
-    progress: Progress | None = None,
-    workers: Pool | None = None,
-) -> SectionsDesign:
-    """The largest bandwidth on plants, from controllers κ in SI and `starts` others beside them."""
-    structured = structured_of(problem)
-    return synthesise_sections(
-        plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
-        starts=starts or 0, seed=structured.seed, initial=initial, only_initial=starts is None,
-        frequencies=structured.frequencies, progress=progress, workers=workers,
-    )  # fmt: skip
+@dataclass(frozen=True)
+class ProblemAt:
+    """A problem of fixed structure at a θ: the plants there, and what is searched on them."""
+
+    problem: CoDesignProblem
+    theta: Sequence[float]
+
+    @cached_property
+    def plants(self) -> list[ScaledPlant]:
+        """The plant set."""
+        return plants_of(self.problem, self.theta)
+
+    def searched(
+        self,
+        initial: Sequence[Array],
+        starts: int | None = None,
+        progress: Progress | None = None,
+        workers: Pool | None = None,
+    ) -> SectionsDesign:
+        """The largest bandwidth, from controllers κ in SI and `starts` others beside them."""
+        problem, structured = self.problem, structured_of(self.problem)
+        return synthesise_sections(
+            self.plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
+            starts=starts or 0, seed=structured.seed, initial=initial, only_initial=starts is None,
+            frequencies=structured.frequencies, progress=progress, workers=workers,
+        )  # fmt: skip
+
+    @property
+    def goal(self) -> Goal:
+        """What is made small besides -ω_b."""
+        problem, sampling = self.problem, self.problem.sampling
+        structure = structure_of(problem)
+        assert isinstance(structure, Structure)
+        if problem.figure is RMS_ERROR:
+            assert problem.budget is not None
+            return RmsError(tuple(self.plants), structure, problem.budget, sampling)
+        assert sampling is not None
+        free = plants_of(replace(problem, suspension=FREE), self.theta)
+        return MoveTime(tuple(free), structure, sampling, motion_of(problem, self.theta))
+
+    def least(
+        self, design: SectionsDesign, only_initial: bool = False, progress: Progress | None = None
+    ) -> LeastValue:
+        """The least of the problem's figure from a certified design and its warm starts."""
+        problem, structured = self.problem, structured_of(self.problem)
+        bounds = bounds_of(problem)
+        started = with_structured(problem, warm_starts=structured.error_warm_starts)
+        return least_value(
+            self.plants, bounds, design, self.goal, sampling=structured.sampling,
+            least_bandwidth=structured.bandwidth_least,
+            initial=warm_starts_at(started, structure_of(problem), self.plants, bounds),
+            only_initial=only_initial, progress=progress,
+        )  # fmt: skip
+
+    def value_of(
+        self, design: SectionsDesign, spent: int, only_initial: bool = False
+    ) -> StructuredValue:
+        """A design of largest bandwidth as a value of ω_b*(θ), or as a start to the least of
+        another figure beside the warm starts; with `only_initial` where these lead to no certified
+        design."""
+        problem, point = self.problem, tuple(float(v) for v in self.theta)
+        error, envelope = np.nan, None
+        if problem.figure is not BANDWIDTH:
+            design = too_slow(problem, design)
+        if design.certified and problem.figure is not BANDWIDTH:
+            found = self.least(design, only_initial)
+            design, error, envelope = found.design, found.value, found.envelope
+        elif design.certified:
+            bounds = bounds_of(problem)
+            envelope = bandwidth_envelope(self.plants, bounds, design, problem.sampling)
+        bandwidth = float(design.bandwidth) if design.certified else np.nan
+        gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
+        slope = tuple(map(float, gradient))
+        return StructuredValue(point, bandwidth, slope, design, spent, envelope, error=error)
 
 
 def structured_value(problem: CoDesignProblem, theta: Sequence[float]) -> StructuredValue:
     """The best certified design from the problem's warm starts at θ, and the envelope gradient."""
-    structured = structured_of(problem)
-    plants, bounds = plants_of(problem, theta), bounds_of(problem)
-    initial = warm_starts_at(problem, structure_of(problem), plants, bounds)
+    here, starts = ProblemAt(problem, theta), structured_of(problem).starts
+    initial = warm_starts_at(problem, structure_of(problem), here.plants, bounds_of(problem))
     made: SectionsDesign | None = None
     spent = 0
     if initial:
-        made = searched(problem, plants, initial)
+        made = here.searched(initial)
         spent += 1
-    if made is None or (structured.starts and not made.certified):
-        made = searched(problem, plants, initial, min(FEW, structured.starts))
+    if made is None or (starts and not made.certified):
+        made = here.searched(initial, min(FEW, starts))
         spent += 1
     while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
-        again = searched(problem, plants, [made.kappa])
+        again = here.searched([made.kappa])
         spent += 1
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
             break
         made = again
-    return value_of_design(problem, theta, plants, made, spent, only_initial=True)
-
-
-def value_of_design(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    plants: Sequence[ScaledPlant],
-    design: SectionsDesign,
-    spent: int,
-    only_initial: bool = False,
-) -> StructuredValue:
-    """A design of largest bandwidth as a value of ω_b*(θ), or as a start to the least of another
-    figure beside the warm starts; with `only_initial` where these lead to no certified design."""
-    point = tuple(float(v) for v in theta)
-    error, envelope = np.nan, None
-    if problem.figure is not BANDWIDTH:
-        design = too_slow(problem, design)
-    if design.certified and problem.figure is not BANDWIDTH:
-        found = least_at(problem, theta, plants, design, only_initial)
-        design, error, envelope = found.design, found.value, found.envelope
-    elif design.certified:
-        envelope = bandwidth_envelope(plants, bounds_of(problem), design, problem.sampling)
-    bandwidth = float(design.bandwidth) if design.certified else np.nan
-    gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
-    slope = tuple(map(float, gradient))
-    return StructuredValue(point, bandwidth, slope, design, spent, envelope, error=error)
+    return here.value_of(made, spent, only_initial=True)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
@@ -133,36 +167,3 @@ def too_slow(problem: CoDesignProblem, design: SectionsDesign) -> SectionsDesign
     words += f", inner.bandwidth_least_hz requires {least / HZ:.4g} Hz"
     short = {"bandwidth_least_hz": least / design.bandwidth}
     return replace(design, outcome=SectionsOutcome.BOUND_NOT_MET, words=words, short=short)
-
-
-def goal_of(
-    problem: CoDesignProblem, theta: Sequence[float], plants: Sequence[ScaledPlant]
-) -> Goal:
-    """What is made small besides -ω_b, on the plants of the problem's set at θ."""
-    structure, sampling = structure_of(problem), problem.sampling
-    assert isinstance(structure, Structure)
-    if problem.figure is RMS_ERROR:
-        assert problem.budget is not None
-        return RmsError(tuple(plants), structure, problem.budget, sampling)
-    assert sampling is not None
-    free = plants_of(replace(problem, suspension=FREE), theta)
-    return MoveTime(tuple(free), structure, sampling, motion_of(problem, theta))
-
-
-def least_at(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    plants: Sequence[ScaledPlant],
-    design: SectionsDesign,
-    only_initial: bool = False,
-    progress: Progress | None = None,
-) -> LeastValue:
-    """The least of the problem's figure from a certified design and the problem's warm starts."""
-    structured, bounds = structured_of(problem), bounds_of(problem)
-    started = with_structured(problem, warm_starts=structured.error_warm_starts)
-    return least_value(
-        plants, bounds, design, goal_of(problem, theta, plants), sampling=structured.sampling,
-        least_bandwidth=structured.bandwidth_least,
-        initial=warm_starts_at(started, structure_of(problem), plants, bounds),
-        only_initial=only_initial, progress=progress,
-    )  # fmt: skip

@@ -17,18 +17,11 @@ from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import (
-    WITHIN,
-    BoundedLoop,
-    Excess,
-    excesses,
-    lattice,
-    worst_plants,
-)
+from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, LoopOnBox, lattice
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import goal_of
+from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     structure_of,
@@ -76,7 +69,7 @@ class DesignOnBox:
             problem, self.uncertain, design.kappa, design.bandwidth, turn, progress
         )
         if problem.figure is MOVE_TIME and design.controller is not None:
-            value = float(np.exp(goal_of(problem, theta, ()).at(design.kappa)[0]))
+            value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
             seed = structured_of(problem).seed + turn
             time, option, point = latest_plant(problem, theta, design.controller, seed)
             if progress is not None:
@@ -188,11 +181,11 @@ def violations(
     """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`; the
     `others` are known and tried besides."""
     structured = structured_of(problem)
-    loop = BoundedLoop(structure_of(problem), kappa, bandwidth, bounds_of(problem),
-                       structured.sampling)  # fmt: skip
+    loop = LoopOnBox(uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem),
+                     structured.sampling)  # fmt: skip
     known = [(option, np.array(point)) for option, point in others]
-    tried = excesses(uncertain, known, loop).tolist() if known else []
-    heads, count = worst_plants(uncertain, loop, seed=structured.seed + turn)
+    tried = loop.excesses(known).tolist() if known else []
+    heads, count = loop.worst_plants(structured.seed + turn)
     heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
     heads.sort(key=lambda head: -head.value)
     if progress is not None:

@@ -16,14 +16,8 @@ from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.structured_bandwidth import (
-    least_at,
-    searched,
-    structured_value,
-    too_slow,
-)
+from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
 from ccd_casadi.inner_problem.structured_plant_set import (
-    plants_of,
     structured_of,
     uncertain_plant,
     with_channels,
@@ -53,13 +47,13 @@ def race(
     """
     if workers is not None:  # it takes seconds: they start while the starts are drawn
         workers.begin(__name__)
-    structured, plants = structured_of(problem), plants_of(problem, theta)
+    here, structured = ProblemAt(problem, theta), structured_of(problem)
     warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
     starts = None if only_warm_starts else structured.starts
-    made = searched(problem, plants, warm_starts, starts, progress, workers)
+    made = here.searched(warm_starts, starts, progress, workers)
     if made.certified or starts is None or starts >= ENOUGH:
         return made
-    return searched(problem, plants, warm_starts, ENOUGH, progress, workers)
+    return here.searched(warm_starts, ENOUGH, progress, workers)
 
 
 def with_range(problem: CoDesignProblem) -> CoDesignProblem:
@@ -161,7 +155,7 @@ def least_from(
     wider = problem
     for turn in range(ROUNDS_OF_ERROR):
         problem = wider
-        found = least_at(problem, theta, plants_of(problem, theta), design, progress=progress)
+        found = ProblemAt(problem, theta).least(design, progress=progress)
         wider = _wider(problem, theta, found.design, turn, progress)[1] or problem
         if wider is problem:
             break

@@ -215,14 +215,9 @@ class SampleStore(AbstractContextManager["SampleStore"]):
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        try:
+        with self._db:  # which commits, or rolls back
             self._db.execute("begin immediate")
             yield
-            self._db.execute("commit")
-        except BaseException:
-            if self._db.in_transaction:  # a full disk has already rolled it back
-                self._db.execute("rollback")
-            raise
 
     def damaged(self) -> SampleStoreError:
         """What to raise where a row cannot be what was written."""

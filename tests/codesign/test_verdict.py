@@ -292,6 +292,24 @@ def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:
     assert ends[0] == pytest.approx(ends[1], rel=1e-5)
 
 
+def test_a_shelf_that_bends_sharply_is_followed_to_its_end(chain_problem) -> None:
+    """The slope of this edge changes by a fifth within 1e-5 of the box.
+
+    A margin that never grew past its first value left ends 3e-5 of J apart.
+    """
+    case = chain_problem(43)
+    lower, upper = lifted_bounds(case)
+    quantities = TrueQuantities(case)
+    ends = []
+    for share in ((0.517, 0.22, 0.96, 0.015, 1.0, 1.0), (0.54, 0.24, 0.9, 0.04, 1.0, 0.9)):
+        start = lower + (upper - lower) * np.array(share)
+        end = descend(quantities, start, steps=80, settled=1e-13)  # as a polish does
+        found = TrueDesign(quantities, end)
+        assert found.acceptable
+        ends.append(found.objective)
+    assert ends[0] == pytest.approx(ends[1], rel=1e-6)
+
+
 @pytest.mark.slow
 def test_all_formulations_end_at_the_same_optimum_of_the_modal_table() -> None:
     """D5: lifted and direct stopped 17 % short of nested, all of them verified."""

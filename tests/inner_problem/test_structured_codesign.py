@@ -212,13 +212,13 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
     anchored: CoDesignProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where no anchor leads to one: a single search with starts, whatever θ the pieces ask for."""
-    honest, searches = structured_bandwidth.searched, []
+    honest, searches = structured_bandwidth.ProblemAt.searched, []
 
-    def counted(case: Any, plants: Any, initial: Any, starts: Any = None, *rest: Any) -> Any:
+    def counted(here: Any, initial: Any, starts: Any = None, *rest: Any) -> Any:
         searches.append(starts)
-        return honest(case, plants, initial, starts, *rest)
+        return honest(here, initial, starts, *rest)
 
-    monkeypatch.setattr(structured_bandwidth, "searched", counted)
+    monkeypatch.setattr(structured_bandwidth.ProblemAt, "searched", counted)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
         alone = Sampler(with_structured(anchored, warm_starts=()), store, pool)
         first = alone.values(np.array(anchored.start))[0]

@@ -27,7 +27,7 @@ from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import BoundedLoop, excesses, lattice, worst_plants
+from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, lattice
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
@@ -275,13 +275,13 @@ def test_the_box_holds_the_plants_that_it_names() -> None:
 
 def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
     box = uncertain(resonance_shift=0.02, gain=0.03)
-    asked = BoundedLoop(SMALL, design.kappa, design.bandwidth, EASY)
-    heads, looked = worst_plants(box, asked, count=40)
-    values = excesses(box, lattice(box, 60, 7), asked)
+    asked = LoopOnBox(box, SMALL, design.kappa, design.bandwidth, EASY)
+    heads, looked = asked.worst_plants(count=40)
+    values = asked.excesses(lattice(box, 60, 7))
     assert looked > 40
     assert heads[0].value >= values.max() - 1e-6
     assert heads[0].value == pytest.approx(
-        excesses(box, [(heads[0].option, heads[0].point)], asked)[0]
+        asked.excesses([(heads[0].option, heads[0].point)])[0]
     )
 
 
@@ -294,11 +294,11 @@ def test_of_many_parameters_the_worst_plant_is_climbed_to(design) -> None:
     kappa = stabilising(members, by_rules(members, np.geomspace(0.01, 0.3, 8)))[0]
     units = members.plants
     kappa = SMALL.in_units(kappa, units.omega_0, units.force)
-    asked = BoundedLoop(SMALL, kappa, 0.01 * units.omega_0, EASY)
-    heads, looked = worst_plants(box, asked, count=12)
+    asked = LoopOnBox(box, SMALL, kappa, 0.01 * units.omega_0, EASY)
+    heads, looked = asked.worst_plants(count=12)
     ends = np.array(list(np.ndindex(*(2,) * 7)))
     corners = [(0, box.box[row, np.arange(7)]) for row in ends]
-    values = excesses(box, [*lattice(box, 12, 0), *corners], asked)
+    values = asked.excesses([*lattice(box, 12, 0), *corners])
     assert looked < len(corners)
     assert heads[0].value >= values.max() - 1e-6
 
