@@ -136,7 +136,7 @@ def finished(
     them, which go further; else to first order, exact there. Searches for worse plants are numbered
     from `look`; at the end they are of the plants themselves."""
     bent = plant_of(working.sampler.problem).nearby is not None
-    reach, looks = (REACH, (look, *AGAIN)) if bent else (CLOSE, (look,))
+    reach, again = (REACH, AGAIN) if bent else (CLOSE, ())
 
     def around(place: JointPoint) -> tuple[Evaluate, ...]:
         return nearby(working.sampler.problem, [place.theta] if bent else (), place.theta)
@@ -153,7 +153,7 @@ def finished(
         del make
         if found.gain <= KEPT * abs(J):
             before, true = working, nearby(problem, (), best.theta)
-            working, best, there = working.on_worse_plants(true, best, looks, WITHIN, tell)
+            working, best, there = working.on_worse_plants(true, best, (look, *again), WITHIN, tell)
             if working is before or there - J <= KEPT * abs(J):
                 return working, best, True
             J = there
@@ -163,7 +163,8 @@ def finished(
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
             models = others
-            working, best, J = working.on_worse_plants(models, end, (look + step,), WITHIN, tell)
+            looks = look + step, *again
+            working, best, J = working.on_worse_plants(models, end, looks, WITHIN, tell)
         gc.collect()  # bases are large, and searches before hold theirs in circles
     return working, best, False
 

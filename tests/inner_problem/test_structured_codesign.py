@@ -214,9 +214,9 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
     """Where no anchor leads to one: a single search with starts, whatever θ the pieces ask for."""
     honest, searches = structured_bandwidth.ProblemAt.searched, []
 
-    def counted(here: Any, initial: Any, starts: Any = None, *rest: Any) -> Any:
+    def counted(here: Any, initial: Any, starts: Any = None, **rest: Any) -> Any:
         searches.append(starts)
-        return honest(here, initial, starts, *rest)
+        return honest(here, initial, starts, **rest)
 
     monkeypatch.setattr(structured_bandwidth.ProblemAt, "searched", counted)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
