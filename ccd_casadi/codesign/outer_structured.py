@@ -8,9 +8,7 @@ The polish works on the true value: it passes kinks, and keeps its controller. M
 are kept in the store of samples: a run that goes on from its store repeats none.
 """
 
-import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -65,7 +63,7 @@ from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import remark
 from ccd_casadi.support.threads import alongside
 
 
@@ -130,13 +128,7 @@ def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
 
 def printer(label: str, quiet: bool) -> Callable[[str], None]:
     """Lines of progress on stderr."""
-
-    def tell(words: str) -> None:
-        if not quiet:
-            with suppress(OSError, ValueError):  # a stream that fails ends the printing
-                say(f"{label}: {words}", sys.stderr)
-
-    return tell
+    return lambda words: remark(f"{label}: {words}", quiet)
 
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
