@@ -25,7 +25,6 @@ from ccd_casadi.fixed_structure.loop_problem import (
     LoopProblem,
     Places,
 )
-from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
@@ -33,6 +32,7 @@ from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.kernels.loop_grid import NONE
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.loop_rows import levels, rows
+from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
