@@ -93,6 +93,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     where a mode that it keeps meets another."""
 
     corrected = bending = True
+    programmes, little = 60, 1e-3  # that cost little beside a trial
     bent = False
     enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
 

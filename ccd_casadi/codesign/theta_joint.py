@@ -42,8 +42,8 @@ ROUNDS = 4  # last searches at most, while worse plants are found at their end
 AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
-ENDINGS, KEPT = 12, 1e-5  # last steps; of J: a promise at which the conditions of optimality hold
-LAST_GAIN = 1e-10  # of w2 ω_b
+ENDINGS, KEPT = 12, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
+LAST_GAIN = 3e-9  # of w2 ω_b: less is rounding
 
 
 def joint_search(

@@ -167,15 +167,15 @@ def on_plants(
     """The same problem on plants that are moved a little: as many, in its units, that fall apart
     and are alike where its own are. None of this is checked."""
     if not isinstance(problem, CompositeProblem):
-        return replace(problem, plants=plant_set(plants, sampling))
+        return replace(problem, plants=plant_set(plants, sampling, alike=True))
     decoupling, parts = problem.structure.decoupling, []
     for part in problem.parts:
         members, channel = [plants[i] for i in part.members], part.channel
         if channel is None:
-            moved = plant_set(members, sampling, decoupling)
+            moved = plant_set(members, sampling, decoupling, alike=True)
         else:
             moved = plant_set(
-                [channel_plant(one, decoupling, channel) for one in members], sampling
+                [channel_plant(one, decoupling, channel) for one in members], sampling, alike=True
             )
         parts.append(replace(part, problem=replace(part.problem, plants=moved)))
     return replace(problem, plants=parts[0].problem.plants, parts=tuple(parts))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.support.arrays import Array
 
 # of a polygon around a disc, and a little for the rounding of the disc itself
@@ -120,4 +121,4 @@ def norm(M: np.ndarray, loosely: bool = False) -> Array:
         if M.shape[-2:] == (1, 1):
             return np.asarray(np.abs(M[..., 0, 0]))
         return np.asarray(np.sqrt((np.abs(M) ** 2).sum(axis=(-2, -1))))
-    return np.asarray(np.linalg.norm(M, 2, axis=(-2, -1)))
+    return sigma_max(M)

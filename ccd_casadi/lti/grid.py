@@ -10,7 +10,7 @@ import scipy
 from ccd_casadi.support.arrays import Array
 
 FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
-ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
+FIRST, HALVINGS = 11, 16  # points between a maximum's neighbours, then of their spacing
 LIGHT = 0.3  # damping ratio below which a pole or zero is a resonance
 
 
@@ -45,16 +45,21 @@ def local_maxima(values: Array) -> np.ndarray:
 
 
 def zoomed(function: Callable[[Array], Array], low: Array, high: Array) -> tuple[Array, Array]:
-    """Where N brackets that close in on a maximum end, and its value; `function` of (N, 11)."""
+    """Where N brackets that close in on a maximum end, and its value; `function` of (N, k)."""
     if not len(low):
         return low, low
-    rows = np.arange(len(low))
-    for _ in range(ZOOMS):
-        points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
-        found = function(points)
-        i = np.argmax(found, axis=1)
-        low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
-    return points[rows, i], found[rows, i]
+    points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, FIRST)
+    value = function(points)
+    for _ in range(HALVINGS):
+        inner = np.argmax(value[:, 1:-1], axis=1)[:, None] + np.arange(3)
+        x, f = (np.take_along_axis(part, inner, axis=1) for part in (points, value))
+        between = 0.5 * (x[:, :-1] + x[:, 1:])
+        order = [0, 3, 1, 4, 2]
+        points = np.concatenate([x, between], axis=1)[:, order]
+        value = np.concatenate([f, function(between)], axis=1)[:, order]
+    best = np.argmax(value, axis=1)[:, None]
+    where, height = (np.take_along_axis(part, best, axis=1)[:, 0] for part in (points, value))
+    return where, height
 
 
 def refine_peak(

@@ -24,10 +24,8 @@ import numpy as np
 from ccd_casadi.optim.quadratic import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
-PROGRAMMES = 12  # around each other, for one step
 SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to the answer of a programme
 SETTLED = 1e-2  # of the radius: a programme that moves less has no more to give
-LITTLE = 1e-2  # of the gain: what one more programme has to add
 HOLDS = 1e-7  # of the penalty: the multiplier of a row that holds the step
 BENDS = 0.2  # of the sizes of its parts: how far curvature may move a row more than it is known to
 FLAT = 1e-4  # of the slopes: least curvature, which leaves a linear programme one
@@ -133,6 +131,8 @@ class Model(ABC, Generic[Data]):
     # Whether a row that ends below its bound by little of what it moves counts with its curvature,
     # as it may bend over it. Searches over K alone end in better optima without.
     bending = False
+    programmes = 12  # around each other, for one step
+    little = 1e-2  # of the gain: what one more programme has to add
 
     @abstractmethod
     def at(self, x: Array) -> Iterate[Data] | None:
@@ -253,7 +253,7 @@ def best_step(
     at, offset, M, p = slopes, value + margin[chosen], convex(H, FLAT * unit), np.zeros(n)
     (low, high), near, straight = _ends(model, here, radius), radius, 0.0
     best: Step | None = None
-    for turn in range(PROGRAMMES):
+    for turn in range(model.programmes):
         found = answer(offset)
         if found is None:
             break
@@ -301,7 +301,7 @@ def best_step(
             active = at[holds]
             M = convex(lagrangian + CONVEXIFYING * active.T @ active, FLAT * unit)
         best = Step(p, predicted, straight, M, multipliers, rows, penalty)
-        little = better < LITTLE * predicted if better > 0.0 else size < SETTLED * radius
+        little = better < model.little * predicted if better > 0.0 else size < SETTLED * radius
         if not rows.curved or (turn and little and not len(fresh)):
             break
     return best
