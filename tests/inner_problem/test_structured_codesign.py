@@ -202,7 +202,8 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
             asked = replace(case, inner=replace(case.inner, S_max=bound))
-            found, words = outer_structured.with_initial_search(store, asked, 0, True)
+            of = Sampler(asked, store, Workers(1))
+            found, words = outer_structured.with_initial_search(of, 0)
             assert (structured_of(found).warm_starts, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip
