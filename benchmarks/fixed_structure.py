@@ -178,7 +178,7 @@ def derivatives(seed: int, count: int = 200) -> dict[str, float]:
         size = np.abs(peaks.to_kappa).max(1) + 1e-3
 
         def values(problem, kappa, tau):
-            return constraints(problem, kappa, tau, peaks.curve, peaks.plant, peaks.v)  # noqa: B023
+            return constraints(problem, kappa, tau, peaks)  # noqa: B023
 
         for i in range(len(kappa)):
             step = 1e-5 * np.eye(len(kappa))[i]
@@ -197,8 +197,8 @@ def derivatives(seed: int, count: int = 200) -> dict[str, float]:
                 moved[i] += s * h
                 # ω₀ frozen: the moved plant in the units of the first, which is in the set too.
                 pair = problem_for([base, at(moved)], structure, bounds, sampling)
-                ends.append(constraints(pair, kappa, tau, peaks.curve,
-                                        np.ones_like(peaks.plant), peaks.v).value)  # fmt: skip
+                there = replace(peaks, plant=np.ones_like(peaks.plant))
+                ends.append(constraints(pair, kappa, tau, there).value)
             slope = (8.0 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12.0 * h)
             worst["theta"] = max(worst["theta"], float(np.abs((slope - exact[:, i]) / scale).max()))
     print(f"derivatives of {count} random loops: largest relative error to kappa "

@@ -16,7 +16,6 @@ from ccd_casadi.deployment.pipeline import deploy as deploy
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise_sections
-from ccd_casadi.fixed_structure.measured import read_frequency_response as read_frequency_response
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure as Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem as CoDesignProblem
@@ -26,6 +25,7 @@ from ccd_casadi.inner_problem.problem import true_inner as true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities as TrueQuantities
 from ccd_casadi.interop.frames import samples_frame as samples_frame
 from ccd_casadi.lti.hold import Sampling as Sampling
+from ccd_casadi.plants.measured import read_frequency_response as read_frequency_response
 from ccd_casadi.plants.plant import Plant as Plant
 from ccd_casadi.plants.plant import build_plant as build_plant
 from ccd_casadi.plants.scaling import StateSpace as StateSpace

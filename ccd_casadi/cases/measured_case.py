@@ -20,7 +20,7 @@ from ccd_casadi.cases.checks import Fail, count, require_good, short_repr, text
 from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
-from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
+from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 

@@ -8,9 +8,7 @@ The polish works on the true value: it passes kinks, and keeps its controller. M
 are kept in the store of samples: a run that goes on from its store repeats none.
 """
 
-import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -62,11 +60,10 @@ from ccd_casadi.sampling.neighbours import WORTH, from_controller
 from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
-from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import remark
 from ccd_casadi.support.threads import alongside
 
 
@@ -81,23 +78,17 @@ class InitialSearch:
     words: str
 
 
-def with_initial_search(
-    store: SampleStore,
-    problem: CoDesignProblem,
-    seed: int,
-    quiet: bool,
-    workers: Pool | None = None,
-) -> tuple[CoDesignProblem, str]:
+def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, str]:
     """Warm starts and plants, from the store where an earlier run has found them.
 
     Second, in words, why there are no warm starts; empty where there are.
     """
-    problem = with_range(with_structured(problem, seed=seed))
+    problem = with_range(with_structured(sampler.problem, seed=seed))
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
     def searched() -> InitialSearch:
-        tell = printer("search at the start", quiet)
-        anchored, made, _ = prepared(problem, tell, workers)
+        tell = printer("search at the start", sampler.quiet)
+        anchored, made, _ = prepared(problem, tell, sampler.workers)
         anchored, made, _ = least_from(anchored, problem.start, made, tell)
         own, start = structured_of(anchored), problem.start
         words = "" if made.certified else made.words
@@ -105,11 +96,11 @@ def with_initial_search(
         if made.certified and alone and problem.figure is BANDWIDTH:
             # No plant was found worse: this is the search that an end at the start would ask for.
             make = partial(ProblemAt(anchored, start).value_of, made, 1)
-            Sampler(anchored, store, Workers(1)).cached("race", start, StructuredValue, make)
+            sampler.of(anchored).cached("race", start, StructuredValue, make)
         return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
 
     key = sample_key(owner, problem.start, 0.0, 0.0)
-    found = store.cached(key, owner, problem.start, InitialSearch, searched)
+    found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
     known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
     return with_structured(problem, **known, scenarios=found.members), found.words
 
@@ -137,13 +128,7 @@ def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
 
 def printer(label: str, quiet: bool) -> Callable[[str], None]:
     """Lines of progress on stderr."""
-
-    def tell(words: str) -> None:
-        if not quiet:
-            with suppress(OSError, ValueError):  # a stream that fails ends the printing
-                say(f"{label}: {words}", sys.stderr)
-
-    return tell
+    return lambda words: remark(f"{label}: {words}", quiet)
 
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
@@ -186,9 +171,7 @@ class StructuredOuter(ThetaOuter):
         sampler = self.sampler
         if structured_of(sampler.problem).warm_starts:
             return self
-        problem, words = with_initial_search(
-            sampler.store, sampler.problem, seed, sampler.quiet, sampler.workers
-        )
+        problem, words = with_initial_search(sampler, seed)
         sampler.count_multistart(sampler.hash)
         lost = words and not structured_of(problem).warm_starts
         return StructuredOuter(sampler.of(problem), words if lost else "")

@@ -38,11 +38,10 @@ GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
 LOOKS, APART = 5, 200  # for worse plants before an end, each elsewhere in the box; numbered from
-ROUNDS = 4  # last searches at most, while worse plants are found at their end
 AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
-ENDINGS, KEPT = 12, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
+ENDINGS, KEPT = 24, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 3e-9  # of w2 ω_b: less is rounding
 
 
@@ -87,7 +86,7 @@ def joint_search(
             working, best, _ = working.on_worse_plants(models, best, looks, WITHIN, tell)
             del make, models
             gc.collect()  # with which the bases go
-            working, best, settled = finished_on_worse_plants(working.whole, best, final, tell)
+            working, best, settled = finished(working.whole, best, final, tell)
             if settled:
                 break
             known = [best.theta]
@@ -104,7 +103,7 @@ def joint_search(
         elif gained < POOR * found.gain:
             reach *= 0.3
     if not (settled or ends is not None):
-        best, *_ = finished(working.sampler, best)
+        working, best, _ = finished(working.whole, best, APART, tell)
     counted = structured_of(working.sampler.problem).scenarios
     worse = set(counted) - set(structured_of(sampler.problem).scenarios)
     if best.theta == first.theta and not worse:
@@ -126,57 +125,48 @@ def _arrived(
     )
 
 
-def finished_on_worse_plants(
-    working: WorkingSet, start: JointPoint, final: int, tell: Callable[[str], None] | None
-) -> tuple[WorkingSet, JointPoint, bool]:
-    """The joint optimum near by with the worse plants found at it, the set that has these, and
-    whether it is one of all of them: also where the last ones cost less of J than is promised at an
-    end."""
-    best, bent = start, plant_of(working.sampler.problem).nearby is not None
-    looks = (final, *AGAIN) if bent else (final,)
-    for _ in range(ROUNDS):
-        best, J, near = finished(working.sampler, best, bent, tell)
-        before, true = working, nearby(working.sampler.problem, (), best.theta)
-        working, best, there = working.on_worse_plants(true, best, looks, WITHIN, tell)
-        if working is before or there - J <= KEPT * abs(J):
-            return working, best, near
-    return working, best, False
-
-
 def finished(
-    sampler: Sampler,
-    start: JointPoint,
-    bent: bool = False,
-    tell: Callable[[str], None] | None = None,
-) -> tuple[JointPoint, float, bool]:
-    """The joint optimum near by, J there, and whether the start was as near or no more is promised.
+    working: WorkingSet, start: JointPoint, look: int, tell: Callable[[str], None] | None
+) -> tuple[WorkingSet, JointPoint, bool]:
+    """The joint optimum near by on all plants that searches find worse on the way to it, the set
+    that has these, and whether no more is promised there.
 
     From what is known at one place after the other: so near that all rows meet which bind at a kink
-    of ω_b*, as `theta_kkt` has to see it. With `bent` on reduced bases around these places, which
-    go further; else on the plants to first order, exact there."""
-    problem, reach = sampler.problem, REACH if bent else CLOSE
+    of ω_b*, as `theta_kkt` has to see it. On reduced bases around these places where a plant has
+    them, which go further; else to first order, exact there. Searches for worse plants are numbered
+    from `look`; at the end they are of the plants themselves."""
+    bent = plant_of(working.sampler.problem).nearby is not None
+    reach, again = (REACH, AGAIN) if bent else (CLOSE, ())
 
     def around(place: JointPoint) -> tuple[Evaluate, ...]:
-        return nearby(problem, [place.theta] if bent else (), place.theta)
+        return nearby(working.sampler.problem, [place.theta] if bent else (), place.theta)
 
     models = around(start)
-    best, J = first = JointModel(problem, models, start, reach).adapted()
-    for _ in range(ENDINGS):
+    best, J = JointModel(working.sampler.problem, models, start, reach).adapted()
+    for step in range(1, ENDINGS):
+        problem = working.sampler.problem
         make = partial(proposed, problem, models, best, reach, LAST_GAIN, bent)
         key = (*best.theta, best.bandwidth, reach, bent)
-        found = sampler.cached("finished", key, Proposal, make)
+        found = working.sampler.cached("finished", key, Proposal, make)
         if tell is not None:
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
-        if found.gain <= KEPT * abs(J):
-            return best, J, True
         del make
+        if found.gain <= KEPT * abs(J):
+            before, true = working, nearby(problem, (), best.theta)
+            working, best, there = working.on_worse_plants(true, best, (look, *again), WITHIN, tell)
+            if working is before or there - J <= KEPT * abs(J):
+                return working, best, True
+            J = there
+            continue
         others = around(found.end)
         end, there = JointModel(problem, others, found.end, reach).adapted()
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
-            best, J, models = end, there, others
+            models = others
+            looks = look + step, *again
+            working, best, J = working.on_worse_plants(models, end, looks, WITHIN, tell)
         gc.collect()  # bases are large, and searches before hold theirs in circles
-    return best, J, first[1] - J <= SETTLED * abs(J)
+    return working, best, False
 
 
 def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Array) -> Array:

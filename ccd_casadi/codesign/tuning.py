@@ -14,11 +14,6 @@ import scipy
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.measured import (
-    MeasuredResponse,
-    from_control,
-    read_frequency_response,
-)
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.closed_loop import closed_loop
@@ -26,6 +21,7 @@ from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.hold import delay_parts, delayed, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ

@@ -108,7 +108,7 @@ def certify(
         for part in parts
     }
     each: dict[int, PlantFigures] = {}
-    for part, figures_of in results(workers if len(tasks) > 1 else None, judged, tasks):
+    for part, figures_of in results(workers, judged, tasks):
         each |= zip(part, figures_of, strict=True)
     found = [each[i] for i in range(len(plants))]
     unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]

@@ -32,6 +32,7 @@ from ccd_casadi.support.threads import side_by_side
 
 T = TypeVar("T")
 R = TypeVar("R")
+Rows = TypeVar("Rows", bound=Places)
 
 AT_ONCE = 6  # coupled plants of a part at most: parts are computed side by side
 NOT_THERE = -1.0  # a pole that stands for none
@@ -80,16 +81,13 @@ class CompositeProblem(LoopProblem):
         start = int(np.sum(sizes[:number], dtype=int))
         return start, start + sizes[number]
 
-    def split(self, rows: Constraints) -> list[tuple[Part, np.ndarray, Constraints]]:
+    def split(self, rows: Rows) -> list[tuple[Part, np.ndarray, Rows]]:
         """Each part with the indices of its rows, and these as it numbers them."""
         found = []
         for number, part in enumerate(self.parts):
             start, end = self.rows_of(number)
             at = np.flatnonzero((rows.plant >= start) & (rows.plant < end))
-            own = rows.only(at)
-            inside = Constraints(own.curve, own.plant - start, own.v, own.value,
-                                 own.to_kappa[:, part.place], own.to_tau)  # fmt: skip
-            found.append((part, at, inside))
+            found.append((part, at, replace(rows.only(at), plant=rows.plant[at] - start)))
         return found
 
     def kinds_of(self, constraints: Constraints) -> list[str]:
@@ -234,23 +232,13 @@ def _(
 
 
 @constraints.register
-def _(
-    problem: CompositeProblem,
-    kappa: Array,
-    tau: float,
-    curve: np.ndarray,
-    row: np.ndarray,
-    v: Array,
-) -> Constraints:
-    value, to_kappa, to_tau = np.zeros(len(v)), np.zeros((len(v), len(kappa))), np.zeros(len(v))
-    found = Constraints(curve, row, v, value, to_kappa, to_tau)
-    for part, at, own in problem.split(found):
-        inside = constraints(
-            part.problem, kappa[part.place], tau + part.lead, own.curve, own.plant, own.v
-        )
-        value[at], to_tau[at] = inside.value, inside.to_tau
-        to_kappa[at] = inside.to_kappa @ part.spread(len(kappa))
-    return found
+def _(problem: CompositeProblem, kappa: Array, tau: float, at: Places) -> Constraints:
+    (value, to_tau), to_kappa = np.zeros((2, len(at.v))), np.zeros((len(at.v), len(kappa)))
+    for part, which, own in problem.split(at):
+        inside = constraints(part.problem, kappa[part.place], tau + part.lead, own)
+        value[which], to_tau[which] = inside.value, inside.to_tau
+        to_kappa[which] = inside.to_kappa @ part.spread(len(kappa))
+    return Constraints(at.curve, at.plant, at.v, value, to_kappa, to_tau)
 
 
 @to_theta.register

@@ -85,36 +85,31 @@ def assess(
         curve.append(np.full(len(row[-1]), end_curve))
         at.append(np.repeat(place[numbers], P))
     i, j, c, k = np.nonzero(regular[..., None, None] & (value > -within))
-    peaks_at = (np.concatenate(part) for part in (curve, row, at))
-    near = Places(curves[c], i + k * P, v[i, j])
-    return Assessment(True, poles, constraints(problem, kappa, tau, *peaks_at), near)
+    found = constraints(problem, kappa, tau, Places(*map(np.concatenate, (curve, row, at))))
+    return Assessment(True, poles, found, Places(curves[c], i + k * P, v[i, j]))
 
 
 @singledispatch
-def constraints(
-    problem: LoopProblem, kappa: Array, tau: float, curve: np.ndarray, row: np.ndarray, v: Array
-) -> Constraints:
-    """Values and derivatives of these rows of these curves at these v."""
-    value, slope, to_kappa, *_ = evaluate_rows(problem, kappa, tau, curve, row, v)
-    to_tau = np.where(curve == LoopCurve.SHAPE, 1.0, 0.0)
-    end = curve == LoopCurve.CROSSING
-    to_tau[end] = slope[end] / problem.plants.chain(v[end])
-    return Constraints(curve, row, v, value + problem.margin, to_kappa, to_tau)
+def constraints(problem: LoopProblem, kappa: Array, tau: float, at: Places) -> Constraints:
+    """Values and derivatives of these rows."""
+    value, slope, to_kappa, *_ = evaluate_rows(problem, kappa, tau, at)
+    to_tau = np.where(at.curve == LoopCurve.SHAPE, 1.0, 0.0)
+    end = at.curve == LoopCurve.CROSSING
+    to_tau[end] = slope[end] / problem.plants.chain(at.v[end])
+    return Constraints(at.curve, at.plant, at.v, value + problem.margin, to_kappa, to_tau)
 
 
-def evaluate_rows(
-    problem: LoopProblem, kappa: Array, tau: float, curve: np.ndarray, row: np.ndarray, v: Array
-) -> Any:
+def evaluate_rows(problem: LoopProblem, kappa: Array, tau: float, at: Places) -> Any:
     """What `kernels.loop_rows.rows` has of these rows; without the margin."""
-    P = problem.plants.count
-    return rows(curve, row // P, row % P, v, problem.loop(kappa, tau))
+    number, plant = np.divmod(at.plant, problem.plants.count)
+    return rows(at.curve, number, plant, at.v, problem.loop(kappa, tau))
 
 
 @singledispatch
 def to_theta(problem: LoopProblem, kappa: Array, constraints: Constraints) -> Array:
     """∂c/∂θ (M, n_θ) at fixed κ and τ."""
     slopes, v, which = problem.plants.slopes, constraints.v, problem.plants_of(constraints)
-    *_, x, y, right = evaluate_rows(problem, kappa, 0.0, constraints.curve, constraints.plant, v)
+    *_, x, y, right = evaluate_rows(problem, kappa, 0.0, constraints)
     out = form_slopes(slopes, which, v, x, y, False)
     free = constraints.curve == LoopCurve.GS
     if free.any():
@@ -141,7 +136,8 @@ def hessians(
     loop = problem.loop(kappa, tau)
     out[:, k:-1, k:-1] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
     v = (rows.v * np.exp([[0.0], [STEP], [-STEP]])).ravel()
-    found = evaluate_rows(problem, kappa, tau, np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
+    around = Places(np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
+    found = evaluate_rows(problem, kappa, tau, around)
     slopes, to_kappa = found[1].reshape(3, m), found[2].reshape(3, m, n)
     slope, own = slopes[0], to_kappa[0]
     c_xx, c_xk = ((part[1] - part[2]) / (2.0 * STEP) for part in (slopes, to_kappa))
@@ -152,7 +148,7 @@ def hessians(
     if beside:
         to_z = to_theta(problem, kappa, rows)
         for i, other in enumerate(beside):
-            moved = evaluate_rows(other, kappa, tau, rows.curve, rows.plant, rows.v)
+            moved = evaluate_rows(other, kappa, tau, rows)
             c_xz[:, i] = (moved[1] - slope) / BESIDE
             out[:, i, k:-1] = out[:, k:-1, i] = (moved[2] - own) / BESIDE
             out[:, i, :k] = (to_theta(other, kappa, rows) - to_z) / BESIDE

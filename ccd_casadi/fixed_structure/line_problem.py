@@ -15,7 +15,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.figures import assess, hessians
+from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.loop_problem import (
     FIRST,
@@ -25,7 +25,6 @@ from ccd_casadi.fixed_structure.loop_problem import (
     LoopProblem,
     Places,
 )
-from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
@@ -33,6 +32,7 @@ from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.kernels.loop_grid import NONE
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.loop_rows import levels, rows
+from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -226,20 +226,16 @@ def _(
     low = (at_low[:, None] * P + np.arange(lines, P)).ravel()
     curve = np.concatenate([codes[c], np.full(len(low), LoopCurve.S_LOW)])
     row = np.concatenate([i + k * P, low])
-    found, _, to_kappa, *_ = rows(curve, row // P, row % P, v[row % P], loop)
-    to_tau = np.where(curve == LoopCurve.SHAPE, 1.0, 0.0)
-    to_tau[curve == LoopCurve.KS] = -problem.ceiling(tau)[1]
-    ends = _ends(problem, loop, crossing)
-    parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
-    curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)
-    peaks = Constraints(curve, row, at, found + problem.margin, to_kappa, to_tau)
+    found = constraints(problem, kappa, tau, Places(curve, row, v[row % P]))
+    found.to_tau[curve == LoopCurve.KS] = -problem.ceiling(tau)[1]
     none = np.zeros(0, np.int64)
+    peaks = found.and_those(_ends(problem, loop, crossing))
     return Assessment(True, np.zeros(0), peaks, Places(none, none, np.zeros(0)))
 
 
-def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarray, ...]:
-    """ln|S(jω_b)| + ½ ln 2 of every response and number: curve, row, v, value and slopes."""
-    P, v, rows_of = problem.plants.count, problem.v, []
+def _ends(problem: LineProblem, loop: object, crossing: Array) -> Constraints:
+    """ln|S(jω_b)| + ½ ln 2 of every response and number."""
+    P, v, found = problem.plants.count, problem.v, []
     numbers = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.CROSSING]))
     for number in numbers:
         place = crossing[number]
@@ -252,9 +248,9 @@ def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarr
             share = np.log(place / at[0]) / width
             mean = np.array([1.0 - share, share])
             slope = (value[1] - value[0]) / width / problem.plants.chain(np.array(place))
-            rows_of.append((number * P + i, at[1], mean @ value, mean @ to_kappa, slope))
-    parts = [np.array(part) for part in zip(*rows_of, strict=True)]
-    return (np.full(len(parts[0]), LoopCurve.CROSSING), *parts)
+            level = mean @ value + problem.margin
+            found.append((code[0], number * P + i, at[1], level, mean @ to_kappa, slope))
+    return Constraints(*map(np.array, zip(*found, strict=True)))
 
 
 @hessians.register

@@ -49,8 +49,8 @@ class Ascent:
     """
 
     point: Point
-    radius: float
-    evaluations: int
+    radius: float = FIRST_RADIUS
+    evaluations: int = 1
     done: bool = False
 
 
@@ -121,7 +121,7 @@ def all_rows(problem: LoopProblem, kappa: Array, tau: float, found: Assessment) 
     """The peaks, and after them the values near."""
     assert found.peaks is not None
     assert found.near is not None
-    return found.peaks.and_those(constraints(problem, kappa, tau, *found.near))
+    return found.peaks.and_those(constraints(problem, kappa, tau, found.near))
 
 
 def ascend(

@@ -101,13 +101,11 @@ class PlantSet:
     @cached_property
     def states(self) -> tuple[Array, Array, Array, Array]:
         """A (P, n, n), B, C and D of these; the shorter ones with stable states that do nothing."""
-        most, (p, m) = max(len(G.A) for G in self.systems), self.residues.shape[2:]
-        A = np.tile(-np.eye(most), (self.count, 1, 1))
-        B, C = np.zeros((self.count, most, m)), np.zeros((self.count, p, most))
-        for i, G in enumerate(self.systems):
-            n = len(G.A)
-            A[i, :n, :n], B[i, :n], C[i, :, :n] = G.A, G.B, G.C
-        return A, B, C, np.array([G.D for G in self.systems])
+        A, B, C, D = (padded([getattr(G, name) for G in self.systems]) for name in "ABCD")
+        for whole, G in zip(A, self.systems, strict=True):
+            rest = np.arange(len(G.A), len(whole))
+            whole[rest, rest] = -1.0
+        return A, B, C, D
 
     @cached_property
     def modes(self) -> modes.Plants:
@@ -154,15 +152,9 @@ class PlantSet:
     @cached_property
     def slopes(self) -> plant_slopes.PlantSlopes:
         """What the kernels need for derivatives to θ; the shorter plants with zeros."""
-        (P, n), (p, m), count = self.poles.shape, self.residues.shape[2:], len(self.plants[0].dA)
-        C, B = np.zeros((P, p, n), complex), np.zeros((P, n, m), complex)
-        dA, dB = np.zeros((P, n, n, count), complex), np.zeros((P, n, m, count), complex)
-        dC = np.zeros((P, p, n, count), complex)
-        for i, plant in enumerate(self.plants):
-            k = len(plant.poles)
-            C[i, :, :k], B[i, :k] = plant.reading, plant.drive
-            dA[i, :k, :k], dB[i, :k] = np.moveaxis(plant.dA, 0, -1), np.moveaxis(plant.dB, 0, -1)
-            dC[i, :, :k] = np.moveaxis(plant.dC, 0, -1)
+        C, B, *parts = (padded([getattr(plant, name) for plant in self.plants], dtype=complex)
+                        for name in ("reading", "drive", "dA", "dB", "dC"))  # fmt: skip
+        dA, dB, dC = (np.ascontiguousarray(np.moveaxis(part, 1, -1)) for part in parts)
         gap, size = self.poles[:, :, None] - self.poles[:, None, :], np.abs(self.poles)
         near = np.abs(gap) <= CLOSE * np.maximum(size[:, :, None], size[:, None, :])
         gaps = np.where(near, 0.0, 1.0 / np.where(near, 1.0, gap))
@@ -171,8 +163,8 @@ class PlantSet:
             T, (d, late, early) = self.period, moments(self.poles, self.period, self.delay)
             steeper = moment_slopes(self.poles, T, self.delay)
             terms[..., 1:] = np.stack([late, early, np.exp(self.poles * T), *steeper], axis=-1)
-        parts = np.stack([dA.real, dA.imag], axis=3)
-        return plant_slopes.PlantSlopes(terms, C, B, gaps, parts, dB, dC, self.period or 0.0, d)
+        both = np.stack([dA.real, dA.imag], axis=3)
+        return plant_slopes.PlantSlopes(terms, C, B, gaps, both, dB, dC, self.period or 0.0, d)
 
 
 def plant_set(
@@ -212,16 +204,20 @@ def plant_set(
     delay = 0.0 if sampling is None else sampling.delay * omega_0
     scaled = (in_units_of(plant, plants[0]) for plant in plants)
     found = tuple(_loop_plant(plant, f"plant {i}", alike) for i, plant in enumerate(scaled, 1))
-    # Shorter plants have residues of zero.
-    most, (p, m) = max(len(one.poles) for one in found), found[0].system.D.shape
-    poles = np.full((len(found), most), -1.0, complex)
-    residues = np.zeros((len(found), most, p, m), complex)
-    for i, loop in enumerate(found):
-        k = len(loop.poles)
-        poles[i, :k] = loop.poles
-        residues[i, :k] = np.einsum("pn,nm->npm", loop.reading, loop.drive)
+    poles = padded([one.poles for one in found], -1.0, complex)
+    residues = padded([np.einsum("pn,nm->npm", one.reading, one.drive) for one in found],
+                      dtype=complex)  # fmt: skip
     out, into = (np.ascontiguousarray(M, float) for M in (out, into))
     return PlantSet(found, omega_0, force, period, delay, poles, residues, out, into)
+
+
+def padded(parts: Sequence[np.ndarray], fill: float = 0.0, dtype: type = float) -> np.ndarray:
+    """Arrays of one rank as one, the smaller ones filled up at their ends."""
+    sizes = np.max([part.shape for part in parts], axis=0)
+    out = np.full((len(parts), *sizes), fill, dtype)
+    for whole, part in zip(out, parts, strict=True):
+        whole[tuple(map(slice, part.shape))] = part
+    return out
 
 
 def closed_loops(

@@ -13,13 +13,13 @@ rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u a
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.loop import PlantSet
+from ccd_casadi.fixed_structure.loop import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.limits import HALF_POWER, Limit, LoopCurve
 from ccd_casadi.kernels.loop_point import LoopArrays
@@ -70,10 +70,7 @@ class LoopProblem:
     def fixed(self) -> Array:
         """The base grid and the flanks of every plant's poles and zeros, (P, k)."""
         roots = [np.append(np.linalg.eigvals(G.A), G.zeros()) for G in self.plants.systems]
-        roots = [own[own.imag >= 0.0] for own in roots]
-        found = np.full((len(roots), max(map(len, roots))), np.nan, complex)
-        for i, own in enumerate(roots):
-            found[i, : len(own)] = own
+        found = padded([own[own.imag >= 0.0] for own in roots], np.nan, complex)
         return np.concatenate([np.tile(self.base, (len(found), 1)), flanked(found)], axis=1)
 
     @cached_property
@@ -236,23 +233,21 @@ class Columns:
 
 
 @dataclass(frozen=True)
-class Constraints(Columns):
-    """M constraints c <= 0: curve, plant, v (over ω₀), value, derivatives to κ (M, n) and τ."""
+class Places(Columns):
+    """LoopCurve, plant and v (over ω₀) of M constraints."""
 
     curve: np.ndarray
     plant: np.ndarray
     v: Array
+
+
+@dataclass(frozen=True)
+class Constraints(Places):
+    """Constraints c <= 0 there: value, derivatives to κ (M, n) and τ."""
+
     value: Array
     to_kappa: Array
     to_tau: Array
-
-
-class Places(NamedTuple):
-    """LoopCurve, plant and v (over ω₀) of constraints."""
-
-    curve: np.ndarray
-    plant: np.ndarray
-    v: Array
 
 
 @dataclass(frozen=True)

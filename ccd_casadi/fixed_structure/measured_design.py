@@ -24,13 +24,13 @@ from ccd_casadi.fixed_structure.decoupling import Decoupling
 from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
-from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge
 from ccd_casadi.fixed_structure.race import finished, run_race
 from ccd_casadi.fixed_structure.sections_design import MARGIN, in_problem_units, titled
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import FIRST_RADIUS, PENALTY, Ascent, Point, ascend
+from ccd_casadi.fixed_structure.local_search import PENALTY, Ascent, Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
@@ -41,17 +41,13 @@ class LocalOptimum:
 
 
 @dataclass(frozen=True)
-class Runner:
-    """One search: where it is, the radius, what its last round gained, loops looked at in all.
+class Runner(Ascent):
+    """One search: where it is, with the loops looked at in all, and what its last round gained.
 
-    `done`: its steps no longer help. `running`: it goes on. `count`: searches that it stands for.
+    `running`: it goes on. `count`: searches that it stands for.
     """
 
-    point: Point
-    radius: float = FIRST_RADIUS
     gained: float = np.inf
-    evaluations: int = 1
-    done: bool = False
     running: bool = True
     count: int = 1
 
@@ -172,7 +168,7 @@ def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool | No
         end = ends[i]
         spent = runner.evaluations + end.evaluations
         gained = end.point.merit() - runner.merit
-        found.append(Runner(end.point, end.radius, gained, spent, end.done, not end.done,
+        found.append(Runner(end.point, end.radius, spent, end.done, gained, not end.done,
                             runner.count))  # fmt: skip
     return found
 

@@ -130,20 +130,22 @@ class ProblemAt:
         return StructuredValue(point, bandwidth, slope, design, spent, envelope, error=error)
 
 
-def structured_value(problem: CoDesignProblem, theta: Sequence[float]) -> StructuredValue:
+def structured_value(
+    problem: CoDesignProblem, theta: Sequence[float], workers: Pool | None = None
+) -> StructuredValue:
     """The best certified design from the problem's warm starts at θ, and the envelope gradient."""
     here, starts = ProblemAt(problem, theta), structured_of(problem).starts
     initial = warm_starts_at(problem, structure_of(problem), here.plants, bounds_of(problem))
     made: SectionsDesign | None = None
     spent = 0
     if initial:
-        made = here.searched(initial)
+        made = here.searched(initial, workers=workers)
         spent += 1
     if made is None or (starts and not made.certified):
-        made = here.searched(initial, min(FEW, starts))
+        made = here.searched(initial, min(FEW, starts), workers=workers)
         spent += 1
     while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
-        again = here.searched([made.kappa])
+        again = here.searched([made.kappa], workers=workers)
         spent += 1
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
             break

@@ -102,7 +102,7 @@ def prepared(
         if wider is None:
             break
         problem = with_structured(wider, warm_starts=_warm_starts(made))
-        made, worst = structured_value(problem, problem.start).design, None
+        made, worst = structured_value(problem, problem.start, workers).design, None
         if not made.certified:
             break
     if made.certified:

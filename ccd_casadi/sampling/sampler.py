@@ -5,9 +5,7 @@ only units in flight. What a polish asks for one after the other (`truth`) and w
 end is stored whole (`kept`), with the controller, as it is made.
 """
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -32,7 +30,7 @@ from ccd_casadi.sampling.units import design_unit, inner_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import remark
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
@@ -246,8 +244,7 @@ class Sampler:
         best = before + int(np.nanargmin(J[before:]))
         if np.isnan(J[:before]).all() or J[best] < np.nanmin(J[:before]) - WORTH * abs(J[best]):
             bandwidth = self.trace[best].bandwidth / HZ
-            with suppress(OSError, ValueError):  # a stream that fails ends the printing
-                say(f"best so far: J {J[best]:.6g}, {bandwidth:.4g} Hz", sys.stderr)
+            remark(f"best so far: J {J[best]:.6g}, {bandwidth:.4g} Hz", self.quiet)
 
     def _worth(self, sample: Sample) -> float:
         """The bandwidth of a design that meets the bounds, else NaN."""

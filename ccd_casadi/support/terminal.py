@@ -5,7 +5,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import TextIO
 
@@ -77,6 +77,13 @@ def inform(text: str, stream: TextIO | None = None) -> None:
     """As `say`, unless `kept_quiet` (--quiet) forbids what is no answer and no mistake."""
     if not QUIET.get():
         say(text, stream)
+
+
+def remark(text: str, quiet: bool) -> None:
+    """A line of progress on stderr, unless quiet; a stream that fails ends the printing alone."""
+    with suppress(OSError, ValueError):
+        if not quiet:
+            say(text, sys.stderr)
 
 
 @contextmanager

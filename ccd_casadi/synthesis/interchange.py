@@ -22,6 +22,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.mat_files import mat_variables
 
 if TYPE_CHECKING:
     import control  # a second to import: where it is called, and not before
@@ -150,22 +151,6 @@ def write_mat(path: Path, design: DesignFile) -> None:
         scipy.io.savemat(path, content, format="5", oned_as="column", long_field_names=True)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def mat_variables(path: Path) -> dict[str, Any]:
-    """What a .mat file holds by name. Raises UserError where it cannot be read."""
-    try:
-        with path.open("rb") as stream:
-            return dict(scipy.io.loadmat(stream))
-    except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except NotImplementedError:  # how SciPy refuses the HDF5 files of MATLAB 7.3
-        raise UserError(f"{path}: is a MATLAB 7.3 file; write it with save(…, '-v7')") from None
-    except Exception as error:  # a damaged file fails anywhere inside the reader
-        words = " ".join(str(error).split())[:120]
-        raise UserError(f"{path}: is not a readable .mat file: {words}") from None
 
 
 def read_mat(path: Path) -> DesignFile:

@@ -334,7 +334,7 @@ def test_what_sections_spend_is_counted_over_all_nodes(
         return FormulationResult(message="nothing is feasible")
 
     monkeypatch.setattr(StructuredOuter, "solve_formulation", solve_formulation)
-    monkeypatch.setattr(outer_structured, "with_initial_search", lambda _, own, *__: (own, ""))
+    monkeypatch.setattr(outer_structured, "with_initial_search", lambda of, _: (of.problem, ""))
     own = problem(controller=StructuredProblem())
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(own, store, Workers(1))

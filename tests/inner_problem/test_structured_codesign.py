@@ -202,7 +202,8 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
             asked = replace(case, inner=replace(case.inner, S_max=bound))
-            found, words = outer_structured.with_initial_search(store, asked, 0, True)
+            of = Sampler(asked, store, Workers(1))
+            found, words = outer_structured.with_initial_search(of, 0)
             assert (structured_of(found).warm_starts, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip
@@ -214,9 +215,9 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
     """Where no anchor leads to one: a single search with starts, whatever θ the pieces ask for."""
     honest, searches = structured_bandwidth.ProblemAt.searched, []
 
-    def counted(here: Any, initial: Any, starts: Any = None, *rest: Any) -> Any:
+    def counted(here: Any, initial: Any, starts: Any = None, **rest: Any) -> Any:
         searches.append(starts)
-        return honest(here, initial, starts, *rest)
+        return honest(here, initial, starts, **rest)
 
     monkeypatch.setattr(structured_bandwidth.ProblemAt, "searched", counted)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:

@@ -24,9 +24,11 @@ from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Workers
 from surrogates.retrain import main as retrain
 
 CABLES = ErrorBudget((
@@ -47,9 +49,10 @@ def least(sampling: Sampling | None = None, **changes: object) -> CoDesignProble
 
 def anchored(case: CoDesignProblem, folder: Path) -> CoDesignProblem:
     with SampleStore(folder / "anchors.sqlite") as store:
-        found, words = with_initial_search(store, case, 0, True)
+        sampler = Sampler(case, store, Workers(1))
+        found, words = with_initial_search(sampler, 0)
         assert not words
-        assert with_initial_search(store, case, 0, True) == (found, "")
+        assert with_initial_search(sampler, 0) == (found, "")
     return found
 
 

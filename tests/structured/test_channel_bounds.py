@@ -113,13 +113,12 @@ def test_where_plants_fall_apart_the_parts_have_the_rows(sampling: Sampling | No
         for one in (rows.only(np.array([j])) for j in range(len(rows.v))):
             own = np.isfinite(joint.limits[one.curve[0], joint.first + i])
             numbers = [joint.first + i] if own else range(joint.first)
-            found = [
-                constraints(joint, kappa, TAU, one.curve, np.array([2 * number]), one.v)
-                for number in numbers
-            ]
+            places = (replace(one, plant=np.array([2 * number])) for number in numbers)
+            found = [constraints(joint, kappa, TAU, place) for place in places]
             row = min(found, key=lambda row: abs(row.value[0] - one.value[0]))
             assert row.value[0] == pytest.approx(one.value[0], abs=1e-8)
-            np.testing.assert_allclose(row.to_kappa[:, part.place], one.to_kappa, atol=1e-7)
+            own = [each.to_kappa[:, part.place] for each in (row, one)]
+            np.testing.assert_allclose(*own, atol=1e-7)
             assert row.to_tau[0] == pytest.approx(one.to_tau[0], abs=1e-7)
     assert {"S_MAX of 1", "S_MAX of 3", "KS of 3"} <= set(apart.kinds_of(peaks))
 

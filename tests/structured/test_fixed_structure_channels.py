@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,7 @@ def test_where_plants_fall_apart_the_parts_are_the_whole(sampling: Sampling | No
     for i in range(len(parts.v)):
         one = parts.only(np.array([i]))
         rows = [
-            constraints(together, kappa, -1.5, one.curve, np.array([2 * k]), one.v)
+            constraints(together, kappa, -1.5, replace(one, plant=np.array([2 * k])))
             for k in range(3)
         ]
         row = min(rows, key=lambda row: abs(row.value[0] - one.value[0]))

@@ -30,7 +30,7 @@ from ccd_casadi.fixed_structure.figures import (
     to_theta,
 )
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
-from ccd_casadi.fixed_structure.loop_problem import LoopCurve
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, Places
 from ccd_casadi.fixed_structure.peak_search import Brackets
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
@@ -210,7 +210,7 @@ def test_derivatives_of_the_peaks(seed: int, sampling: Sampling | None) -> None:
     assert peaks is not None
 
     def values(problem, kappa, tau, which=peaks.plant):
-        return constraints(problem, kappa, tau, peaks.curve, which, peaks.v).value
+        return constraints(problem, kappa, tau, replace(peaks, plant=which)).value
 
     size = np.abs(peaks.to_kappa).max(1, keepdims=True) + 1e-3
     to_kappa = slopes(lambda x: values(problem, x, tau), kappa, 1e-4)
@@ -344,5 +344,5 @@ def test_a_plant_that_answers_nothing_raises_nothing() -> None:
     v = np.geomspace(0.01, 1.0, 5)
     found = by_curve(silent, kappa, 0.0, silent.curves, np.tile(v, (1, 1)))
     assert (found[LoopCurve.T] == -np.inf).all()
-    rows = np.full(5, int(LoopCurve.T))
-    assert not np.isfinite(evaluate_rows(silent, kappa, 0.0, rows, np.zeros(5, int), v)[1]).any()
+    rows = Places(np.full(5, int(LoopCurve.T)), np.zeros(5, int), v)
+    assert not np.isfinite(evaluate_rows(silent, kappa, 0.0, rows)[1]).any()

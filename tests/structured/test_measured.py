@@ -13,15 +13,11 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, syn
 from ccd_casadi.fixed_structure.line_problem import line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.measured import (
-    MeasuredResponse,
-    from_control,
-    read_frequency_response,
-)
 from ccd_casadi.fixed_structure.measured_design import design_on_data
 from ccd_casadi.fixed_structure.measured_loop import judge, winding
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 

@@ -15,7 +15,7 @@ from test_measured import two_by_two
 import ccd_casadi as ccd
 from ccd_casadi import report
 from ccd_casadi.fixed_structure.line_problem import line_problem
-from ccd_casadi.fixed_structure.measured import MeasuredResponse
+from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.tune import main
 from surrogates.lazy_names import from_stub

@@ -124,7 +124,7 @@ def assert_derivatives(
     peaks = peaks.only(chosen(peaks.plant) & (gaps(model, kappa, tau, peaks) > 0.03))
 
     def values(of, kappa, tau):
-        return constraints(of, kappa, tau, peaks.curve, peaks.plant, peaks.v).value
+        return constraints(of, kappa, tau, peaks).value
 
     size = np.abs(peaks.to_kappa).max(1, keepdims=True) + 1e-2
     to_kappa = slopes(lambda x: values(model, x, tau), kappa, 1e-4)

@@ -10,8 +10,8 @@ import numpy as np
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
+from ccd_casadi.support.mat_files import mat_variables
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.interchange import mat_variables
 
 BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25
