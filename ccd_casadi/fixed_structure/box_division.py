@@ -69,8 +69,7 @@ def divided(family: LoopFamily, box: Array, slack: float, share: int, enough: in
         if not count or spent >= share or (spent >= enough and count > STUCK * spent):
             return Division(raised(levels, waiting.levels(found.names)), spent)
         order = np.argsort(-waiting.worst, kind="stable")
-        first = min(AT_ONCE, max(count // 4, 1))
-        worst, waiting = waiting.only(order[:first]), waiting.only(order[first:])
+        worst, waiting = waiting.only(order[:AT_ONCE]), waiting.only(order[AT_ONCE:])
         part, known = _halved(worst), np.tile(worst.highest, 2)
 
 
