@@ -14,7 +14,8 @@ from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.support.arrays import Array
 
-AT_ONCE = 2_000  # boxes that are divided at a time
+AT_ONCE = 2_000  # boxes that are divided at a time, at most
+BATCHES = 250  # of a share: a small one is spent on the worst boxes alone
 STUCK = 0.25  # of its boxes still open: it would take many times as many to close them
 DECADES = 6.0  # of frequency cells at the start, downwards; below is one cell to 0
 
@@ -69,7 +70,8 @@ def divided(family: LoopFamily, box: Array, slack: float, share: int, enough: in
         if not count or spent >= share or (spent >= enough and count > STUCK * spent):
             return Division(raised(levels, waiting.levels(found.names)), spent)
         order = np.argsort(-waiting.worst, kind="stable")
-        worst, waiting = waiting.only(order[:AT_ONCE]), waiting.only(order[AT_ONCE:])
+        first = min(AT_ONCE, max(share // BATCHES, count // 4, 1))
+        worst, waiting = waiting.only(order[:first]), waiting.only(order[first:])
         part, known = _halved(worst), np.tile(worst.highest, 2)
 
 
