@@ -41,6 +41,7 @@ LOOKS, APART = 5, 200  # for worse plants before an end, each elsewhere in the b
 AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
+STILL = 2e-3  # of the box: so near a basis is that of the place itself
 ENDINGS, KEPT = 24, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 3e-9  # of w2 ω_b: less is rounding
 
@@ -118,11 +119,16 @@ def _arrived(
     problem: CoDesignProblem, best: JointPoint, J: float, ends: Sequence[tuple[Array, float]]
 ) -> bool:
     """Whether a place is that of a known end, and not better."""
-    width = np.subtract(problem.upper, problem.lower)
     return any(
-        np.abs((best.theta - theta) / width).max() < CLOSE and end - SETTLED * abs(end) < J
+        _apart(problem, best.theta, theta) < CLOSE and end - SETTLED * abs(end) < J
         for theta, end in ends
     )
+
+
+def _apart(problem: CoDesignProblem, one: Sequence[float], other: Sequence[float] | Array) -> float:
+    """The largest distance of two θ along an axis, in shares of the box."""
+    width = np.subtract(problem.upper, problem.lower)
+    return float(np.abs(np.subtract(one, other) / width).max())
 
 
 def finished(
@@ -141,7 +147,7 @@ def finished(
     def around(place: JointPoint) -> tuple[Evaluate, ...]:
         return nearby(working.sampler.problem, [place.theta] if bent else (), place.theta)
 
-    models = around(start)
+    models, middle = around(start), start.theta
     best, J = JointModel(working.sampler.problem, models, start, reach).adapted()
     for step in range(1, ENDINGS):
         problem = working.sampler.problem
@@ -151,6 +157,7 @@ def finished(
         if tell is not None:
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
         del make
+        gc.collect()  # searches are large, and hold themselves in circles
         if found.gain <= KEPT * abs(J):
             before, true = working, nearby(problem, (), best.theta)
             working, best, there = working.on_worse_plants(true, best, (look, *again), WITHIN, tell)
@@ -158,14 +165,14 @@ def finished(
                 return working, best, True
             J = there
             continue
-        others = around(found.end)
+        still = bent and _apart(problem, found.end.theta, middle) < STILL
+        others = models if still else around(found.end)
         end, there = JointModel(problem, others, found.end, reach).adapted()
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
-            models = others
+            models, middle = others, middle if still else found.end.theta
             looks = look + step, *again
             working, best, J = working.on_worse_plants(models, end, looks, WITHIN, tell)
-        gc.collect()  # bases are large, and searches before hold theirs in circles
     return working, best, False
 
 
