@@ -30,7 +30,7 @@ from ccd_casadi.support.process_pool import Pool
 MOST_WARM_STARTS = 3
 ENOUGH = 12  # starts before a search may say that it found no controller within the bounds
 DISTINCT = 0.1  # relative: local optima further below the best are no warm starts
-ROUNDS, ROUNDS_OF_ERROR = 6, 4  # of a design on the set and a search for plants that are worse
+ROUNDS, ROUNDS_OF_ERROR = 8, 4  # of a design on the set and a search for plants that are worse
 SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
 
 
@@ -97,12 +97,18 @@ def prepared(
 
     made = race(problem, problem.start, progress, workers, only_warm_starts)
     worst: Excess | None = None
+    last = True  # what a search ends with goes to its optimum once no plant is found worse
     for turn in range(ROUNDS if made.certified else 0):
         worst, wider = _wider(problem, problem.start, made, turn, progress)
-        if wider is None:
+        if wider is None and last:
             break
-        problem = with_structured(wider, warm_starts=_warm_starts(made))
-        made, worst = structured_value(problem, problem.start, workers).design, None
+        last = wider is None
+        problem = with_structured(wider or problem, warm_starts=_warm_starts(made))
+        if last:
+            made = structured_value(problem, problem.start, workers).design
+        else:
+            made = race(problem, problem.start, progress, workers, only_warm_starts=True)
+        worst = None
         if not made.certified:
             break
     if made.certified:
