@@ -37,7 +37,7 @@ REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the models 
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
-LOOKS, APART = 5, 200  # for worse plants before an end, each elsewhere in the box; numbered from
+APART = 200  # looks for worse plants at an end are numbered from it, each elsewhere in the box
 AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
@@ -82,12 +82,10 @@ def joint_search(
             settled = ends is not None
             if settled:
                 break
-            final = APART + (LOOKS + 1) * turn + LOOKS
-            looks = range(final - LOOKS, final)
-            working, best, _ = working.on_worse_plants(models, best, looks, WITHIN, tell)
             del make, models
             gc.collect()  # with which the bases go
-            working, best, settled = finished(working.whole, best, final, tell)
+            look = APART + ENDINGS * turn
+            working, best, settled = finished(working.whole, best, look, tell)
             if settled:
                 break
             known = [best.theta]
