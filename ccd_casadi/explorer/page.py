@@ -89,6 +89,7 @@ class Page:
         self.note, self.output = Div(name="note"), Div(name="output")
         self.modes = Div(stylesheets=[WIDE])
         self.design = _button("Design sections here", "design", self.design_structured)
+        self._designs, self._began = False, session.kappa is not None
         self.solve_button = _button("Solve from here", "solve", self.start_solve)
         self.stop = _button("Stop the solve", "stop", self.stop_solve)
         self.stop.disabled = True
@@ -163,7 +164,7 @@ class Page:
         self._of_search = False
         self._kept.knobs = knobs = self.controls.knobs()
         structured = knobs.structured
-        self.design.disabled = not structured
+        self.design.disabled = self._designs or not structured
         full = (let_go or search or bool(self.controls.always.active)) and not structured
         behind = full and self.session.known is not None
         try:
@@ -178,6 +179,8 @@ class Page:
             self._search_behind(knobs)
         if let_go:
             self.settle()
+        if structured and not self._began and self.session.known is None:
+            self.design_structured()  # no page stays without a controller
 
     def _complain(self, words: str) -> None:
         self.note.text = f'<p class="refused">{escape(words)}</p>'
@@ -276,31 +279,33 @@ class Page:
         self.settle()
 
     def _failed(self, error: BaseException) -> None:
-        self._newest = None
+        self._newest, self._designs = None, False
         self._complain(str(error))
 
     def design_structured(self) -> None:
         """A controller of fixed structure at this θ."""
         knobs = self.controls.knobs()
         problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
-        self.design.disabled = True
+        self.design.disabled = self._designs = self._began = True
         self._designing("it takes seconds")
         done, failed = self._then(self._designed), self._then(self._failed)
         told = self._then(self._designing)
         self.background.ask(designed, (problem, knobs), done, failed, told)
 
     def _designing(self, words: str) -> None:
-        if self.design.disabled:  # not of one that has ended
+        if self._designs:  # not of one that has ended
             self.note.text = f"<p>designing a controller at this θ: {escape(words)} …</p>"
 
     def _designed(self, found: Designed) -> None:
-        self.design.disabled, self.note.text = False, ""
+        self.design.disabled, self._designs, self.note.text = False, False, ""
         look = self.session.took_designed(found)
         if look is None:
             self._complain(found.words)
-            return
-        self.show(look)
-        self.settle()
+        elif found.knobs == self.controls.knobs():
+            self.show(look)
+            self.settle()
+        else:  # the sliders moved meanwhile: it is judged where they are
+            self.moved(True)
 
     # pins, files, solves
 

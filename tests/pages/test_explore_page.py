@@ -31,9 +31,10 @@ READY = "Bokeh?.documents[0]?.get_model_by_name('answer')?.data.serial[0] > 0"
 
 
 @pytest.fixture
-def server(tmp_path):
+def server(tmp_path, request):
     """The command as a user gives it, and the address that it prints."""
-    command = [sys.executable, "-m", "ccd_casadi.explore", "runs/two_mass.toml", "--no-open"]
+    case = getattr(request, "param", "runs/two_mass.toml")
+    command = [sys.executable, "-m", "ccd_casadi.explore", case, "--no-open"]
     started = subprocess.Popen(
         [*command, "--out", str(tmp_path)], stdout=subprocess.PIPE, text=True
     )
@@ -102,6 +103,15 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     picture(page, "explorer_without_its_server")
     with SampleStore(Path(tmp_path) / "samples.sqlite") as store:
         assert tuple(theta) in {sample.theta for sample in store.select()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("server", ["runs/two_mass_built.toml"], indirect=True)
+def test_a_case_with_sections_opens_with_a_controller(browser, server):
+    page, heard = opened(browser, server[1])
+    page.get_by_text("certified, keeps its bounds").wait_for()
+    picture(page, "explorer_with_sections")
+    assert not heard
 
 
 @pytest.mark.slow
