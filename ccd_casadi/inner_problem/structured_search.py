@@ -104,10 +104,10 @@ def prepared(
             break
         last = wider is None
         problem = with_structured(wider or problem, warm_starts=_warm_starts(made))
-        if last:
-            made = structured_value(problem, problem.start, workers).design
-        else:
+        if not last:
             made = race(problem, problem.start, progress, workers, only_warm_starts=True)
+        if last or not made.certified:  # which has a few starts more where warm ones lead to none
+            made = structured_value(problem, problem.start, workers).design
         worst = None
         if not made.certified:
             break
