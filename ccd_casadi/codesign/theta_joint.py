@@ -38,10 +38,11 @@ GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
 APART = 200  # looks for worse plants at an end are numbered from it, each elsewhere in the box
-AGAIN = (0, 101, 102)  # looks that a run has at its end, where a return costs finite elements
+AGAIN = (0,)  # the look that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
-STILL = 2e-3  # of the box: so near a basis is that of the place itself
+STILL, NEARBY = 2e-3, 0.05  # of the box: a basis is that of the place; errs by some 1e-6 of J
+COARSE = 1e-5  # of J: with less promised a basis is that of the place itself
 ENDINGS, KEPT = 24, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 3e-9  # of w2 ω_b: less is rounding
 
@@ -156,6 +157,10 @@ def finished(
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
         del make
         gc.collect()  # searches are large, and hold themselves in circles
+        if found.gain <= KEPT * abs(J) and bent and _apart(problem, best.theta, middle) > STILL:
+            models, middle = around(best), best.theta
+            best, J = JointModel(problem, models, best, reach).adapted()
+            continue
         if found.gain <= KEPT * abs(J):
             before, true = working, nearby(problem, (), best.theta)
             working, best, there = working.on_worse_plants(true, best, (look, *again), WITHIN, tell)
@@ -163,7 +168,8 @@ def finished(
                 return working, best, True
             J = there
             continue
-        still = bent and _apart(problem, found.end.theta, middle) < STILL
+        near = NEARBY if found.gain > COARSE * abs(J) else STILL
+        still = bent and _apart(problem, found.end.theta, middle) < near
         others = models if still else around(found.end)
         end, there = JointModel(problem, others, found.end, reach).adapted()
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach

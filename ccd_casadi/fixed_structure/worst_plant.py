@@ -2,13 +2,15 @@
 
     max over p in the box of  max_j c_j(κ, τ; p)
 
-by compass searches from many points at once, of more than four parameters by ascent: each of the
-largest c_j of a plant, made linear in p, points to a corner of the box, and steps towards these
-corners are tried. An unstable loop is worst of all. For what lies between there is `box_proof`.
+by compass searches from many points at once. Of more than four parameters every peak of the loops
+is climbed on its own, from the plant where it is highest: its c_j, made linear in p, points to a
+corner of the box, and steps towards it are tried. Else a bound that all plants reach alike would
+hide the rest. An unstable loop is worst of all. For what lies between there is `box_proof`.
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,15 +29,16 @@ from ccd_casadi.support.arrays import Array
 WITHIN = 1e-4  # ln: by how much a plant of the box may pass a bound and count as within
 UNSTABLE = 10.0  # ln: what an unstable loop counts as
 LATTICE = 200  # plants, evenly over the box
-UNDAMPED = 120  # of more than four parameters, which are not looked through evenly anyway
+UNDAMPED = 60  # of more than four parameters, which are not looked through evenly anyway
 EVENLY = 4  # of so many plants one keeps its damping, the others have the least: peaks are sharp
 ALONG = 61  # plants along each theta that varies, at every corner of the rest
 SEARCHES = 6
 ROUNDS = 7  # of a compass search, its step halved each time
 FEW = 4  # parameters up to which every one is moved on its own
-LARGEST = 2  # constraints of a plant that are followed
-STEPS = (1.0, 0.3, 0.1, 0.03)  # towards the corner that a constraint points to: ridges are narrow
+STEPS = (1.0, 0.3, 0.1, 0.03)  # towards the corner that a peak points to: ridges are narrow
 PEAK = 0.1  # ln of the frequency: rows of one bound nearer than that are one peak
+PEAKS, EACH = 40, 2  # that are climbed, the highest, each from its highest plants
+BELOW = 0.1  # ln: how far below its bound such a peak may start
 CLIMBS = 4  # rounds of them
 
 
@@ -46,6 +49,35 @@ class Excess:
     option: int
     point: Array
     value: float
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A peak of one plant's loop: its curve, ln of its frequency in rad/s, its c; and the largest
+    c of that plant."""
+
+    option: int
+    point: Array
+    curve: int
+    log_omega: float
+    own: float
+    value: float
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of many plants' loops: of which plant each is, its curve, ln ω and c."""
+
+    plant: np.ndarray
+    curve: np.ndarray
+    log_omega: Array
+    value: Array
+
+    def nearest(self, plant: int, peak: Peak) -> int | None:
+        """The row of a plant that is that peak now: the highest near by."""
+        near = np.abs(self.log_omega - peak.log_omega) < PEAK
+        rows = np.flatnonzero(near & (self.plant == plant) & (self.curve == peak.curve))
+        return int(rows[np.argmax(self.value[rows])]) if len(rows) else None
 
 
 def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int, Array]]:
@@ -139,7 +171,7 @@ class LoopOnBox:
         return any(head.value > value + WITHIN for head, value in zip(heads, before, strict=True))
 
     def _climbed(self, count: int, seed: int) -> tuple[list[Excess], int]:
-        """`worst_plants` of many parameters: ascents from the worst plants of distinct peaks."""
+        """`worst_plants` of many parameters: ascents of distinct peaks."""
         uncertain = self.uncertain
         own = np.array([name == "damping" for name in uncertain.names])
         points = [
@@ -147,45 +179,81 @@ class LoopOnBox:
             for i, (option, point) in enumerate(lattice(uncertain, count, seed))
         ]
         value, problem, peaks = self._looked_at(uncertain.plants(points))
-        found = dict[tuple[int, ...], Excess]()
-        for i in np.argsort(-value).tolist():
-            option, point = points[i]
-            key: tuple[int, ...] = (option, -i)
-            if peaks is not None and -np.inf < value[i] < UNSTABLE:
-                rows = np.flatnonzero(problem.plants_of(peaks) == i)
-                row = rows[np.argmax(peaks.value[rows])]
-                key = (option, int(peaks.curve[row]), round(float(np.log(peaks.v[row])) / PEAK))
-            found.setdefault(key, Excess(option, point, float(value[i])))
-        heads, looked = list(found.values())[:SEARCHES], len(points)
+        lost = np.flatnonzero(value >= UNSTABLE)
+        ends = {points[i][0]: Excess(*points[i], float(value[i])) for i in lost[np.argsort(value[lost])]}
+        heads, looked = _distinct(points, value, _rows(problem, peaks)), len(points)
+        climbing = list(range(len(heads)))
         for _ in range(CLIMBS):
-            steps = self._towards_corners(heads)
+            steps = self._towards_corners([heads[i] for i in climbing])
             if not steps:
                 break
             looked += len(steps)
-            if not self._tried(heads, steps):
-                break
-        return sorted(heads, key=lambda head: -head.value), looked
+            moved = self._highest([heads[i] for i in climbing], steps)
+            before = [heads[i].own for i in climbing]
+            for i, head in zip(climbing, moved, strict=True):
+                heads[i] = head
+            climbing = [
+                i for i, own in zip(climbing, before, strict=True)
+                if own + 0.1 * WITHIN < heads[i].own < UNSTABLE
+            ]  # fmt: skip
+        found = [*ends.values(), *(Excess(one.option, one.point, one.value) for one in heads)]
+        return sorted(found, key=lambda head: -head.value), looked
 
-    def _towards_corners(self, heads: Sequence[Excess]) -> list[tuple[int, Array]]:
-        """Steps from every head that is stable: the head's number and the point."""
+    def _towards_corners(self, heads: Sequence[Peak]) -> list[tuple[int, Array]]:
+        """Steps from every one: the head's number and the point."""
+        if not heads:
+            return []
         box = self.uncertain.box
         plants = [self.uncertain.sloped(head.point, head.option) for head in heads]
         _, problem, peaks = self._looked_at(plants)
-        if peaks is None:
+        rows = _rows(problem, peaks)
+        found = [(i, rows.nearest(i, head)) for i, head in enumerate(heads)]
+        known = [(i, row) for i, row in found if row is not None]
+        if peaks is None or not known:
             return []
-        of = problem.plants_of(peaks)
-        chosen = [
-            own[np.argsort(-peaks.value[own])[:LARGEST]]
-            for own in (np.flatnonzero(of == row) for row in range(len(heads)))
-        ]
-        rows = np.concatenate(chosen)
-        slopes = to_theta(problem, in_problem_units(problem, self.kappa), peaks.only(rows))
-        found: list[tuple[int, Array]] = []
-        for row, slope in zip(of[rows].tolist(), slopes, strict=True):
-            head = heads[row]
-            corner = np.where(slope > 0.0, box[1], np.where(slope < 0.0, box[0], head.point))
-            for step in STEPS:
-                point = head.point + step * (corner - head.point)
-                if np.abs(point - head.point).max() > 0.0:
-                    found.append((row, point))
-        return found
+        chosen = peaks.only(np.array([row for _, row in known]))
+        slopes = to_theta(problem, in_problem_units(problem, self.kappa), chosen)
+        steps: list[tuple[int, Array]] = []
+        for (i, _), slope in zip(known, slopes, strict=True):
+            point = heads[i].point
+            corner = np.where(slope > 0.0, box[1], np.where(slope < 0.0, box[0], point))
+            ahead = [point + step * (corner - point) for step in STEPS]
+            steps += [(i, other) for other in ahead if (other != point).any()]
+        return steps
+
+    def _highest(self, heads: Sequence[Peak], steps: Sequence[tuple[int, Array]]) -> list[Peak]:
+        """Every peak where it is highest: where it was, or after one of the steps from there."""
+        plants = self.uncertain.plants([(heads[i].option, point) for i, point in steps])
+        value, problem, peaks = self._looked_at(plants)
+        rows, out = _rows(problem, peaks), list(heads)
+        for number, (i, point) in enumerate(steps):
+            largest, row = float(value[number]), rows.nearest(number, heads[i])
+            own = largest if largest >= UNSTABLE else -np.inf if row is None else rows.value[row]
+            if own > out[i].own:
+                at = out[i].log_omega if row is None else float(rows.log_omega[row])
+                out[i] = replace(out[i], point=point, log_omega=at, own=float(own), value=largest)
+        return out
+
+
+def _rows(problem: LoopProblem, peaks: Constraints | None) -> Rows:
+    if peaks is None:
+        return Rows(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
+    plants = problem.plants
+    log_omega = np.log(plants.frequency(peaks.v) * plants.omega_0)
+    return Rows(problem.plants_of(peaks), peaks.curve, log_omega, peaks.value - problem.margin)
+
+
+def _distinct(points: Sequence[tuple[int, Array]], value: Array, rows: Rows) -> list[Peak]:
+    """The peaks of all plants, each on that of every option where it is highest."""
+    found, many = list[Peak](), Counter[tuple[int, ...]]()
+    for row in np.argsort(-rows.value, kind="stable").tolist():
+        own, of = float(rows.value[row]), int(rows.plant[row])
+        if own < -BELOW or len(found) == PEAKS:
+            break
+        option, point = points[of]
+        curve, log_omega = int(rows.curve[row]), float(rows.log_omega[row])
+        key = option, curve, round(log_omega / PEAK)
+        many[key] += 1
+        if many[key] <= EACH:
+            found.append(Peak(option, point, curve, log_omega, own, float(value[of])))
+    return found

@@ -34,7 +34,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 
-AT_ONCE = 3  # plants added in a round
+AT_ONCE = 8  # plants added in a round
 APART = 1e-4  # of the box: plants that are closer are the same plant
 CHECKED = 200  # plants that the judge looks at in the end
 LOOSE = 2.0 * WITHIN  # relative: by how much they may pass a bound
