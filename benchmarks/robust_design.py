@@ -15,8 +15,9 @@ from ccd_casadi.fixed_structure import (
 )
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.loop_on_box import WITHIN, Excess, LoopOnBox
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import LATTICE, WITHIN, Excess, LoopOnBox, lattice
+from ccd_casadi.fixed_structure.worst_plant import LATTICE, lattice, worst_plants
 from ccd_casadi.support.arrays import Array
 
 AT_ONCE = 3  # plants added in one round
@@ -61,7 +62,7 @@ def synthesise_robustly(
     worst = Excess(0, uncertain.nominal, np.nan)
     while made.certified:
         loop = LoopOnBox(uncertain, structure, made.kappa, made.bandwidth, bounds, sampling)
-        heads, _ = loop.worst_plants(seed + turn, count)
+        heads, _ = worst_plants(loop, seed + turn, count)
         worst = heads[0]
         turn += 1
         if worst.value <= WITHIN or turn > rounds:

@@ -29,7 +29,7 @@ from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, c
 from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
 from ccd_casadi.inner_problem.objective import objective_of, violated

@@ -10,8 +10,8 @@ from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
-from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of

@@ -24,7 +24,7 @@ from ccd_casadi.codesign.joint_model import (
     proposed,
 )
 from ccd_casadi.codesign.working_set import WorkingSet
-from ccd_casadi.fixed_structure.worst_plant import WITHIN
+from ccd_casadi.fixed_structure.loop_on_box import WITHIN
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import nearby, structured_of
@@ -38,7 +38,7 @@ GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
 APART = 200  # looks for worse plants at an end are numbered from it, each elsewhere in the box
-AGAIN = (0,)  # the look that a run has at its end, where a return costs finite elements
+AGAIN = (0, 101)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
 STILL, NEARBY = 2e-3, 0.05  # of the box: a basis is that of the place; errs by some 1e-6 of J
@@ -175,8 +175,7 @@ def finished(
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
             models, middle = others, middle if still else found.end.theta
-            looks = look + step, *again
-            working, best, J = working.on_worse_plants(models, end, looks, WITHIN, tell)
+            working, best, J = working.on_worse_plants(models, end, (look + step,), WITHIN, tell)
     return working, best, False
 
 

@@ -86,6 +86,10 @@ class UncertainPlant:
         own = {"damping": 1.0} | {f"theta.{name}": value for name, _, value, _ in self.ranges}
         return np.array([own.get(name, 0.0) for name in self.names])
 
+    def modal(self, option: int) -> ModalPlant:
+        """The model of an option in modal coordinates."""
+        return self._modal(self.nominal, option)
+
     def plant(self, point: Array, option: int = 0) -> ScaledPlant:
         """The scaled plant at a point of the box; its derivatives are those to θ."""
         modal, count = self._modal(point, option), len(self.ranges)

@@ -15,9 +15,10 @@ from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
+from ccd_casadi.fixed_structure.loop_on_box import WITHIN, Excess, LoopOnBox
 from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, LoopOnBox, lattice
+from ccd_casadi.fixed_structure.worst_plant import lattice, worst_plants
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -185,7 +186,7 @@ def violations(
                      structured.sampling)  # fmt: skip
     known = [(option, np.array(point)) for option, point in others]
     tried = loop.excesses(known).tolist() if known else []
-    heads, count = loop.worst_plants(structured.seed + turn)
+    heads, count = worst_plants(loop, structured.seed + turn)
     heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
     heads.sort(key=lambda head: -head.value)
     if progress is not None:

@@ -12,8 +12,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
+from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.fixed_structure.sections_design import Progress
-from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
