@@ -61,7 +61,7 @@ def main(options: argparse.Namespace) -> ExitCode:
 def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     """Sections on a measured response, with a page where a folder is asked for."""
     from ccd_casadi.cases.case import CaseError
-    from ccd_casadi.codesign.inner_answer import measured_answer
+    from ccd_casadi.studies.measured_answer import measured_answer
 
     given = (options.theta, options.omega_S_hz, options.omega_T_hz, options.begin_at)
     if any(value is not None for value in given):
