@@ -1,6 +1,6 @@
 """The inner problem at one θ under the contract's keys, as JSON, for each kind of controller."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
@@ -63,7 +64,7 @@ class InnerOptions:
 
     seed: int
     workers: Pool
-    progress: Callable[[str], None] | None = None
+    tell: Tell = silent
     point: tuple[float, float] | None = None
     begin_at: Path | None = None
 
@@ -131,16 +132,16 @@ def structured_answer(
     if options.point is not None:
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
         raise UserError(words)
-    begin_at, progress, workers = options.begin_at, options.progress, options.workers
+    begin_at, tell, workers = options.begin_at, options.tell, options.workers
     workers.begin(prepared.__module__)  # they start while the plants are made
     head = head_of(problem, theta)
     asked = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
         kappa = sections_kappa(begin_at, structure_of(asked))
         asked = with_structured(asked, warm_starts=(kappa,))
-    asked, made, worst = prepared(asked, progress, workers, begin_at is not None)
+    asked, made, worst = prepared(asked, tell, workers, begin_at is not None)
     fastest = made.bandwidth
-    asked, made, least = least_from(asked, theta, made, progress)
+    asked, made, least = least_from(asked, theta, made, tell)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth

@@ -1,6 +1,5 @@
 """A structure on measured lines, designed and judged there, under the contract's keys."""
 
-from collections.abc import Callable
 from typing import Any
 
 from ccd_casadi.analysis.loop_figures import measured_entry
@@ -12,16 +11,17 @@ from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on
 from ccd_casadi.fixed_structure.measured_loop import controller_response
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.lti.closed_loop import equivalent_open_loop
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 
 
 def measured_answer(
-    case: MeasuredCase, *, seed: int, progress: Callable[[str], None] | None = None
+    case: MeasuredCase, *, seed: int, tell: Tell = silent
 ) -> tuple[InnerAnswer, MeasuredDesign]:
     """The structure of the case on its measured lines, and the design behind the answer."""
     made = design_on_data(
         case.responses, case.structure, case.bounds, period=case.period, starts=case.starts,
-        seed=seed, progress=progress,
+        seed=seed, progress=tell,
     )  # fmt: skip
     return answer_of(case, made), made
 
