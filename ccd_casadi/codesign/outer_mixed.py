@@ -32,7 +32,7 @@ from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design
+from ccd_casadi.synthesis.synthesis import Design
 from surrogates import design
 
 POLISH_ROUNDS = 3
@@ -123,7 +123,7 @@ class MixedOuter(Outer):
         final = sampler.cached("final", tuple(x), Design, make)
         free = replace(problem, suspension=Suspension(0.0, 0.0))
         unsuspended = measure(
-            scaled_plant(free, theta), final.controller, final.weights, gamma=UNBOUNDED,
+            scaled_plant(free, theta), final.controller, final.weights,
             omega_low=problem.inner.omega_low,
         )  # fmt: skip
         loops = loops_of(problem, theta, final.controller)
