@@ -13,7 +13,7 @@ from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
+from ccd_casadi.plants.modal import FREE, ModalPlant, modal_plant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
@@ -98,7 +98,7 @@ def robustness(
 def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
     loop = run.loop_on(run.plant.plant_si())  # as it runs
     sampled, modal = loop.sampling is not None, run.modal()
-    free, profile = modal_plant(run.system, Suspension(0.0, 0.0)), setpoint(d.limits)
+    free, profile = modal_plant(run.system, FREE), setpoint(d.limits)
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
     view = loop_view([loop], bounded, bandwidth_hz=omega_b / HZ)
