@@ -18,7 +18,7 @@ from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
-from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
+from ccd_casadi.codesign.robust_check import check_references, other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -127,9 +127,7 @@ class MixedOuter(Outer):
             omega_low=problem.inner.omega_low,
         )  # fmt: skip
         loops = loops_of(problem, theta, final.controller)
-        found, robust = None, check_robust(problem, loops)
-        if final.figures.certified:
-            found, robust = survived(problem, loops, final.figures.bandwidth)
+        found, robust = survived(problem, loops, final.figures)
         return VerifiedDesign(
             problem=problem,
             x=x,

@@ -8,7 +8,7 @@ The polish works on the true value: it passes kinks, and keeps its controller. M
 are kept in the store of samples: a run that goes on from its store repeats none.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -62,7 +62,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Workers, results
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.progress import Progress, Tell
 from ccd_casadi.support.terminal import remark
 from ccd_casadi.support.threads import alongside
 
@@ -99,7 +99,7 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
             sampler.of(anchored).cached("race", start, StructuredValue, make)
         return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
 
-    key = sample_key(owner, problem.start, 0.0, 0.0)
+    key = sample_key(owner, problem.start)
     found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
     known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
     return with_structured(problem, **known, scenarios=found.members), found.words
@@ -115,7 +115,7 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
         found = ProblemAt(problem, theta).value_of(made, 1)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
-    sampler.count_multistart(sample_key(sampler.hash, theta, 0.0, 0.0))
+    sampler.count_multistart(sample_key(sampler.hash, theta))
     return sampler.cached("race", theta, StructuredValue, multistart)
 
 
@@ -126,7 +126,7 @@ def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
     return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
 
 
-def printer(label: str, quiet: bool) -> Callable[[str], None]:
+def printer(label: str, quiet: bool) -> Tell:
     """Lines of progress on stderr."""
     return lambda words: remark(f"{label}: {words}", quiet)
 
@@ -265,7 +265,7 @@ class StructuredOuter(ThetaOuter):
             costs = sampler.cached("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
             prices = on_box.tolerance_prices()
-            survival = survived(problem, loops, design.bandwidth)[0] if design.certified else None
+            survival = survived(problem, loops, design)[0]
             damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, design.controller, best.value)

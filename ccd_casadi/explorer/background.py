@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.explorer.known_plant import KnownPlant
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost, WorkerProcess, tell
 
-Progress = Callable[[str], None]
 Then = Callable[[Any], None]
 Failed = Callable[[BaseException], None]
 
 
-def _working(given: tuple[bool, Callable[[Any, Progress], Any], Any]) -> Any:
+def _working(given: tuple[bool, Callable[[Any, Tell], Any], Any]) -> Any:
     user_code, work, task = given
     with permit_user_code(user_code):
         return work(task, tell)
@@ -36,9 +36,7 @@ class Background:
         self._asking, self._thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._closed = False
 
-    def ask(
-        self, work: Callable[[Any, Progress], Any], task: Any, told: Progress = lambda words: None
-    ) -> Future:
+    def ask(self, work: Callable[[Any, Tell], Any], task: Any, told: Tell = silent) -> Future:
         """Do what the user waits for, one after the other; `told` hears how far the work is."""
 
         def answered() -> Any:
@@ -91,7 +89,7 @@ class Solve:
     """`python -m ccd_casadi.solve` of a case, in a process of its own, into a folder."""
 
     def __init__(
-        self, case: Path, folder: Path, options: Sequence[str], tell: Callable[[str], None],
+        self, case: Path, folder: Path, options: Sequence[str], tell: Tell,
         ended: Callable[[int], None],
     ) -> None:  # fmt: skip
         """`tell` is given every line, `ended` the exit code, both in another thread."""

@@ -124,9 +124,9 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
 
 
 def loop_lines(r: Mapping[str, Any]) -> list[str]:
-    """Margins, steps and what is narrow at the bandwidth, for the terminal."""
-    found = facts("margins", r)
-    return [plain(f"{name.lower():14s}{value}, {remark}") for name, value, remark in found]
+    """Margins, steps, what is narrow at the bandwidth, error budget and move, for the terminal."""
+    found = [row for table in ("margins", "budget", "move") for row in facts(table, r)]
+    return [plain(f"{name.lower():14s}{', '.join(filter(None, rest))}") for name, *rest in found]
 
 
 def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:

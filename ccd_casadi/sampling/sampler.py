@@ -136,7 +136,7 @@ class Sampler:
     def _solve(self, problems: Mapping[tuple[float, ...], CoDesignProblem], label: str) -> None:
         """The inner problem at every θ, and the better one kept of it and what is known."""
         owners = {theta: hashes_of(problem)[1] for theta, problem in problems.items()}
-        keys = {theta: sample_key(owners[theta], theta, 0.0, 0.0) for theta in problems}
+        keys = {theta: sample_key(owners[theta], theta) for theta in problems}
         payloads = {key: self.store.get_result(key) for key in keys.values()}
         missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
@@ -145,7 +145,7 @@ class Sampler:
                 theta = missing[key]
                 self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
                 if theta not in self.solved:  # who goes on from the store asks for it by this key
-                    own = sample_key(self.inner_hash, theta, 0.0, 0.0)
+                    own = sample_key(self.inner_hash, theta)
                     self.store.put_unit([], (own, self.inner_hash, theta, payload))
                 payloads[key] = payload
                 progress.advance()
@@ -202,7 +202,7 @@ class Sampler:
     def cached(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
         """What `make` gives at a point of this problem, once for all runs on the store."""
         owner = problem_hash({what: self.inner_hash})
-        return self.store.cached(sample_key(owner, point, 0.0, 0.0), owner, point, kind, make)
+        return self.store.cached(sample_key(owner, point), owner, point, kind, make)
 
     def _recorded(self, x: Array, make: Callable[[], Sensitivities]) -> Sensitivities:
         """A design made outside the pool (IPOPT on the true function): a row too, and counted."""

@@ -221,7 +221,7 @@ def test_neither_the_set_nor_the_range_denies_the_other(
     loops, S_max = loops_and_bound(case, seed)
     whole = problem(robust=RobustSet(reach, 5, factors, 0.0))
     whole = replace(whole, inner=replace(whole.inner, S_max=S_max))
-    found, check = survived(whole, loops, CROSSOVER)
+    found, check = survived(whole, loops, SimpleNamespace(certified=True, bandwidth=CROSSOVER))
     assert check is not None
     within = found.within(-reach, reach)
     assert check.passed <= within

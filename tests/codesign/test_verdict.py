@@ -161,9 +161,10 @@ def corner_design() -> tuple[Survival, float]:
         problem().weights.at(*WEIGHTS),
         omega_low=problem().inner.omega_low,
     )
-    bandwidth = made.figures.bandwidth
     loops = loops_of(problem(), CORNER, made.controller)
-    return survived(problem(), loops, bandwidth)[0], bandwidth
+    found = survived(problem(), loops, made.figures)[0]
+    assert found is not None
+    return found, made.figures.bandwidth
 
 
 def test_the_range_found_is_where_stability_is_lost() -> None:
