@@ -168,7 +168,7 @@ class StructuredOuter(ThetaOuter):
 
     def promising(self, thetas: Array, least: float) -> Array:
         """By what no controller of any order reaches: far sooner than a search finds none."""
-        tasks = {i: (self.problem, theta, least) for i, theta in enumerate(thetas)}
+        tasks = {i: (self.problem, theta, least) for i, theta in enumerate(thetas.tolist())}
         excluded = dict(results(self.sampler.workers, _excluded, tasks))
         return thetas[[not excluded[i] for i in tasks]]
 
@@ -318,7 +318,7 @@ def _worst_plants(
     return max(worst, other, key=lambda one: one.value), scenarios
 
 
-def _excluded(problem: CoDesignProblem, theta: Array, least: float) -> bool:
+def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) -> bool:
     """Whether it is shown that J is at least that at θ."""
     if problem.figure is not BANDWIDTH or not (problem.w2 < 0.0 and np.isfinite(least)):
         return False
