@@ -91,7 +91,9 @@ class ByRule(InnerKind):
         raise AssertionError("no page is drawn here")
 
 
-def rule_unit(case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]) -> Unit:
+def rule_unit(
+    case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...], workers: object
+) -> Unit:
     """One θ for the store."""
     value, slope = KINDS[RuleOfThumb](case).value(theta)
     feasible = bool(np.isfinite(value))
