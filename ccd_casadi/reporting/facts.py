@@ -152,7 +152,7 @@ def channel_words(own: Mapping[str, Any]) -> str:
 
 def loop_lines(r: Mapping[str, Any]) -> list[str]:
     """Margins, steps, what is narrow at the bandwidth, error budget and move, for the terminal."""
-    found = [row for table in ("margins", "budget", "move") for row in facts(table, r)]
+    found = [*facts("margins", r), *facts("budget", r), *facts("move", r)]
     return [plain(f"{name.lower():14s}{', '.join(filter(None, rest))}") for name, *rest in found]
 
 
