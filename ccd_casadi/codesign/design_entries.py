@@ -8,9 +8,10 @@ from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
+from ccd_casadi.inner_problem.move_figures import exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures

@@ -32,7 +32,7 @@ from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
-from ccd_casadi.inner_problem.objective import objective_of, violated
+from ccd_casadi.inner_problem.objective import objective, objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import (
     ProblemAt,
@@ -54,14 +54,14 @@ from ccd_casadi.inner_problem.structured_search import (
     with_range,
     with_warm_start,
 )
-from ccd_casadi.limitations.of_problem import known_gap
+from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.neighbours import WORTH, from_controller
 from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.process_pool import Workers, results
 from ccd_casadi.support.progress import Progress, Tell
 from ccd_casadi.support.terminal import remark
 from ccd_casadi.support.threads import alongside
@@ -165,6 +165,12 @@ class StructuredOuter(ThetaOuter):
     @property
     def retries_pay(self) -> bool:
         return not is_expensive(self.problem)
+
+    def promising(self, thetas: Array, least: float) -> Array:
+        """By what no controller of any order reaches: far sooner than a search finds none."""
+        tasks = {i: (self.problem, theta, least) for i, theta in enumerate(thetas.tolist())}
+        excluded = dict(results(self.sampler.workers, _excluded, tasks))
+        return thetas[[not excluded[i] for i in tasks]]
 
     def prepared(self, seed: int) -> "StructuredOuter":
         """Searched at the start for warm starts and the plant set, where there are none."""
@@ -310,6 +316,13 @@ def _worst_plants(
     workers = Workers(1) if few else sampler.workers
     other, scenarios = on_box.worst_elsewhere(turns, workers, tell)
     return max(worst, other, key=lambda one: one.value), scenarios
+
+
+def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) -> bool:
+    """Whether it is shown that J is at least that at θ."""
+    if problem.figure is not BANDWIDTH or not (problem.w2 < 0.0 and np.isfinite(least)):
+        return False
+    return none_reaches(problem, theta, (least - objective(problem, theta, 0.0)) / problem.w2)
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:

@@ -29,8 +29,8 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
     with_structured,
 )
-from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import Gap
+from ccd_casadi.sampling.neighbours import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ, counted
@@ -52,7 +52,7 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
 
     def climbed(**easier: object) -> float:
         eased = with_structured(problem, minimise="bandwidth", **easier)
-        value = structured_value(with_warm_start(eased, kappa), theta)
+        value = structured_value(from_controller(eased, kappa.tolist()), theta)
         return value.bandwidth if value.feasible else float("nan")
 
     return Costs(climbed(scenarios=((0, model),)), climbed(sampling=None))

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +36,7 @@ class Background:
         self._asking, self._thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._closed = False
 
-    def ask(
-        self, work: Callable[[Any, Tell], Any], task: Any, then: Then, failed: Failed,
-        told: Tell = silent,
-    ) -> Future:  # fmt: skip
+    def ask(self, work: Callable[[Any, Tell], Any], task: Any, told: Tell = silent) -> Future:
         """Do what the user waits for, one after the other; `told` hears how far the work is."""
 
         def answered() -> Any:
@@ -54,15 +51,15 @@ class Background:
                 raise value
             return value
 
-        return self._submit(self._asking, answered, then, failed)
+        return self._asking.submit(answered)
 
     def renew(self, known: KnownPlant, then: Then) -> None:
         """Make the model of a slow plant anew; of megabytes, it stays in this process."""
-        self._submit(self._thread, known.renew, then, print_failure)
+        self.answer(self._thread.submit(known.renew), then, print_failure)
 
-    def _submit(
-        self, pool: Executor, work: Callable[[], Any], then: Then, failed: Failed
-    ) -> Future:
+    def answer(self, future: Future, then: Then, failed: Failed) -> None:
+        """Call one of them with what this comes to, unless all is closed by then."""
+
         def done(future: Future) -> None:
             if self._closed or future.cancelled():
                 return
@@ -72,9 +69,7 @@ class Background:
             else:
                 failed(error)
 
-        future = pool.submit(work)
         future.add_done_callback(done)
-        return future
 
     def close(self) -> None:
         """End what is under way."""

@@ -66,6 +66,11 @@ class Session:
         self.point = tuple(float(np.sqrt(a * b)) for a, b in (inner.omega_S, inner.omega_T))
         self.store = SampleStore(folder / "samples.sqlite")  # last: what is refused opens none
 
+    @property
+    def undesigned(self) -> bool:
+        """Whether a controller has to be designed before anything is shown, which takes seconds."""
+        return self.start.structured and self.kappa is None and self.known is None
+
     def elements(self, problem: CoDesignProblem, theta: tuple[float, ...]) -> Elements:
         """The plant's matrices at θ as fast as one drags."""
         return elements_at(problem, theta) if self.known is None else self.known.at(theta)

@@ -20,7 +20,7 @@ from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, l
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
-from ccd_casadi.inner_problem.move_figures import FREE, motion_of
+from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -31,6 +31,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     warm_starts_at,
     with_structured,
 )
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

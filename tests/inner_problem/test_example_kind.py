@@ -33,7 +33,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.units import UNITS, Unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
+from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
 STEP = 1e-5  # relative, of central differences
@@ -71,7 +71,7 @@ class ByRule(InnerKind):
         plant, inner = scaled_plant(self.problem, theta), self.problem.inner
         K = pid(plant, made.share)
         weights = self.problem.weights
-        return K, measure(plant, K, weights, gamma=UNBOUNDED, omega_low=inner.omega_low)
+        return K, measure(plant, K, weights, omega_low=inner.omega_low)
 
     def value(self, theta: Sequence[float]) -> tuple[float, Array]:
         figures = self.at(theta)[1]
