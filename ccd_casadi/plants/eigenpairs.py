@@ -173,7 +173,7 @@ def build_resolvent(
     def of(space: Krylov, value: float) -> Array:
         """x = Vy."""
         operator = np.eye(len(space.T)) - (value + pencil.shift) * space.T
-        return np.linalg.solve(operator, space.V.T @ M_start)
+        return np.asarray(np.linalg.solve(operator, space.V.T @ M_start))
 
     for space in krylov_spaces(pencil, start, modes):
         size = np.linalg.norm(space.V.T @ M_start, axis=0).max()
