@@ -8,9 +8,9 @@ from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_words import SectionWords, gain_words
+from ccd_casadi.inner_problem.sections_words import SectionWords
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
-from ccd_casadi.reporting.facts import binding, paragraph
+from ccd_casadi.reporting.facts import binding, gain_words, paragraph
 from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
 

@@ -131,9 +131,6 @@ class VerifiedRule(Verified):
         state = State.PASSED if self.feasible else State.FAILED
         return VerdictLine(state, "stable and within S_max and S_low on the model", {})
 
-    def survives_line(self) -> VerdictLine:
-        return VerdictLine(State.UNKNOWN, "not looked at", {})
-
     def gap_words(self) -> str:
         return ""
 
