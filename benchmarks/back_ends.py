@@ -10,8 +10,8 @@ import lmi
 import numpy as np
 from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 
+from ccd_casadi.studies.backends import SOLVERS, TITLES, synthesise_with, verdicts
 from ccd_casadi.support.worker_process import Runner
-from ccd_casadi.synthesis.backends import SOLVERS, TITLES, synthesise_with, verdicts
 
 SEED = 0
 SOLVERS["lmi"] = lmi.solve

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.studies.backends import Attempt, StandardPlant, balance
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import require
-from ccd_casadi.synthesis.backends import Attempt, StandardPlant, balance
 
 STRICT = 1e-7  # a definite matrix is at least this much so
 LARGEST_EIGENVALUE = 1e8  # of X and Y, which nothing else may bound

@@ -26,11 +26,12 @@ from ccd_casadi.codesign.outer_structured import multistart_at
 from ccd_casadi.codesign.outer_theta import SETTLED, pieces_from
 from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
+from ccd_casadi.inner_problem.move_figures import exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import plants_of, with_structured
 from ccd_casadi.inner_problem.structured_search import least_from, prepared
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.neighbours import from_controller
 from ccd_casadi.sampling.sampler import Sampler

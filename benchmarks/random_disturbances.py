@@ -29,10 +29,10 @@ from slycot.exceptions import SlycotError
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.studies.backends import StandardPlant, balance, mixed_sensitivity, solve_slicot
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner
-from ccd_casadi.synthesis.backends import StandardPlant, balance, mixed_sensitivity, solve_slicot
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 SB10AD_STATES = 30  # of the generalized plant; larger ones take it seconds

@@ -51,7 +51,7 @@ def filled(path: Path, rows: int) -> list[str]:
                 )
                 if owner == sampler.hash:
                     keys.append(key)
-            inner = sample_key(owner, unit[0].theta, 0.0, 0.0)
+            inner = sample_key(owner, unit[0].theta)
             store.put_unit(unit, (inner, owner, unit[0].theta, {"syntheses": UNIT}), owner)
     return keys
 

@@ -9,8 +9,6 @@ from ccd_casadi.codesign.lifted import Lifted as Lifted
 from ccd_casadi.codesign.nested import Nested as Nested
 from ccd_casadi.codesign.run import solve as solve
 from ccd_casadi.codesign.run import verify as verify
-from ccd_casadi.codesign.tuning import Tuned as Tuned
-from ccd_casadi.codesign.tuning import tune as tune
 from ccd_casadi.codesign.verified import Solution as Solution
 from ccd_casadi.deployment.pipeline import deploy as deploy
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
@@ -31,6 +29,8 @@ from ccd_casadi.plants.plant import build_plant as build_plant
 from ccd_casadi.plants.scaling import StateSpace as StateSpace
 from ccd_casadi.robust.study import robustness as robustness
 from ccd_casadi.studies.comparison import compare as compare
+from ccd_casadi.studies.tuning import Tuned as Tuned
+from ccd_casadi.studies.tuning import tune as tune
 from ccd_casadi.support.errors import UserError as UserError
 from ccd_casadi.support.units import HZ as HZ
 from ccd_casadi.synthesis.choice import choose_inputs as choose_inputs

@@ -17,7 +17,7 @@ from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.inner_problem.problem import CoDesignProblem
-    from ccd_casadi.synthesis.backends import BackendResult
+    from ccd_casadi.studies.backends import BackendResult
 
 
 def _problem(
@@ -51,17 +51,17 @@ def _problem(
     option("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file"),
     *break_frequency_options("of a weight (default: the best at theta, or the run's)"),
     valued("--limit", "SECONDS", positive, "time limit of each optional back end", 60.0),
-    needs=["ccd_casadi.codesign.result", "ccd_casadi.synthesis.backends"],
+    needs=["ccd_casadi.codesign.result", "ccd_casadi.studies.backends"],
     without_effect=["--seed"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
     from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
+    from ccd_casadi.studies.backends import RICCATI, TITLES, synthesise_with, verdicts
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.versions import versions
     from ccd_casadi.support.worker_process import Runner
-    from ccd_casadi.synthesis.backends import RICCATI, TITLES, synthesise_with, verdicts
 
     problem, theta, point = _problem(options)
     plant, weights, inner = scaled_plant(problem, theta), problem.weights.at(*point), problem.inner
@@ -99,7 +99,7 @@ def main(options: argparse.Namespace) -> ExitCode:
 
 
 def _table(found: "Sequence[BackendResult]") -> str:
-    from ccd_casadi.synthesis.backends import TITLES
+    from ccd_casadi.studies.backends import TITLES
 
     lines = [
         f"{'back end':18s} {'gamma':>9s} {'certified':>9s} {'bandwidth':>11s} {'peak of S':>9s} "
@@ -118,7 +118,7 @@ def _table(found: "Sequence[BackendResult]") -> str:
 
 
 def _conclusion(found: "Sequence[BackendResult]") -> str:
-    from ccd_casadi.synthesis.backends import AGREE, TITLES
+    from ccd_casadi.studies.backends import AGREE, TITLES
 
     right = [TITLES[item.backend] for item in found if item.holds]
     wrong = [TITLES[item.backend] for item in found if item.holds is False]

@@ -61,13 +61,13 @@ def main(options: argparse.Namespace) -> ExitCode:
 def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     """Sections on a measured response, with a page where a folder is asked for."""
     from ccd_casadi.cases.case import CaseError
-    from ccd_casadi.codesign.inner_answer import measured_answer
+    from ccd_casadi.studies.measured_answer import measured_answer
 
     given = (options.theta, options.omega_S_hz, options.omega_T_hz, options.begin_at)
     if any(value is not None for value in given):
         words = 'plant.model = "measured" has no theta and no weights to place; leave out --theta'
         raise CaseError(f"{case.path}: {words}, --omega-s-hz, --omega-t-hz and --begin-at")
-    found, made = measured_answer(case, seed=options.seed, progress=PROGRESS)
+    found, made = measured_answer(case, seed=options.seed, tell=PROGRESS)
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:
         from ccd_casadi.drawing.stored import write_page

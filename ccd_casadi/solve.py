@@ -21,11 +21,15 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
-    from ccd_casadi.codesign.design_entries import budget_lines, move_lines
-    from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words, gain_words
-    from ccd_casadi.reporting.facts import cost_words, loop_lines, theta_words
+    from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.reporting.facts import (
+        channel_words,
+        cost_words,
+        gain_words,
+        loop_lines,
+        theta_words,
+    )
     from ccd_casadi.reporting.verdict import advice, terminal_lines
-    from ccd_casadi.sampling.spent import cost_words as spent_words
     from ccd_casadi.support.package_text import template
 
     r = solution.result
@@ -35,9 +39,9 @@ def summary(solution: "Solution") -> str:
     found = r.get("controller", {}).get("sections", ())
     return words.render(
         r=r, decision=advice(r), verdict=terminal_lines(r), theta=theta_words(r),
-        hardware=cost_words(r, 6), inner_value=inner_value_lines(r), spent=spent_words(r),
+        hardware=cost_words(r, 6), inner_value=inner_value_lines(r),
         sections=[SectionWords(**item) for item in found],
-        loop_and_budget=[*loop_lines(r), *budget_lines(r), *move_lines(r)],
+        loop_lines=loop_lines(r),
         design_plant=design_plant_lines(r.get("robust") or {}),
     ).rstrip()  # fmt: skip
 

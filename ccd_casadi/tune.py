@@ -20,14 +20,12 @@ from ccd_casadi.support.terminal import inform, say
     valued("--lead", "N", integer(0), "number of leads, with --biquads", 1),
     option("--biquads", metavar="N", type=integer(0),
            help="number of notches (default: by the resonances)"),
-    needs=["ccd_casadi.codesign.tuning"],
+    needs=["ccd_casadi.studies.tuning"],
     place=RUN | {"metavar": "DATA", "nargs": "+", "help": "responses (.csv, .mat, .npz) or models "
                  "(.mat with A, B, C, D); several are one set"},
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
-    from ccd_casadi.codesign.inner_answer import answer_of
-    from ccd_casadi.codesign.tuning import tune
     from ccd_casadi.deployment.realisation import Realisation, block_diagonal
     from ccd_casadi.deployment.source_code import write_c
     from ccd_casadi.drawing.stored import write_page
@@ -37,6 +35,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.facts import loop_lines
     from ccd_casadi.reporting.measured_page import measured_page
     from ccd_casadi.reporting.verdict import advice
+    from ccd_casadi.studies.measured_answer import answer_of
+    from ccd_casadi.studies.tuning import tune
     from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.versions import versions

@@ -15,7 +15,7 @@ import numpy as np
 from ccd_casadi.analysis.motor import UNLIMITED, Motion, MotionAt, motion_at
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.fixed import reparametrised
-from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.arrays import Array
@@ -55,7 +55,7 @@ class DrivenMechanics:
 
     def at(self, theta: Sequence[float], sampling: Sampling | None = None) -> MotionAt:
         """The move at θ. Raises UserError where a spring holds the output."""
-        free = scale_plant(modal_plant(self(theta), Suspension(0.0, 0.0)), 1.0, bare=True)
+        free = scale_plant(modal_plant(self(theta), FREE), 1.0, bare=True)
         return motion_at(self.motion, free, self.mass(theta), self.place, sampling)
 
 

@@ -7,7 +7,14 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import responses_of, sigma_max
-from ccd_casadi.lti.grid import frequency_grid, local_maxima, refine_peak, resonant, root_flanks
+from ccd_casadi.lti.grid import (
+    frequency_grid,
+    local_maxima,
+    refine_peak,
+    resonant,
+    root_flanks,
+    thinned,
+)
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -18,6 +25,7 @@ POINTS = 500  # of the frequency grid, besides those around lightly damped poles
 FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))
 END = 0.98  # of half the sampling rate
 SAME = 1e-9  # relative distance of two frequencies below which they are one
+FINE = 0.1  # of the least damping ratio: width of what one frequency of the other plants stands for
 NAMES = ("S", "KS", "T")
 
 
@@ -43,8 +51,8 @@ class LoopView:
     """σ_max of S, KS (N/m), T and GS (m/N) of every plant, the model first, (4, P, k) over Hz.
 
     G (k, p, m), K (k, m, p) as they run and `peaks`, local maxima of σ_max(S) above 1 as
-    (Hz, gain), are the model's; `open` is L = GK of every plant (P, k, p, p). `bounds` (3, k) of
-    S, KS, T: NaN where nothing is asked.
+    (Hz, gain), are the model's; `open` is L = GK of every plant (P, k, p, p), of several channels
+    of the model alone. `bounds` (3, k) of S, KS, T: NaN where nothing is asked.
     """
 
     label: str
@@ -119,18 +127,31 @@ def loop_view(
     high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
     if model.sampling is not None:
         high = END * 0.5 / model.sampling.period
-    roots = [resonant(loop.plant.poles) for loop in loops]
-    roots += [resonant(model.controller.rates), resonant(model.plant.zeros(_unit(model)))]
-    near = root_flanks(np.concatenate(roots), FLANKS) / HZ
+    light = (model.plant.poles, model.controller.rates, model.plant.zeros(_unit(model)))
+    near = root_flanks(np.concatenate([resonant(roots) for roots in light]), FLANKS) / HZ
     places = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
-    hz = frequency_grid(low, high, points, near, places, apart=SAME)
-    pairs = [loop.responses(HZ * hz) for loop in loops]
-    every = [responses_of(G, K) for G, K in pairs]
-    sizes = np.array([[sigma_max(parts[name]) for parts in every] for name in (*NAMES, "GS")])
+    others = _of_others([resonant(loop.plant.poles) for loop in loops[1:]])
+    hz = frequency_grid(low, high, points, near, places, others, apart=SAME)
+    G, K = model.responses(HZ * hz)
+    sizes, opened = np.empty((1 + len(NAMES), len(loops), len(hz))), []
+    for i, loop in enumerate(loops):  # of one plant at a time: responses are large
+        pair = loop.responses(HZ * hz) if i else (G, K)
+        made = responses_of(*pair)
+        sizes[:, i] = [sigma_max(made[name]) for name in (*NAMES, "GS")]
+        if i == 0 or made["S"].shape[1:] == (1, 1):
+            opened.append(pair[0] @ pair[1])
     return LoopView(
-        label, tuple(loops), hz, *pairs[0], sizes, np.array([G @ K for G, K in pairs]),
-        np.asarray(bounded.over(hz)), bounded, bandwidth_hz, found, poles, zeros,
+        label, tuple(loops), hz, G, K, sizes, np.array(opened), np.asarray(bounded.over(hz)),
+        bounded, bandwidth_hz, found, poles, zeros,
     )  # fmt: skip
+
+
+def _of_others(roots: Sequence[np.ndarray]) -> Array:
+    """Frequencies in Hz on the flanks of resonances of plants that are much alike: one of those
+    that differ by a tenth of a half width."""
+    every = np.concatenate([*roots, np.empty(0, complex)])
+    least = np.min(np.abs(every.real / every), initial=1.0)
+    return thinned(root_flanks(every, FLANKS) / HZ, max(FINE * float(least), SAME))
 
 
 def peaks_of(loop: Loop) -> tuple[tuple[float, float], ...]:

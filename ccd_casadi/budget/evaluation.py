@@ -12,9 +12,7 @@ from ccd_casadi.budget.derivatives import of_filter
 from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.moving_average import average_gain
 from ccd_casadi.budget.sources import ErrorBudget, Source
-from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -55,26 +53,25 @@ class BudgetFigures:
         return max(item.disagreement for item in self.sources)
 
 
-def evaluate_budget(
-    G: StateSpace, K: StateSpace, budget: ErrorBudget, hold: Sampling | None = None
-) -> BudgetFigures | None:
-    """The budget of a loop in SI, plant without feedthrough, controller e in, u out.
+def evaluate_budget(loop: Loop, budget: ErrorBudget) -> BudgetFigures | None:
+    """The budget of a loop in SI, plant without feedthrough.
 
     With several channels errors and forces are those of the vectors. None for a loop that is not
     stable, which has no stationary error. Raises UserError for a plant with a feedthrough.
 
     >>> import numpy as np
     >>> from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
+    >>> from ccd_casadi.lti.state_space import StateSpace
     >>> mass = StateSpace(np.array([[0.0, 1.0], [-1.0, -2.0]]), np.eye(2, 1, -1), np.eye(1, 2),
     ...                   np.zeros((1, 1)))
     >>> none = StateSpace(*(np.zeros((i, j)) for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))))
     >>> white = ErrorBudget((Source("cable", Kind.FORCE, ShapedSpectrum(1.0)),))
-    >>> round(evaluate_budget(mass, none, white).error ** 2, 12)  # 1/2 over 2 d k, d = 2, k = 1
+    >>> loop = Loop(mass, none)
+    >>> round(evaluate_budget(loop, white).error ** 2, 12)  # 1/2 over 2 d k, d = 2, k = 1
     0.125
     """
-    if np.any(G.D):
+    if np.any(loop.plant.D):
         raise UserError("the plant of an error budget has no feedthrough")
-    loop = Loop(G, K, hold)
     if not loop.stable:
         return None
     found = tuple(_figures(loop, source, budget.window) for source in budget.sources)

@@ -22,7 +22,7 @@ from ccd_casadi.cases.findings import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
-from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant, require_damping
+from ccd_casadi.plants.modal import FREE, ModalPlant, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import Plant, mechanics, named_values
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
@@ -73,7 +73,7 @@ def diagnose(
                 modal = modal_plant(system, problem.suspension)
                 require_damping(modal)
                 scaled = scale_plant(modal, problem.weights.M_K)
-                free = scale_plant(modal_plant(system, Suspension(0.0, 0.0)), problem.weights.M_K)
+                free = scale_plant(modal_plant(system, FREE), problem.weights.M_K)
             except PlantError as error:
                 words = str(error) if "at theta" in str(error) else f"{error} {place}"
                 findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     structured_of,
@@ -30,6 +31,8 @@ from ccd_casadi.inner_problem.structured_search import with_range, with_warm_sta
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
+from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -37,7 +40,7 @@ from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
+from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
 if TYPE_CHECKING:
@@ -67,6 +70,15 @@ class FinishedRun(NotebookHtml):
     sampling: Sampling | None = None
     kappa: Array | None = None  # of a fixed structure, SI
 
+    @cached_property
+    def system(self) -> Mechanics:
+        """The plant's matrices at θ."""
+        return mechanics(plant_of(self.problem), self.theta, derivatives=False)
+
+    def modal(self, *off: Perturbation) -> ModalPlant:
+        """The plant in its modes, as the model has it or off that."""
+        return modal_plant(self.system, self.problem.suspension, *off)
+
     def loop_on(self, plant: StateSpace) -> Loop:
         """The loop on a plant in SI, as it runs."""
         return Loop(plant, self.controller, self.sampling)
@@ -74,7 +86,7 @@ class FinishedRun(NotebookHtml):
     def measured(self, plant: ScaledPlant, controller: StateSpace) -> DesignFigures:
         """The figures of a continuous loop, its norm not judged."""
         low = self.problem.inner.omega_low
-        return measure(plant, controller, self.weights, gamma=UNBOUNDED, omega_low=low)
+        return measure(plant, controller, self.weights, omega_low=low)
 
     def to_control(self) -> "tuple[control.StateSpace, control.StateSpace]":
         """G (N to m) and K (e = r - y to N) in continuous time, SI, for python-control.
@@ -188,7 +200,7 @@ def _read_structured(
         raise UserError(f"{path}: {words}; solve the case again")
     problem = with_warm_start(with_function(folder / "result.json", problem, result), kappa)
     figures = measure(
-        scaled_plant(problem, theta), controller, problem.weights, gamma=UNBOUNDED,
+        scaled_plant(problem, theta), controller, problem.weights,
         omega_low=problem.inner.omega_low,
     )  # fmt: skip
     return {"problem": problem, "weights": problem.weights, "controller": controller,

@@ -1,6 +1,6 @@
 """A synthesis, its controller and its error budget as values of result.json and controller.json."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -8,9 +8,10 @@ from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
+from ccd_casadi.inner_problem.move_figures import exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
@@ -107,29 +108,11 @@ def move_entry(
     }}  # fmt: skip
 
 
-def move_lines(result: Mapping[str, Any]) -> list[str]:
-    """The move in a line for a terminal; none for a result without one."""
-    move = result.get("move")
-    if not move:
-        return []
-    latest = move["settled_latest"]
-    settled = "not settled" if latest is None else f"{1e3 * latest:.5g} ms with settling"
-    words = f"{1e3 * move['duration']:.5g} ms by {', '.join(move['limits'])}; {settled} on the set"
-    if "power" in move:
-        words += f"; {move['peak_force']:.4g} N, {move['peak_current']:.3g} A at most, "
-        words += f"{move['power']:.4g} W"
-    drawn = result.get("move_time_fresh")
-    if drawn:
-        told = 1e3 * result["move_time"]
-        words += f"; {drawn['survived']} of {drawn['draws']} fresh plants within {told:.5g} ms"
-    return [f"move          {words}"]
-
-
 def budget_dict(budget: LoopBudget) -> dict[str, Any]:
     """The figures on the model, and the largest of all plants; m, N, s; null where infinite."""
     model = budget.model
     head: dict[str, Any] = {
-        "sampled": budget.hold is not None,
+        "sampled": budget.sampled,
         "plants": budget.plants,
         "error_rms_largest": budget.largest_error,
         "force_rms_largest": budget.largest_force,
@@ -160,28 +143,3 @@ def _source(item: SourceFigures, whole: BudgetFigures) -> dict[str, Any]:
         "force_rms": item.force,
         "disagreement": item.disagreement,
     }
-
-
-def budget_lines(result: Mapping[str, Any]) -> list[str]:
-    """The budget in a line for a terminal; none for a result without one."""
-    budget = result.get("budget")
-    if not budget:
-        return []
-    if not budget["sources"]:
-        return [f"error budget  none: {budget['reason']}"]
-    worst = max(budget["sources"], key=lambda item: item["share"] or 0.0)
-    words = f"{_micro(budget['error_rms'])} RMS"
-    if budget["window_s"] is not None:
-        words += (
-            f" (MA {_micro(budget['error_ma'])}, MSD {_micro(budget['error_msd'])} over "
-            f"{1e3 * budget['window_s']:g} ms)"
-        )
-    force = "infinite" if budget["force_rms"] is None else f"{budget['force_rms']:.4g} N"
-    words += f", force {force}; {worst['name']} has {100.0 * (worst['share'] or 0.0):.3g} %"
-    if budget["plants"] > 1:
-        words += f"; at most {_micro(budget['error_rms_largest'])} on {budget['plants']} plants"
-    return [f"error budget  {words}"]
-
-
-def _micro(metres: float | None) -> str:
-    return "infinite" if metres is None else f"{1e6 * metres:.4g} um"

@@ -66,9 +66,10 @@ def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
     solve_from(starts)
     ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
-        found = outer.sampler.values(ends, "search from the ends of each parameter")
         room = 0.0 if is_expensive(problem) else NEARLY * abs(best)
         least = np.inf if outer.global_check_is_cheap else best + room
+        ends = outer.promising(ends, least)
+        found = outer.sampler.values(ends, "search from the ends of each parameter")
         solve_from([sample for sample in found if objective_of(problem, sample) < least])
     return GlobalCheck(
         points=len(samples),

@@ -1,17 +1,13 @@
-"""The inner problem at one θ under the contract's keys, as JSON: by mixed sensitivity, or sections
-on a measured response, designed and judged on its lines.
-"""
+"""The inner problem at one θ under the contract's keys, as JSON, for each kind of controller."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.analysis.loop_view import peaks_of
-from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.design_entries import budget_entry, controller_dict, mixed_dict, move_entry
 from ccd_casadi.codesign.structured_entries import (
@@ -21,9 +17,6 @@ from ccd_casadi.codesign.structured_entries import (
     robust_dict,
     sections_controller,
 )
-from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
-from ccd_casadi.fixed_structure.measured_loop import controller_response
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -33,18 +26,17 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     true_design,
 )
-from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, with_structured
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import final_design
-from ccd_casadi.lti.closed_loop import equivalent_open_loop
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
@@ -72,7 +64,7 @@ class InnerOptions:
 
     seed: int
     workers: Pool
-    progress: Callable[[str], None] | None = None
+    tell: Tell = silent
     point: tuple[float, float] | None = None
     begin_at: Path | None = None
 
@@ -130,60 +122,6 @@ def mixed_answer(
     return InnerAnswer(status, answer, controller_dict(made.controller), rows)
 
 
-def measured_answer(
-    case: MeasuredCase, *, seed: int, progress: Callable[[str], None] | None = None
-) -> tuple[InnerAnswer, MeasuredDesign]:
-    """The structure of the case on its measured lines, and the design behind the answer."""
-    made = design_on_data(
-        case.responses, case.structure, case.bounds, period=case.period, starts=case.starts,
-        seed=seed, progress=progress,
-    )  # fmt: skip
-    return answer_of(case, made), made
-
-
-def answer_of(case: MeasuredCase, design: MeasuredDesign) -> InnerAnswer:
-    """What a design on the lines of a case says of itself."""
-    hz = case.responses[0].hz
-    plant = {"file": case.file, "lines": len(hz), "first_hz": hz[0], "last_hz": hz[-1]}
-    figures: dict[str, Any] = {"plant": plant, "theta": {}, "words": design.words, "syntheses": 1}
-    if design.controller is None or design.figures is None:
-        return InnerAnswer("infeasible", figures | {"reason": design.words})
-    f, kappa = design.figures, design.kappa
-    figures |= {
-        "reason": "" if design.usable else design.words,
-        "bandwidth_hz": design.bandwidth / HZ,
-        "sensitivity_peak": f.S_peak,
-        "sensitivity_peak_hz": f.S_peak_frequency / HZ,
-        "sensitivity_peak_between_lines": f.S_between,
-        "sensitivity_low": f.S_low,
-        "compliance_max": f.GS,
-        "KS_max": f.KS,
-        **_loop_entry(case, design),
-        "certificate": {
-            "stable": f.stable,
-            "sure": f.sure,
-            "right_half_plane_poles": f.right_half_plane,
-            "passed": design.usable,
-            "figures_over_bounds": case.bounds.shares(f),
-        },
-        "controller": sections_dict(design.structure, kappa) | {"kappa": kappa.tolist()},
-    }
-    sampling = None if case.period is None else Sampling(1 / case.period)
-    controller = sections_controller(design, sampling)
-    return InnerAnswer("verified" if design.usable else "not_verified", figures, controller)
-
-
-def _loop_entry(case: MeasuredCase, design: MeasuredDesign) -> dict[str, Any]:
-    """Margins on the lines; nothing of an unstable loop."""
-    K = design.controller
-    if K is None or design.figures is None or not design.figures.stable:
-        return {}
-    joints = [(HZ * one.hz, one.matrix @ controller_response(K, one.hz, case.period))
-              for one in case.responses]  # fmt: skip
-    loops = [(omega, equivalent_open_loop(L, i)) for omega, L in joints for i in range(L.shape[1])]
-    return measured_entry(loops, K, design.bandwidth, design.figures.S_peak)
-
-
 def structured_answer(
     problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
 ) -> InnerAnswer:
@@ -194,16 +132,16 @@ def structured_answer(
     if options.point is not None:
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
         raise UserError(words)
-    begin_at, progress, workers = options.begin_at, options.progress, options.workers
+    begin_at, tell, workers = options.begin_at, options.tell, options.workers
     workers.begin(prepared.__module__)  # they start while the plants are made
     head = head_of(problem, theta)
     asked = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
     if begin_at is not None:
         kappa = sections_kappa(begin_at, structure_of(asked))
         asked = with_structured(asked, warm_starts=(kappa,))
-    asked, made, worst = prepared(asked, progress, workers, begin_at is not None)
+    asked, made, worst = prepared(asked, tell, workers, begin_at is not None)
     fastest = made.bandwidth
-    asked, made, least = least_from(asked, theta, made, progress)
+    asked, made, least = least_from(asked, theta, made, tell)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth

@@ -6,16 +6,13 @@ from typing import Any
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.plants.modal import modal_plant
-from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
 
 
 def natural_hz(run: FinishedRun) -> tuple[float, ...]:
     """Natural frequencies of the flexible modes at the design, Hz."""
-    modal = modal_plant(mechanics(plant_of(run.problem), run.theta), run.problem.suspension)
+    modal = run.modal()
     return tuple(float(w) / HZ for w in modal.natural[~modal.rigid])
 
 

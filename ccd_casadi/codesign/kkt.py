@@ -173,7 +173,8 @@ def lagrangian_hessian(
         mu = np.array([multipliers.get(name, 0.0) for name in found.names]) * found.sizes
         return found.gradient + mu @ found.jacobian
 
-    return hessian_products(slope, bounds.shares(here.x), directions)
+    at = bounds.shares(here.x)
+    return hessian_products(lambda ends: [slope(z) for z in ends], at, directions)
 
 
 def newton_step(here: TrueDesign) -> Array | None:

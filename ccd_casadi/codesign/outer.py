@@ -89,6 +89,10 @@ class Outer(ABC):
         """Whether local solves may start from points that are no better."""
         return not is_expensive(self.problem)
 
+    def promising(self, thetas: Array, least: float) -> Array:
+        """Those of θ (k, n_θ) where it is not shown beforehand that J is `least` or more."""
+        return thetas
+
     @property
     def retries_pay(self) -> bool:
         """Whether searches from beside an end that is not stationary pay."""

@@ -18,7 +18,7 @@ from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
-from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
+from ccd_casadi.codesign.robust_check import check_references, other_damping, survived
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -26,13 +26,13 @@ from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.optim.box import Box
-from ccd_casadi.plants.modal import Suspension
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design
+from ccd_casadi.synthesis.synthesis import Design
 from surrogates import design
 
 POLISH_ROUNDS = 3
@@ -121,15 +121,13 @@ class MixedOuter(Outer):
         figures = here.design.figures
         make = partial(final_design, problem, theta, (figures.omega_S, figures.omega_T))
         final = sampler.cached("final", tuple(x), Design, make)
-        free = replace(problem, suspension=Suspension(0.0, 0.0))
+        free = replace(problem, suspension=FREE)
         unsuspended = measure(
-            scaled_plant(free, theta), final.controller, final.weights, gamma=UNBOUNDED,
+            scaled_plant(free, theta), final.controller, final.weights,
             omega_low=problem.inner.omega_low,
         )  # fmt: skip
         loops = loops_of(problem, theta, final.controller)
-        found, robust = None, check_robust(problem, loops)
-        if final.figures.certified:
-            found, robust = survived(problem, loops, final.figures.bandwidth)
+        found, robust = survived(problem, loops, final.figures)
         return VerifiedDesign(
             problem=problem,
             x=x,

@@ -8,7 +8,7 @@ The polish works on the true value: it passes kinks, and keeps its controller. M
 are kept in the store of samples: a run that goes on from its store repeats none.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,7 @@ from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
-from ccd_casadi.inner_problem.objective import objective_of, violated
+from ccd_casadi.inner_problem.objective import objective, objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import (
     ProblemAt,
@@ -54,15 +54,15 @@ from ccd_casadi.inner_problem.structured_search import (
     with_range,
     with_warm_start,
 )
-from ccd_casadi.limitations.of_problem import known_gap
+from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.neighbours import WORTH, from_controller
 from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.process_pool import Workers, results
+from ccd_casadi.support.progress import Progress, Tell
 from ccd_casadi.support.terminal import remark
 from ccd_casadi.support.threads import alongside
 
@@ -99,7 +99,7 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
             sampler.of(anchored).cached("race", start, StructuredValue, make)
         return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
 
-    key = sample_key(owner, problem.start, 0.0, 0.0)
+    key = sample_key(owner, problem.start)
     found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
     known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
     return with_structured(problem, **known, scenarios=found.members), found.words
@@ -115,7 +115,7 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
         found = ProblemAt(problem, theta).value_of(made, 1)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
-    sampler.count_multistart(sample_key(sampler.hash, theta, 0.0, 0.0))
+    sampler.count_multistart(sample_key(sampler.hash, theta))
     return sampler.cached("race", theta, StructuredValue, multistart)
 
 
@@ -126,7 +126,7 @@ def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
     return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
 
 
-def printer(label: str, quiet: bool) -> Callable[[str], None]:
+def printer(label: str, quiet: bool) -> Tell:
     """Lines of progress on stderr."""
     return lambda words: remark(f"{label}: {words}", quiet)
 
@@ -165,6 +165,12 @@ class StructuredOuter(ThetaOuter):
     @property
     def retries_pay(self) -> bool:
         return not is_expensive(self.problem)
+
+    def promising(self, thetas: Array, least: float) -> Array:
+        """By what no controller of any order reaches: far sooner than a search finds none."""
+        tasks = {i: (self.problem, theta, least) for i, theta in enumerate(thetas.tolist())}
+        excluded = dict(results(self.sampler.workers, _excluded, tasks))
+        return thetas[[not excluded[i] for i in tasks]]
 
     def prepared(self, seed: int) -> "StructuredOuter":
         """Searched at the start for warm starts and the plant set, where there are none."""
@@ -259,7 +265,7 @@ class StructuredOuter(ThetaOuter):
             costs = sampler.cached("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
             prices = on_box.tolerance_prices()
-            survival = survived(problem, loops, design.bandwidth)[0] if design.certified else None
+            survival = survived(problem, loops, design)[0]
             damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, design.controller, best.value)
@@ -310,6 +316,13 @@ def _worst_plants(
     workers = Workers(1) if few else sampler.workers
     other, scenarios = on_box.worst_elsewhere(turns, workers, tell)
     return max(worst, other, key=lambda one: one.value), scenarios
+
+
+def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) -> bool:
+    """Whether it is shown that J is at least that at θ."""
+    if problem.figure is not BANDWIDTH or not (problem.w2 < 0.0 and np.isfinite(least)):
+        return False
+    return none_reaches(problem, theta, (least - objective(problem, theta, 0.0)) / problem.w2)
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:

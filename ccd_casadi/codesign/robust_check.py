@@ -20,7 +20,7 @@ import numpy as np
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel
 from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival
-from ccd_casadi.fixed_structure import SetCertificate, certify
+from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import Perturbation, modal_plant
@@ -29,7 +29,7 @@ from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, Outcome
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
 
 DENSE = 41  # shifts of a robust set on which the design is looked at, at the least
 MATTERS = 0.01  # of a bound: what the other damping has to pass it by to be told
@@ -98,21 +98,24 @@ class OtherDamping:
 
 
 def survived(
-    problem: CoDesignProblem, loops: LoopsOffModel, bandwidth: float
-) -> tuple[Survival, RobustCheck | None]:
-    """What the loop survives and whether its set is kept: neither says what the other denies.
+    problem: CoDesignProblem, loops: LoopsOffModel, design: DesignFigures | SectionsDesign
+) -> tuple[Survival | None, RobustCheck | None]:
+    """What a certified loop survives and whether its set is kept: neither says what the other
+    denies.
 
     The ranges are asked at the ends of the set and where it is worst, and the set at all that was
     asked for the ranges.
     """
     check = check_robust(problem, loops)
+    if not design.certified:
+        return None, check
     marks = [abs(end) for end in kind_of(problem).common_shifts()]
     if check is not None and check.at.damping == 1.0:
         marks.append(abs(check.at.shift))
     inner, slack = problem.inner, kind_of(problem).slack
     found = survival(
-        loops, S_max=inner.S_max, bandwidth=bandwidth, omega_low=inner.omega_low, slack=slack,
-        marks=marks,
+        loops, S_max=inner.S_max, bandwidth=design.bandwidth, omega_low=inner.omega_low,
+        slack=slack, marks=marks,
     )  # fmt: skip
     return found, check_robust(problem, loops)
 
@@ -219,4 +222,4 @@ def check_on(
                  omega_low=problem.inner.omega_low)  # fmt: skip
     figures = at(gamma=design.figures.certificate.norm_bound)
     outcome = figures.outcome
-    return ReferenceCheck(name, outcome, figures if figures.certified else at(gamma=UNBOUNDED))
+    return ReferenceCheck(name, outcome, figures if figures.certified else at())

@@ -96,16 +96,16 @@ def theta_kkt(
              for one in (sample, *truth.values(thetas, "certificate"))]  # fmt: skip
         return np.array(J[1:]) - J[0]
 
-    def slope(z: Array) -> Array:
-        there = truth.values(bounds.lower + bounds.width * z, "certificate")[0]
-        return objective_gradient(problem, there)
+    def gradients(z: Array) -> list[Array]:
+        there = truth.values(bounds.lower + bounds.width * z, "certificate")
+        return [objective_gradient(problem, one) for one in there]
 
     if kink is not None:
         step = STEP if beside else BESIDE
         slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.size, step)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
     elif beside is None:  # λ's own curvature is left out
-        columns = hessian_products(slope, bounds.shares(sample.theta), Z, BESIDE)
+        columns = hessian_products(gradients, bounds.shares(sample.theta), Z, BESIDE)
         second = reduced_curvature(Z, columns, at.size)
     return at.certificate(nu, residual, second, kink)
 

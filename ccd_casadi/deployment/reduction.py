@@ -25,7 +25,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
+from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
 NEGLIGIBLE = 1e-9  # of the largest closed-loop Hankel value: a state under it is none
@@ -90,7 +90,7 @@ def reductions(channel: LoopChannel, weights: Weights, omega_low: float) -> list
             if smaller is None:
                 continue
             controller = smaller.in_units(1.0 / plant.omega_0, 1.0 / plant.force)
-            figures = measure(plant, controller, weights, gamma=UNBOUNDED, omega_low=omega_low)
+            figures = measure(plant, controller, weights, omega_low=omega_low)
             found.append(ReducedController(r, method, controller, figures))
     return found
 

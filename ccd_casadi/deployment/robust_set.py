@@ -14,10 +14,8 @@ from ccd_casadi.codesign.robust_check import DENSE
 from ccd_casadi.deployment.channels import LoopChannel, along_directions
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
-from ccd_casadi.plants.modal import Perturbation, modal_plant
-from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.robust.sampled import SampledFigures
 
@@ -83,10 +81,9 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
     robust = run.problem.robust
     if robust is None:
         return ()
-    system = mechanics(plant_of(run.problem), run.theta, derivatives=False)
     places = robust.perturbations(DENSE if dense and robust.shift else None)
     return tuple(
-        Member(at, scale_plant(modal_plant(system, run.problem.suspension, at), run.weights.M_K))
+        Member(at, scale_plant(run.modal(at), run.weights.M_K))
         for at in places
         if at != Perturbation()
     )

@@ -5,20 +5,20 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.explorer.known_plant import KnownPlant
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost, WorkerProcess, tell
 
-Progress = Callable[[str], None]
 Then = Callable[[Any], None]
 Failed = Callable[[BaseException], None]
 
 
-def _working(given: tuple[bool, Callable[[Any, Progress], Any], Any]) -> Any:
+def _working(given: tuple[bool, Callable[[Any, Tell], Any], Any]) -> Any:
     user_code, work, task = given
     with permit_user_code(user_code):
         return work(task, tell)
@@ -36,10 +36,7 @@ class Background:
         self._asking, self._thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._closed = False
 
-    def ask(
-        self, work: Callable[[Any, Progress], Any], task: Any, then: Then, failed: Failed,
-        told: Progress = lambda words: None,
-    ) -> Future:  # fmt: skip
+    def ask(self, work: Callable[[Any, Tell], Any], task: Any, told: Tell = silent) -> Future:
         """Do what the user waits for, one after the other; `told` hears how far the work is."""
 
         def answered() -> Any:
@@ -54,15 +51,15 @@ class Background:
                 raise value
             return value
 
-        return self._submit(self._asking, answered, then, failed)
+        return self._asking.submit(answered)
 
     def renew(self, known: KnownPlant, then: Then) -> None:
         """Make the model of a slow plant anew; of megabytes, it stays in this process."""
-        self._submit(self._thread, known.renew, then, print_failure)
+        self.answer(self._thread.submit(known.renew), then, print_failure)
 
-    def _submit(
-        self, pool: Executor, work: Callable[[], Any], then: Then, failed: Failed
-    ) -> Future:
+    def answer(self, future: Future, then: Then, failed: Failed) -> None:
+        """Call one of them with what this comes to, unless all is closed by then."""
+
         def done(future: Future) -> None:
             if self._closed or future.cancelled():
                 return
@@ -72,9 +69,7 @@ class Background:
             else:
                 failed(error)
 
-        future = pool.submit(work)
         future.add_done_callback(done)
-        return future
 
     def close(self) -> None:
         """End what is under way."""
@@ -94,7 +89,7 @@ class Solve:
     """`python -m ccd_casadi.solve` of a case, in a process of its own, into a folder."""
 
     def __init__(
-        self, case: Path, folder: Path, options: Sequence[str], tell: Callable[[str], None],
+        self, case: Path, folder: Path, options: Sequence[str], tell: Tell,
         ended: Callable[[int], None],
     ) -> None:  # fmt: skip
         """`tell` is given every line, `ended` the exit code, both in another thread."""

@@ -18,7 +18,7 @@ from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.arrays import Array
@@ -99,7 +99,7 @@ def curves_of(look: Look) -> Curves | None:
 
 def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
     """The default one of robustness, its rigid bodies free where that loop is stable."""
-    modal = modal_plant(look.elements.system, Suspension(0.0, 0.0))
+    modal = modal_plant(look.elements.system, FREE)
     free = replace(loop, plant=modal.state_space)
     ((made,),) = moves(
         [loop], [free], [mass_feedforward(modal, 0)], setpoint(LIMITS), axis=0, window=WINDOW,

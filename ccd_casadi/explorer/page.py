@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -253,8 +254,8 @@ class Page:
         self.note.text = "<p>solving the model and searching at this θ …</p>"
         if not busy:
             task = (self.session.problems.at(knobs), knobs)
-            done, failed = self._then(self._searched), self._then(self._failed)
-            self.background.ask(searched_exactly, task, done, failed)
+            search = self.background.ask(searched_exactly, task)
+            self.background.answer(search, self._then(self._searched), self._then(self._failed))
 
     def _searched(self, found: tuple[Look, str]) -> None:
         look, modes = found
@@ -286,11 +287,17 @@ class Page:
         """A controller of fixed structure at this θ."""
         knobs = self.controls.knobs()
         problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
+        self.waits_for(self.background.ask(designed, (problem, knobs), self.told))
+
+    def waits_for(self, design: Future) -> None:
+        """A design is under way, which this page shows once it ends."""
         self.design.disabled = self._designs = self._began = True
         self._designing("it takes seconds")
-        done, failed = self._then(self._designed), self._then(self._failed)
-        told = self._then(self._designing)
-        self.background.ask(designed, (problem, knobs), done, failed, told)
+        self.background.answer(design, self._then(self._designed), self._then(self._failed))
+
+    def told(self, words: str) -> None:
+        """How far a design is, in any thread."""
+        self._then(self._designing)(words)
 
     def _designing(self, words: str) -> None:
         if self._designs:  # not of one that has ended

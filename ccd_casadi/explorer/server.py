@@ -4,6 +4,7 @@ import asyncio
 import secrets
 import warnings
 import webbrowser
+from concurrent.futures import Future
 from pathlib import Path
 
 from bokeh.document import Document
@@ -23,6 +24,7 @@ from ccd_casadi.explorer.page import SOLVED, Page
 from ccd_casadi.explorer.panels import FIGURES
 from ccd_casadi.explorer.pins import Kept
 from ccd_casadi.explorer.session import Session
+from ccd_casadi.explorer.structured import designed
 
 HOST = "127.0.0.1"
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -65,8 +67,21 @@ class Explorer:
         served = HTTPServer(application)
         served.add_sockets(sockets)
         self._server = BaseServer(IOLoop.current(), application, served)
+        self._first = self._design_first() if session.undesigned else None
         if session.known is not None:
             self.background.renew(session.known, self._renewed)
+
+    def _design_first(self) -> Future:
+        """The controller that pages begin with, designed while they open; they hear how far it
+        is."""
+        session = self.session
+
+        def told(words: str) -> None:
+            for page in list(self._pages):
+                page.told(words)
+
+        task = (session.problems.at(session.start), session.start)
+        return self.background.ask(designed, task, told)
 
     def _document(self, document: Document) -> None:
         context = document.session_context
@@ -86,6 +101,8 @@ class Explorer:
         document.js_on_event(ClientReconnected, CustomJS(code=f"{shown}true"))
         document.theme = "dark_minimal" if dark else "light_minimal"
         page = Page(document, self.session, self.background, self._of_solves, dark, kept)
+        if self._first is not None and self.session.undesigned:
+            page.waits_for(self._first)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._gone(page))
 

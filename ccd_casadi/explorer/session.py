@@ -1,6 +1,6 @@
 """What the explorer knows while it runs: the case, the store of its looks, pins, files written."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -31,6 +31,7 @@ from ccd_casadi.sampling.rows import hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import unit_of
+from ccd_casadi.support.progress import Tell
 from surrogates.files import write_whole
 
 QUICK = 0.4  # s of a full search that a drag of S_max waits for
@@ -64,6 +65,11 @@ class Session:
         # until something was searched: the middle of the ranges
         self.point = tuple(float(np.sqrt(a * b)) for a, b in (inner.omega_S, inner.omega_T))
         self.store = SampleStore(folder / "samples.sqlite")  # last: what is refused opens none
+
+    @property
+    def undesigned(self) -> bool:
+        """Whether a controller has to be designed before anything is shown, which takes seconds."""
+        return self.start.structured and self.kappa is None and self.known is None
 
     def elements(self, problem: CoDesignProblem, theta: tuple[float, ...]) -> Elements:
         """The plant's matrices at θ as fast as one drags."""
@@ -151,7 +157,7 @@ class Session:
                 self.store.put(rows, key)  # of matrices without derivatives: no sample of ω_b*(θ)
                 continue
             inner = hashes_of(look.problem)[1]
-            unit = (sample_key(inner, look.theta, 0.0, 0.0), inner, look.theta, payload)
+            unit = (sample_key(inner, look.theta), inner, look.theta, payload)
             self.store.put_unit(rows, unit, key)
 
     def save(self, knobs: Knobs) -> Path:
@@ -173,9 +179,7 @@ class Session:
         return next(place for place in places if not place.exists())
 
 
-def searched_exactly(
-    task: tuple[CoDesignProblem, Knobs], tell: Callable[[str], None]
-) -> tuple[Look, str]:
+def searched_exactly(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> tuple[Look, str]:
     """A full search on the model of a slow plant, and the pictures of its modes: for a worker."""
     problem, knobs = task
     elements = elements_at(problem, knobs.theta)

@@ -13,7 +13,6 @@ import numpy as np
 from ccd_casadi.explorer.designs import How, Look, Standing, elements_at, without_controller
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.fixed_structure import SetCertificate
-from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
@@ -22,6 +21,7 @@ from ccd_casadi.inner_problem.structured_search import prepared, with_range
 from ccd_casadi.sampling.rows import Sample, hashes_of, sample_key
 from ccd_casadi.sampling.units import structured_unit
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Tell
 from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome
 
 Unit = tuple[str, str, tuple[float, ...], dict[str, Any]]
@@ -56,14 +56,14 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
     return replace(problem, controller=taken, start=known.start)
 
 
-def designed(task: tuple[CoDesignProblem, Knobs], tell: Progress) -> Designed:
+def designed(task: tuple[CoDesignProblem, Knobs], tell: Tell) -> Designed:
     """The best certified controller at θ from the problem's warm starts, or from many starts."""
     problem, knobs = task
     if not structured_of(problem).warm_starts:
-        problem = prepared(replace(problem, start=knobs.theta), progress=tell)[0]
+        problem = prepared(replace(problem, start=knobs.theta), tell=tell)[0]
     problem = with_range(problem)
     designs, inner = hashes_of(problem)
-    own = sample_key(inner, knobs.theta, 0.0, 0.0)
+    own = sample_key(inner, knobs.theta)
     rows, payload = structured_unit(problem, designs, own, knobs.theta)
     kappa = np.array(payload["kappa"]) if payload["kappa"] else None
     return Designed(

@@ -25,11 +25,9 @@ from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.race import LocalOptimum, run_race, started
 from ccd_casadi.fixed_structure.sections_design import (
     DesignSearch,
-    Progress,
     SectionsDesign,
     in_problem_units,
     span_of,
-    titled,
 )
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
@@ -38,6 +36,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent, titled
 from ccd_casadi.synthesis.interchange import from_control, plant_from_control
 
 SLOWEST = 10.0  # ω₀ over ω_low/S_low, the bandwidth that S of slope one needs at least
@@ -56,7 +55,7 @@ def synthesise_sections(
     initial: Sequence[Array] = (),
     only_initial: bool = False,
     frequencies: tuple[float, float] | None = None,
-    progress: Progress | None = None,
+    progress: Tell | None = None,
     workers: Pool | None = None,
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every plant of a set.
@@ -115,8 +114,8 @@ def synthesise_sections(
     """
     scaled = _scaled(plants, bounds, M_K)
     problem = problem_for(scaled, structure, bounds, sampling, frequencies)
-    search = DesignSearch(problem, scaled, sampling, starts, seed, initial, only_initial, progress,
-                          workers)  # fmt: skip
+    search = DesignSearch(problem, scaled, sampling, starts, seed, initial, only_initial,
+                          progress or silent, workers)  # fmt: skip
     if isinstance(problem, CompositeProblem):
         return _of_several(search, problem)
     return of_one_channel(search)
@@ -220,7 +219,7 @@ def _of_channels(
         title = f"channel {structure.decoupling.names[i]}"
         found.append(of_one_channel(replace(
             search, problem=alone, plants=members, initial=begins, began=perf_counter(),
-            only_initial=search.only_initial or again, progress=titled(search.tell, title),
+            only_initial=search.only_initial or again, tell=titled(search.tell, title),
         )))  # fmt: skip
     return found
 

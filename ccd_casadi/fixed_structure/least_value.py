@@ -28,7 +28,6 @@ from ccd_casadi.fixed_structure.loop_problem import Assessment
 from ccd_casadi.fixed_structure.optimality import Envelope, Optimality, envelope_of, optimality
 from ccd_casadi.fixed_structure.sections_design import (
     DesignSearch,
-    Progress,
     SectionsDesign,
     SectionsOutcome,
     in_problem_units,
@@ -40,6 +39,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 
 STEP = 1e-30  # of κ along the imaginary axis
@@ -132,7 +132,7 @@ def least_value(
     least_bandwidth: float = 0.0,
     initial: Sequence[Array] = (),
     only_initial: bool = False,
-    progress: Progress | None = None,
+    tell: Tell = silent,
 ) -> LeastValue:
     """From `initial` (κ in SI), a certified design and its other local optima to the least value
     of the goal; with `only_initial` from the latter where the former lead to no certified design.
@@ -144,7 +144,7 @@ def least_value(
     if not isinstance(structure, Structure):
         raise ValueError("the least value is searched for one input and one output only")
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
-    search = DesignSearch(problem, plants, sampling, progress=progress)
+    search = DesignSearch(problem, plants, sampling)
     w0, force = problem.plants.omega_0, problem.plants.force
     floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
 
@@ -174,7 +174,7 @@ def least_value(
         made, conditions = _judged(search, end, design, floor)
         value = float(np.exp(end.value + REWARD * end.x[-1]))
         at = f"{goal.shown(value)} at {made.bandwidth / HZ:.2f} Hz"
-        search.tell(f"{at}, {count} steps: {made.words}")
+        tell(f"{at}, {count} steps: {made.words}")
         if made.certified and value < best.value:
             direct = goal.to_theta(made.kappa)
             envelope = envelope_of(problem, end.x[:-1], conditions, direct)

@@ -10,7 +10,7 @@ judge is `measured_loop.judge`. Of several channels each is designed on its own 
 Uᵀ G V first, and the search on the whole begins where these are stable together.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import cast
@@ -26,7 +26,7 @@ from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, de
 from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge
 from ccd_casadi.fixed_structure.race import finished, run_race
-from ccd_casadi.fixed_structure.sections_design import MARGIN, in_problem_units, titled
+from ccd_casadi.fixed_structure.sections_design import MARGIN, in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
@@ -34,6 +34,7 @@ from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent, titled
 
 FEWER = 600  # lines that starts of single channels are designed on
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
@@ -72,7 +73,7 @@ def design_on_data(
     seed: int = 0,
     effort: float | None = None,
     given_up: float = 0.0,
-    progress: Callable[[str], None] | None = None,
+    progress: Tell = silent,
     workers: Pool | None = None,
 ) -> MeasuredDesign:
     """max ω_b over the parameters of a structure, with every bound on every line of every response.
@@ -93,17 +94,16 @@ def design_on_data(
     if shapes != {(1, 1)} and isinstance(structure, Structure):
         decoupling = static_decoupling(responses[0])
         structure = ChannelStructure(decoupling, (structure,) * len(decoupling.names))
-    tell = progress or (lambda words: None)
     problem = line_problem(responses, structure, bounds, period, MARGIN, effort)
     if isinstance(structure, ChannelStructure):
-        pool, spent = _channels_stacked(problem, structure, period, starts, seed, tell, workers)
+        pool, spent = _channels_stacked(problem, structure, period, starts, seed, progress, workers)
     else:
         pool, spent = _pool(problem, starts, np.random.default_rng(seed)), 0
     if not len(pool):
         nothing = np.full(len(structure.names), np.nan)
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent)
     best: MeasuredDesign | None = None
-    for runner in finished(run_race(problem, np.array(pool), tell, workers)):
+    for runner in finished(run_race(problem, np.array(pool), progress, workers)):
         end = ascend(problem, runner.point, iterations=60, radius=1e-2, restoring=True)
         spent += runner.evaluations + end.evaluations
         kappa = _more_integral(problem, end.point, given_up) if given_up else end.point.kappa
@@ -183,7 +183,7 @@ def _channels_stacked(
     period: float | None,
     starts: int,
     seed: int,
-    tell: Callable[[str], None],
+    tell: Tell,
     workers: Pool | None,
 ) -> tuple[list[Array], int]:
     """The channels' own designs as one κ, with ever tighter S_max until it is stable."""

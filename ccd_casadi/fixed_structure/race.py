@@ -8,7 +8,7 @@ others. Each climb is a function of its start alone, so that any
 number of processes finds the same.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from ccd_casadi.fixed_structure.local_search import PENALTY, Ascent, Point, asce
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.progress import Tell
 
 ROUNDS, STEPS = 27, 15  # at most, steps of each
 HALVINGS = (0, 2, 6)  # rounds after which the better half goes on
@@ -60,7 +61,7 @@ class Runner(Ascent):
 def run_race(
     problem: LoopProblem,
     pool: Array,
-    tell: Callable[[str], None],
+    tell: Tell,
     workers: Pool | None = None,
     before: Sequence[Runner] = (),
     known: int = 0,

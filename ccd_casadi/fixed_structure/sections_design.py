@@ -1,6 +1,6 @@
 """A controller of fixed structure: the end of a search, judged and put in words."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from time import perf_counter
@@ -20,11 +20,10 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
-
-Progress = Callable[[str], None]
 
 
 class SectionsOutcome(StrEnum):
@@ -86,11 +85,6 @@ class SectionsDesign(NotebookHtml):
         return self.outcome is SectionsOutcome.CERTIFIED
 
 
-def titled(progress: Progress, title: str) -> Progress:
-    """Lines of progress with what they are of."""
-    return lambda words: progress(f"{title}: {words}")
-
-
 def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:
     """SI parameters κ in the units of the problem."""
     P = problem.plants
@@ -116,14 +110,9 @@ class DesignSearch:
     seed: int = 0
     initial: Sequence[Array] = ()
     only_initial: bool = False
-    progress: Progress | None = None
+    tell: Tell = silent
     workers: Pool | None = None
     began: float = field(default_factory=perf_counter)
-
-    def tell(self, words: str) -> None:
-        """A line of progress."""
-        if self.progress is not None:
-            self.progress(words)
 
     def inside(self, kappas: Sequence[Array]) -> list[Array]:
         """Controllers κ in SI in the units of the problem and in its box."""

@@ -12,7 +12,6 @@ from ccd_casadi.budget import BudgetFigures, evaluate_budget
 from ccd_casadi.budget.derivatives import variance_slopes
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.synthesis.weights import Weights
@@ -54,7 +53,7 @@ class LoopBudget:
     plants: int
     largest_error: float
     largest_force: float
-    hold: Sampling | None
+    sampled: bool
 
 
 def loop_budget(
@@ -63,9 +62,9 @@ def loop_budget(
     """None for a problem without a budget; the controller in SI, as `controller.json` has it."""
     if problem.budget is None:
         return None
-    loops, hold = design_loops(problem, theta, controller), problem.sampling
-    model = evaluate_budget(loops[0].plant, controller, problem.budget, hold)
+    loops = design_loops(problem, theta, controller)
+    model = evaluate_budget(loops[0], problem.budget)
     found = [variance_slopes(loop, problem.budget, ()) for loop in loops]
     largest = np.max([np.full(3, np.inf) if item is None else item.value for item in found], axis=0)
     error, force = np.sqrt(largest[[0, 2]]).tolist()
-    return LoopBudget(model, len(loops), error, force, hold)
+    return LoopBudget(model, len(loops), error, force, problem.sampling is not None)

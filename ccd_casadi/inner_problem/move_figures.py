@@ -19,12 +19,11 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import plants_of, structured_of, uncertain_plant
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import Suspension
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-FREE = Suspension(0.0, 0.0)
 CHECKED, FRESH = 100, 500  # plants of the lattice, and drawn afresh
 FRESH_SEED = 3000  # apart from those of other draws
 PER_MOVE = 10.0  # a continuous loop is stepped 50 times in this share of the setpoint

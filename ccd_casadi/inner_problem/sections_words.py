@@ -1,6 +1,5 @@
 """A controller of fixed structure as a motion engineer reads it: sections in Hz and damping."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Kind
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, with_unit
+from ccd_casadi.support.units import HZ
 
 NEAR = 1.1  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
 
@@ -93,34 +92,6 @@ def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict
         "gain": gain_of(kappa),
         "sections": [vars(item) for item in section_words(structure, kappa)],
     }  # fmt: skip
-
-
-def gain_words(controller: Mapping[str, Any]) -> str:
-    """`470 kN/m`, of several channels `z: 470 kN/m, tip: …`; of `controller` of result.json."""
-    if "gain" in controller:
-        return with_unit(controller["gain"], "N/m", 4)
-    return ", ".join(
-        f"{c['name']}: {with_unit(c['gain'], 'N/m', 4)}" for c in controller["channels"]
-    )
-
-
-def channel_words(own: Mapping[str, Any]) -> str:
-    """A channel's own bounds and how it keeps them, of an entry of `channel_bounds`.
-
-    >>> own = {"name": "tilt", "sensitivity_peak": 1.5, "sensitivity_peak_hz": 212.0, "S_max": 1.5,
-    ...        "bandwidth_hz": 60.2, "bandwidth_ratio": 1.6}
-    >>> channel_words(own)
-    'channel tilt: peak 1.5 at 212 Hz (S_max 1.5), 60.2 Hz (at least 1.6 ω_b)'
-    """
-    peak = f"peak {own['sensitivity_peak']:.6g} at {own['sensitivity_peak_hz']:.4g} Hz"
-    if own["S_max"] is not None:
-        peak += f" (S_max {own['S_max']:g})"
-    words = f"channel {own['name']}: {peak}, {own['bandwidth_hz']:.6g} Hz"
-    if own["bandwidth_ratio"] > 1.0:
-        words += f" (at least {own['bandwidth_ratio']:g} ω_b)"
-    if "M_K" in own:
-        words += f", |W_KS KS| {own['weighted_KS']:.4g} with its M_K"
-    return words
 
 
 def _channels_dict(structure: ChannelStructure, kappa: Array) -> dict[str, Any]:

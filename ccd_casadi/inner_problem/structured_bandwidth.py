@@ -18,9 +18,9 @@ from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
-from ccd_casadi.fixed_structure.sections_design import Progress, SectionsOutcome
+from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
-from ccd_casadi.inner_problem.move_figures import FREE, motion_of
+from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.objective import InnerValue
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -31,10 +31,12 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     warm_starts_at,
     with_structured,
 )
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 
 FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
@@ -70,7 +72,7 @@ class ProblemAt:
         self,
         initial: Sequence[Array],
         starts: int | None = None,
-        progress: Progress | None = None,
+        tell: Tell = silent,
         workers: Pool | None = None,
     ) -> SectionsDesign:
         """The largest bandwidth, from controllers κ in SI and `starts` others beside them."""
@@ -78,7 +80,7 @@ class ProblemAt:
         return synthesise_sections(
             self.plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
             starts=starts or 0, seed=structured.seed, initial=initial, only_initial=starts is None,
-            frequencies=structured.frequencies, progress=progress, workers=workers,
+            frequencies=structured.frequencies, progress=tell, workers=workers,
         )  # fmt: skip
 
     @property
@@ -95,7 +97,7 @@ class ProblemAt:
         return MoveTime(tuple(free), structure, sampling, motion_of(problem, self.theta))
 
     def least(
-        self, design: SectionsDesign, only_initial: bool = False, progress: Progress | None = None
+        self, design: SectionsDesign, only_initial: bool = False, tell: Tell = silent
     ) -> LeastValue:
         """The least of the problem's figure from a certified design and its warm starts."""
         problem, structured = self.problem, structured_of(self.problem)
@@ -105,7 +107,7 @@ class ProblemAt:
             self.plants, bounds, design, self.goal, sampling=structured.sampling,
             least_bandwidth=structured.bandwidth_least,
             initial=warm_starts_at(started, structure_of(problem), self.plants, bounds),
-            only_initial=only_initial, progress=progress,
+            only_initial=only_initial, tell=tell,
         )  # fmt: skip
 
     def value_of(

@@ -16,7 +16,6 @@ from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.loop_on_box import WITHIN, Excess, LoopOnBox
-from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice, worst_plants
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
@@ -34,6 +33,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.progress import Tell, silent
 
 AT_ONCE = 8  # plants added in a round
 APART = 1e-4  # of the box: plants that are closer are the same plant
@@ -58,29 +58,26 @@ class DesignOnBox:
         """The box."""
         return uncertain_plant(self.problem, self.theta)
 
-    def worst(
-        self, turn: int = 0, progress: Progress | None = None
-    ) -> tuple[Excess, tuple[Scenario, ...]]:
+    def worst(self, turn: int = 0, tell: Tell = silent) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of the box, and those to add: past a bound, each a new one.
 
         Where a move's time counts the plant that settles latest besides, if it is later than v.
         """
         problem, theta, design = self.problem, self.theta, self.design
         worst, found = violations(
-            problem, self.uncertain, design.kappa, design.bandwidth, turn, progress
+            problem, self.uncertain, design.kappa, design.bandwidth, turn, tell
         )
         if problem.figure is MOVE_TIME and design.controller is not None:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
             seed = structured_of(problem).seed + turn
             time, option, point = latest_plant(problem, theta, design.controller, seed)
-            if progress is not None:
-                progress(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
+            tell(f"{1e3 * time:.5g} ms on the latest plant, {1e3 * value:.5g} ms counted")
             if time > value:
                 found = (*found, (option, tuple(map(float, point))))
         return worst, found
 
     def worst_elsewhere(
-        self, turns: range, workers: Pool, progress: Progress
+        self, turns: range, workers: Pool, tell: Tell
     ) -> tuple[Excess, tuple[Scenario, ...]]:
         """The worst plant of several searches, and those to add of the first that finds any; as
         many at a time as there are workers."""
@@ -91,7 +88,7 @@ class DesignOnBox:
             seen += [worst for worst, _ in found.values()]
             largest = max(seen, key=lambda one: one.value)
             words = f"{100.0 * np.exp(largest.value):.6g} % of a bound at most"
-            progress(f"{words}, searched from elsewhere")
+            tell(f"{words}, searched from elsewhere")
             added = next((found[turn][1] for turn in own if found[turn][1]), ())
             if added:
                 break
@@ -175,7 +172,7 @@ def violations(
     kappa: Array,
     bandwidth: float,
     turn: int,
-    progress: Progress | None = None,
+    tell: Tell | None = None,
     within: float = WITHIN,
     others: Sequence[Scenario] = (),
 ) -> tuple[Excess, tuple[Scenario, ...]]:
@@ -189,8 +186,8 @@ def violations(
     heads, count = worst_plants(loop, structured.seed + turn)
     heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
     heads.sort(key=lambda head: -head.value)
-    if progress is not None:
-        progress(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
+    if tell is not None:
+        tell(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
     counted = structured.scenarios
     found: list[Scenario] = []

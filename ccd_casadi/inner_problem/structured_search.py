@@ -13,7 +13,6 @@ import numpy as np
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
 from ccd_casadi.fixed_structure.loop_on_box import Excess
-from ccd_casadi.fixed_structure.sections_design import Progress
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
@@ -26,6 +25,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent
 
 MOST_WARM_STARTS = 3
 ENOUGH = 12  # starts before a search may say that it found no controller within the bounds
@@ -37,7 +37,7 @@ SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fas
 def race(
     problem: CoDesignProblem,
     theta: Sequence[float],
-    progress: Progress | None = None,
+    tell: Tell = silent,
     workers: Pool | None = None,
     only_warm_starts: bool = False,
 ) -> SectionsDesign:
@@ -50,10 +50,10 @@ def race(
     here, structured = ProblemAt(problem, theta), structured_of(problem)
     warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
     starts = None if only_warm_starts else structured.starts
-    made = here.searched(warm_starts, starts, progress, workers)
+    made = here.searched(warm_starts, starts, tell, workers)
     if made.certified or starts is None or starts >= ENOUGH:
         return made
-    return here.searched(warm_starts, ENOUGH, progress, workers)
+    return here.searched(warm_starts, ENOUGH, tell, workers)
 
 
 def with_range(problem: CoDesignProblem) -> CoDesignProblem:
@@ -78,7 +78,7 @@ def with_range(problem: CoDesignProblem) -> CoDesignProblem:
 
 def prepared(
     problem: CoDesignProblem,
-    progress: Progress | None = None,
+    tell: Tell = silent,
     workers: Pool | None = None,
     only_warm_starts: bool = False,
 ) -> tuple[CoDesignProblem, SectionsDesign, Excess | None]:
@@ -95,17 +95,17 @@ def prepared(
     scenarios = tuple((option, tuple(map(float, point))) for option, point in corners)
     problem = with_structured(problem, scenarios=scenarios)
 
-    made = race(problem, problem.start, progress, workers, only_warm_starts)
+    made = race(problem, problem.start, tell, workers, only_warm_starts)
     worst: Excess | None = None
     last = True  # what a search ends with goes to its optimum once no plant is found worse
     for turn in range(ROUNDS if made.certified else 0):
-        worst, wider = _wider(problem, problem.start, made, turn, progress)
+        worst, wider = _wider(problem, problem.start, made, turn, tell)
         if wider is None and last:
             break
         last = wider is None
         problem = with_structured(wider or problem, warm_starts=_warm_starts(made))
         if not last:
-            made = race(problem, problem.start, progress, workers, only_warm_starts=True)
+            made = race(problem, problem.start, tell, workers, only_warm_starts=True)
         if last or not made.certified:  # which has a few starts more where warm ones lead to none
             made = structured_value(problem, problem.start, workers).design
         worst = None
@@ -118,10 +118,10 @@ def prepared(
 
 def _wider(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, turn: int,
-    progress: Progress | None,
+    tell: Tell,
 ) -> tuple[Excess, CoDesignProblem | None]:  # fmt: skip
     """The worst plant, and the problem with those that are worse than its own, if there are any."""
-    worst, found = DesignOnBox(problem, theta, design).worst(turn, progress)
+    worst, found = DesignOnBox(problem, theta, design).worst(turn, tell)
     scenarios = (*structured_of(problem).scenarios, *found)
     return worst, with_structured(problem, scenarios=scenarios) if found else None
 
@@ -145,10 +145,7 @@ def with_warm_start(problem: CoDesignProblem, kappa: Sequence[float] | Array) ->
 
 
 def least_from(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    design: SectionsDesign,
-    progress: Progress | None = None,
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, tell: Tell = silent
 ) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:
     """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
     one of the least of another figure, not certified where it has to be slower than is allowed.
@@ -161,8 +158,8 @@ def least_from(
     wider = problem
     for turn in range(ROUNDS_OF_ERROR):
         problem = wider
-        found = ProblemAt(problem, theta).least(design, progress=progress)
-        wider = _wider(problem, theta, found.design, turn, progress)[1] or problem
+        found = ProblemAt(problem, theta).least(design, tell=tell)
+        wider = _wider(problem, theta, found.design, turn, tell)[1] or problem
         if wider is problem:
             break
     return with_warm_start(problem, found.design.kappa), found.design, found

@@ -49,6 +49,14 @@ def upper_bound(limits: Limits, known: float = np.inf) -> float:
     return min(found or _certified(limits, omega_b, most, MANY) or most, known)
 
 
+def forbids(limits: Limits, omega_b: float) -> bool:
+    """Whether one coarse programme and its certificate show that no controller has ω_b (rad/s)."""
+    search = _Search(limits, omega_b, -1, COARSE)
+    g, weight = search.multiplier(omega_b)
+    grid = _grid(limits, omega_b, MANY[1])
+    return bool(1.0 < g < np.inf) and rules_out(limits, search.basis, weight, omega_b, grid)
+
+
 def _certified(limits: Limits, omega_b: float, most: float, size: tuple[int, int]) -> float:
     """The least ω_b that a certificate was found for, next to `omega_b`; 0: none below `most`.
 

@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.limitations.bound import forbids_most, lower_bound, pointwise, upper_bound
+from ccd_casadi.limitations.bound import forbids, forbids_most, lower_bound, pointwise, upper_bound
 from ccd_casadi.limitations.limits import Limits, limits_of
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.support.arrays import Array
@@ -126,6 +126,18 @@ def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
         return gap_of(problem, theta, within=False)
     except UserError:
         return None
+
+
+def none_reaches(problem: CoDesignProblem, theta: Sequence[float], omega_b: float) -> bool:
+    """Whether it is shown, in a fraction of a second, that no controller has ω_b (rad/s) at θ, on
+    the model; False where nothing is known."""
+    if not omega_b > 0.0:
+        return False
+    try:
+        loops = limits_of_problem(problem, theta)
+    except (UserError, PlantError):
+        return False
+    return any(forbids(limits, omega_b) for limits in loops)
 
 
 def limits_of_problem(problem: CoDesignProblem, theta: Sequence[float]) -> list[Limits]:

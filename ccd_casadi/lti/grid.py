@@ -39,6 +39,17 @@ def frequency_grid(
     return np.asarray(grid[np.append(True, np.diff(grid) > apart * grid[1:])])
 
 
+def thinned(values: Array, width: float) -> Array:
+    """Those above 0, ascending: the least of each interval of ln ω that is so wide.
+
+    >>> thinned(np.array([1.0, 1.01, 2.0, 1.02]), 0.1).tolist()
+    [1.0, 2.0]
+    """
+    ascending = np.sort(values[values > 0.0])
+    _, first = np.unique(np.floor(np.log(ascending) / width), return_index=True)
+    return np.asarray(ascending[first])
+
+
 def local_maxima(values: Array) -> np.ndarray:
     """Places inside the array that are above their left neighbour and not below their right one."""
     return np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1

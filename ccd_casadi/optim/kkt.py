@@ -166,18 +166,21 @@ def reduced_curvature(Z: Array, columns: Array | None, size: float) -> float | N
 
 
 def hessian_products(
-    slope: Callable[[Array], Array | None], z: Array, directions: Array, step: float = STEP
+    slopes: Callable[[Array], Sequence[Array | None]],
+    z: Array,
+    directions: Array,
+    step: float = STEP,
 ) -> Array | None:
-    """HZ (n, k) by differences of a gradient z -> (n,); one-sided at an end of the unit box.
+    """HZ (n, k) by differences of gradients, all at once: z (2 k, n) -> (n,) of each; one-sided at
+    an end of the unit box.
 
     None where a gradient is not known, or the box leaves less than half of a step.
     """
-    columns = np.empty((z.size, directions.shape[1]))
-    for k, direction in enumerate(directions.T):
-        ends = [np.clip(z + sign * step * direction, 0.0, 1.0) for sign in (1.0, -1.0)]
-        slopes = [slope(end) for end in ends]
-        span = float(np.linalg.norm(ends[0] - ends[1]))
-        if slopes[0] is None or slopes[1] is None or span < 0.5 * step:
-            return None
-        columns[:, k] = (slopes[0] - slopes[1]) / span
-    return columns
+    ends = np.clip(z + step * np.concatenate([directions.T, -directions.T]), 0.0, 1.0)
+    found = [slope for slope in slopes(ends) if slope is not None]
+    ups, downs = np.split(ends, 2)
+    spans = np.linalg.norm(ups - downs, axis=1)
+    if len(found) < len(ends) or (spans < 0.5 * step).any():
+        return None
+    above, below = np.split(np.array(found), 2)
+    return np.asarray(((above - below) / spans[:, None]).T)

@@ -5,18 +5,23 @@ serves the eigen-solve and all derivatives. Point masses are a low-rank change o
 the Woodbury identity, so the same code solves one symmetry or the direct sum of all of them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import splu
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.threads import OwnThreads
+
+BLOCK = 2  # vectors that modes are searched with
+STEPS = 200  # blocks of a space at most
+EXACT, SOLVED = 1e-11, 1e-10  # relative residuals of a mode, and of a solution
+ROUNDING = 1e-13  # of the operator's norm: directions of a block that are no more
 
 
 class StageError(UserError):
@@ -85,33 +90,69 @@ def orthonormal(pencil: Pencil, vectors: Array) -> Array:
     return V
 
 
+@dataclass(frozen=True)
+class Krylov:
+    """A block Krylov space of A⁻¹M: V (n, k), M-orthonormal, and T = VᵀMA⁻¹MV (k, k).
+
+    What A⁻¹M makes of the last block is not in the space: `rest` (b, b) is the Gram matrix of its
+    part beside it.
+    """
+
+    V: Array
+    T: Array
+    rest: Array
+
+    def beside(self, y: Array) -> Array:
+        """‖A⁻¹MVy - VTy‖ (m,) in the norm of M, of the columns of y (k, m)."""
+        last = y[-len(self.rest) :]
+        return np.asarray(np.sqrt(np.maximum(np.sum(last * (self.rest @ last), axis=0), 0.0)))
+
+
+def krylov_spaces(pencil: Pencil, start: Array, without: Array) -> Iterator[Krylov]:
+    """Those from `start` (n, b), each a block larger, M-orthogonal to `without` (n, r).
+
+    Each block is orthogonalised against all before it, so that one product with M and one solution
+    a block are all: ARPACK asks for four products a vector.
+    """
+    V, MV, block = without, pencil.mass(without), start
+    out, T, scale = V.shape[1], np.zeros((0, 0)), 0.0
+    for _ in range(STEPS):
+        for _ in range(2):
+            block = block - V @ (MV.T @ block)
+        M_block = pencil.mass(block)
+        gram = block.T @ M_block
+        scale = scale or float(np.sqrt(gram.max(initial=0.0)))
+        if len(T):
+            yield Krylov(V[:, out:], T, gram)
+        for least in ((ROUNDING * scale) ** 2, 0.0):
+            values, turn = np.linalg.eigh(block.T @ M_block)
+            turn = turn[:, values > least] / np.sqrt(values[values > least])
+            block, M_block = block @ turn, M_block @ turn
+            again = MV.T @ block
+            block, M_block = block - V @ again, M_block - MV @ again
+        if not block.shape[1]:
+            return
+        V, MV = np.hstack([V, block]), np.hstack([MV, M_block])
+        block = pencil.inverse(M_block)
+        known, own = np.split(MV[:, out:].T @ block, [len(T)])
+        T = np.block([[T, known], [known.T, 0.5 * (own + own.T)]])
+        scale = float(np.abs(T).max())
+
+
 def flexible_modes(pencil: Pencil, rigid: Array, count: int) -> tuple[Array, Array]:
     """The `count` lowest flexible eigenvalues (rad²/s²) and M-orthonormal modes (n, count).
 
-    `rigid` (n, r) are the exact rigid-body modes: projected out, they cost no iterations.
+    `rigid` (n, r) are the exact rigid-body modes: projected out, they cost no iterations. Blocks
+    find modes of equal frequency, as many as a block has vectors.
     """
-
-    M_rigid = pencil.mass(rigid)
-
-    def inverse(x: Array) -> Array:
-        # from both sides: rounding of K leaves K rigid = 0 to eight digits only
-        y = pencil.inverse(x - M_rigid @ (rigid.T @ x))
-        return y - rigid @ (M_rigid.T @ y)
-
-    def operator(f: Callable[[Array], Array]) -> LinearOperator:
-        return LinearOperator((pencil.size, pencil.size), matvec=f, dtype=float)
-
     # a fixed start: the same θ gives the same digits
-    start = inverse(np.random.default_rng(0).standard_normal(pencil.size))
-    ncv = min(pencil.size, max(18, 2 * count + 1))
-    how = {"v0": start, "ncv": ncv, "maxiter": 500, "tol": 1e-11, "OPinv": operator(inverse)}
-    M = operator(pencil.mass)
-    try:
-        mu, V = eigsh(M, k=count, M=M, sigma=0.0, **how)
-    except Exception as error:
-        raise StageError(f"the stage's eigen-solve failed ({error}); check theta") from error
-    order = np.argsort(mu)
-    return mu[order] - pencil.shift, V[:, order]
+    start = pencil.inverse(np.random.default_rng(0).standard_normal((pencil.size, BLOCK)))
+    for space in krylov_spaces(pencil, start, rigid):
+        mu, Y = np.linalg.eigh(space.T)
+        mu, Y = mu[: -count - 1 : -1], Y[:, : -count - 1 : -1]
+        if len(mu) == count and (space.beside(Y) <= EXACT * mu).all():
+            return 1.0 / mu - pencil.shift, space.V @ Y
+    raise StageError("the stage's eigen-solve did not converge; check theta")
 
 
 def build_resolvent(
@@ -124,48 +165,20 @@ def build_resolvent(
     With every mode up to λ deflated the operator is positive definite: Galerkin's method is
     then that of conjugate gradients. Grown until the relative residual at `largest` is 1e-10.
     """
-    modes = orthonormal(pencil, modes)
-    M_modes = pencil.mass(modes)
+    if not F.shape[1]:
+        return lambda value: F
+    start = pencil.inverse(F)
+    M_start = pencil.mass(start)
 
-    def deflate(x: Array) -> Array:
-        for _ in range(2):
-            x = x - modes @ (M_modes.T @ x)
-        return x
+    def of(space: Krylov, value: float) -> Array:
+        """x = Vy."""
+        operator = np.eye(len(space.T)) - (value + pencil.shift) * space.T
+        return np.asarray(np.linalg.solve(operator, space.V.T @ M_start))
 
-    start = deflate(pencil.inverse(F))
-    size = np.sqrt(np.einsum("ij,ij->j", start, pencil.mass(start)).max(initial=0.0))
-    V = MV = W = np.zeros((pencil.size, 0))
-    block, norms = start, size
-    for _ in range(60):
-        block = deflate(block)
-        for _ in range(2):
-            block = block - V @ (MV.T @ block)
-        values, turn = np.linalg.eigh(block.T @ pencil.mass(block))
-        keep = values > (1e-13 * norms) ** 2
-        if not keep.any():
-            break
-        new = block @ (turn[:, keep] / np.sqrt(values[keep]))
-        new = deflate(new)
-        new = new - V @ (MV.T @ new)
-        new = orthonormal(pencil, new)
-        M_new = pencil.mass(new)
-        image = deflate(pencil.inverse(M_new))
-        V, MV, W = np.hstack([V, new]), np.hstack([MV, M_new]), np.hstack([W, image])
-        T = MV.T @ W
-        right = MV.T @ start
-        y = np.linalg.solve(np.eye(len(T)) - (largest + pencil.shift) * T, right)
-        x = V @ y
-        residual = start - x + (largest + pencil.shift) * (W @ y)
-        error = np.sqrt(np.einsum("ij,ij->j", residual, pencil.mass(residual)).max())
-        block, norms = image, float(np.abs(T).max())
-        if error < 1e-10 * size:
-            break
-    else:
-        raise StageError("the stage's mode derivatives did not converge; retain another number")
-    T, right = MV.T @ W, MV.T @ start
-    T = 0.5 * (T + T.T)
-
-    def at(value: float) -> Array:
-        return V @ np.linalg.solve(np.eye(len(T)) - (value + pencil.shift) * T, right)
-
-    return at
+    for space in krylov_spaces(pencil, start, modes):
+        size = np.linalg.norm(space.V.T @ M_start, axis=0).max()
+        left = (largest + pencil.shift) * space.beside(of(space, largest)).max()
+        if left < SOLVED * size:
+            found = space
+            return lambda value: found.V @ of(found, value)
+    raise StageError("the stage's mode derivatives did not converge; retain another number")

@@ -33,6 +33,9 @@ class Suspension:
     damping_ratio: float = 0.7
 
 
+FREE = Suspension(0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Perturbation:
     """A plant off its model: flexible frequencies times 1 + `shift`, damping times `damping`.

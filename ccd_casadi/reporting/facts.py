@@ -11,7 +11,6 @@ from jinja2 import UndefinedError
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_words import channel_words
 from ccd_casadi.support.package_text import template
 from ccd_casadi.support.terminal import plain
 from ccd_casadi.support.units import HZ, counted, display_unit, number, small_share, with_unit
@@ -123,10 +122,38 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
     return f"predicted {guess} (error {small_share(r['verification_error'])})"
 
 
+def gain_words(controller: Mapping[str, Any]) -> str:
+    """`470 kN/m`, of several channels `z: 470 kN/m, tip: …`; of `controller` of result.json."""
+    if "gain" in controller:
+        return with_unit(controller["gain"], "N/m", 4)
+    return ", ".join(
+        f"{c['name']}: {with_unit(c['gain'], 'N/m', 4)}" for c in controller["channels"]
+    )
+
+
+def channel_words(own: Mapping[str, Any]) -> str:
+    """A channel's own bounds and how it keeps them, of an entry of `channel_bounds`.
+
+    >>> own = {"name": "tilt", "sensitivity_peak": 1.5, "sensitivity_peak_hz": 212.0, "S_max": 1.5,
+    ...        "bandwidth_hz": 60.2, "bandwidth_ratio": 1.6}
+    >>> channel_words(own)
+    'channel tilt: peak 1.5 at 212 Hz (S_max 1.5), 60.2 Hz (at least 1.6 ω_b)'
+    """
+    peak = f"peak {own['sensitivity_peak']:.6g} at {own['sensitivity_peak_hz']:.4g} Hz"
+    if own["S_max"] is not None:
+        peak += f" (S_max {own['S_max']:g})"
+    words = f"channel {own['name']}: {peak}, {own['bandwidth_hz']:.6g} Hz"
+    if own["bandwidth_ratio"] > 1.0:
+        words += f" (at least {own['bandwidth_ratio']:g} ω_b)"
+    if "M_K" in own:
+        words += f", |W_KS KS| {own['weighted_KS']:.4g} with its M_K"
+    return words
+
+
 def loop_lines(r: Mapping[str, Any]) -> list[str]:
-    """Margins, steps and what is narrow at the bandwidth, for the terminal."""
-    found = facts("margins", r)
-    return [plain(f"{name.lower():14s}{value}, {remark}") for name, value, remark in found]
+    """Margins, steps, what is narrow at the bandwidth, error budget and move, for the terminal."""
+    found = [*facts("margins", r), *facts("budget", r), *facts("move", r)]
+    return [plain(f"{name.lower():14s}{', '.join(filter(None, rest))}") for name, *rest in found]
 
 
 def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:

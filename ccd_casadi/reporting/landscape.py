@@ -44,7 +44,7 @@ def read_truths(path: Path, problem: CoDesignProblem) -> Truths:
         rows = [s for s in store.select() if len(s.theta) == count]
         for theta in dict.fromkeys(sample.theta for sample in rows):
             known = store.get_result(best_key(inner_hash, theta))
-            known = known or store.get_result(sample_key(inner_hash, theta, 0.0, 0.0))
+            known = known or store.get_result(sample_key(inner_hash, theta))
             if known is not None:
                 thetas.append(theta)
                 value = known["bandwidth"]

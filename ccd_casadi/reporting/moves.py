@@ -17,9 +17,9 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_loops
-from ccd_casadi.inner_problem.move_figures import FREE, motion_of
+from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants

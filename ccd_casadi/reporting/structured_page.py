@@ -8,12 +8,11 @@ from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_words import SectionWords, gain_words
+from ccd_casadi.inner_problem.sections_words import SectionWords
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
-from ccd_casadi.reporting.facts import binding, paragraph
+from ccd_casadi.reporting.facts import binding, gain_words, paragraph
 from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing
 
@@ -31,7 +30,7 @@ def bandwidths_table(verified: VerifiedStructured) -> Table:
     if sampling is not None:
         found = measure(
             scaled_plant(problem, verified.theta), design.controller, problem.weights,
-            gamma=UNBOUNDED, omega_low=problem.inner.omega_low,
+            omega_low=problem.inner.omega_low,
         )  # fmt: skip
         rows.append(("the model", "continuous", found.bandwidth))
     head = ("-3 dB of S with this controller, on", "loop", "Hz")

@@ -11,10 +11,8 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.survival import damping_range, excess_of, growth_of, shift_range
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
-from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.arrays import Array
@@ -67,53 +65,46 @@ def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Pert
     return PerturbedLoop(place, stable, figures.bandwidth, peak, figures.certificate.max_real_pole)
 
 
-def system_of(run: FinishedRun) -> Mechanics:
-    """The plant's matrices at the run's θ."""
-    return mechanics(plant_of(run.problem), run.theta)
-
-
-def shift_line(run: FinishedRun, system: Mechanics, reach: float, count: int = 41) -> Line:
+def shift_line(run: FinishedRun, reach: float, count: int = 41) -> Line:
     """All flexible frequencies times 1 + s, |s| <= reach."""
     shifts = np.unique(np.append(np.linspace(-reach, reach, count), 0.0))
     marks = [abs(end) for end in kind_of(run.problem).common_shifts()]
     places = {float(s): Perturbation(float(s)) for s in shifts}
-    return _line(run, system, places, 0.0, partial(shift_range, limit=reach, marks=marks),
+    return _line(run, places, 0.0, partial(shift_range, limit=reach, marks=marks),
                  Progress(len(places), "resonance shifts"))  # fmt: skip
 
 
-def damping_line(
-    run: FinishedRun, system: Mechanics, low: float, high: float, count: int = 41
-) -> Line:
+def damping_line(run: FinishedRun, low: float, high: float, count: int = 41) -> Line:
     """Damping times d, low <= d <= high; evenly in its logarithm."""
     factors = np.exp(np.unique(np.append(np.linspace(np.log(low), np.log(high), count), 0.0)))
     places = {float(d): Perturbation(0.0, float(d)) for d in factors}
-    return _line(run, system, places, 1.0, partial(damping_range, limits=(low, high)),
+    return _line(run, places, 1.0, partial(damping_range, limits=(low, high)),
                  Progress(len(places), "damping"))  # fmt: skip
 
 
 def _line(
-    run: FinishedRun, system: Mechanics, places: Mapping[float, Perturbation], model: float,
+    run: FinishedRun, places: Mapping[float, Perturbation], model: float,
     search: Callable[[LoopsOffModel, Figure], Ends], progress: Progress,
 ) -> Line:  # fmt: skip
     """The plants at these places, and between what the loop is stable, and within S_max, by the
     search that the verdict of a solve makes; `model`: its place, where not even there."""
-    loops = loops_off_model(system, run.problem.suspension, run.controller, run.sampling)
+    loops = loops_off_model(run.system, run.problem.suspension, run.controller, run.sampling)
     nominal, stable, within = loops.at(Perturbation()), (model, model), (model, model)
     excess = partial(excess_of, level=run.problem.inner.S_max * (1.0 + kind_of(run.problem).slack))
     if nominal.stable:
         stable = search(loops, growth_of)
         within = search(loops, excess) if excess(nominal) <= 0.0 else within
-    judged = [judge(run, modal_plant(system, run.problem.suspension, off), (place,))
+    judged = [judge(run, run.modal(off), (place,))
               for place, off in progress.over(places.items())]  # fmt: skip
     return Line(tuple(judged), stable, within)
 
 
-def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[PerturbedLoop, ...]:
+def single_modes(run: FinishedRun, reach: float) -> tuple[PerturbedLoop, ...]:
     """Every flexible mode that the loop drives and sees, alone, shifted by ±reach.
 
     Places are (frequency in Hz, shift).
     """
-    modal = modal_plant(system, run.problem.suspension)
+    modal = run.modal()
     residue = np.linalg.norm(modal.B, axis=1) * np.linalg.norm(modal.C, axis=0)
     found = []
     for i in np.flatnonzero(~modal.rigid & (residue > 1e-9 * residue.max())):
@@ -125,15 +116,13 @@ def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Per
     return tuple(found)
 
 
-def worst_in_box(
-    run: FinishedRun, system: Mechanics, reach: float, damping: tuple[float, float]
-) -> PerturbedLoop:
+def worst_in_box(run: FinishedRun, reach: float, damping: tuple[float, float]) -> PerturbedLoop:
     """The worst (shift, damping factor) of the box: a grid, then a local search from its worst."""
     low, high = np.array([-reach, np.log(damping[0])]), np.array([reach, np.log(damping[1])])
 
     def at(x: Array) -> PerturbedLoop:
         s, d = float(x[0]), float(np.exp(x[1]))
-        return judge(run, modal_plant(system, run.problem.suspension, Perturbation(s, d)), (s, d))
+        return judge(run, run.modal(Perturbation(s, d)), (s, d))
 
     grid = [np.array([s, d]) for s in np.linspace(low[0], high[0], 9)
             for d in np.linspace(low[1], high[1], 5)]  # fmt: skip

@@ -13,7 +13,7 @@ from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
+from ccd_casadi.plants.modal import FREE, ModalPlant, modal_plant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
@@ -23,7 +23,6 @@ from ccd_casadi.robust.perturbed import (
     damping_line,
     shift_line,
     single_modes,
-    system_of,
     worst_in_box,
 )
 from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
@@ -97,9 +96,9 @@ def robustness(
 
 
 def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
-    system, loop = system_of(run), run.loop_on(run.plant.plant_si())  # as it runs
-    sampled, modal = loop.sampling is not None, modal_plant(system, run.problem.suspension)
-    free, profile = modal_plant(system, Suspension(0.0, 0.0)), setpoint(d.limits)
+    loop = run.loop_on(run.plant.plant_si())  # as it runs
+    sampled, modal = loop.sampling is not None, run.modal()
+    free, profile = modal_plant(run.system, FREE), setpoint(d.limits)
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
     view = loop_view([loop], bounded, bandwidth_hz=omega_b / HZ)
@@ -116,10 +115,10 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
         margins=margins(loop.responses, hz),
         noise=noise(loop, d.sensor, d.disturbance),
         statics=statics(loop.plant, loop.controller, bandwidth=omega_b, omega_low=low),
-        shift=shift_line(run, system, d.shift),
-        damping=damping_line(run, system, *d.damping),
-        modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping),
+        shift=shift_line(run, d.shift),
+        damping=damping_line(run, *d.damping),
+        modes=single_modes(run, d.shift),
+        box=worst_in_box(run, d.shift, d.damping),
         tolerances=tolerances(run, d.tolerance, d.samples, seed, workers),
         structured=None if sampled else structured_bound(run.plant, modal, run.controller, hz),
         setpoint=profile,

@@ -117,14 +117,17 @@ def hashes_of(problem: CoDesignProblem) -> tuple[str, str]:
     return designs, problem_hash({"problem": designs, "inner": problem.inner_identity()})
 
 
-def sample_key(problem: str, theta: Sequence[float], omega_S: float, omega_T: float) -> str:
-    """The key of one synthesis of a problem, exact in every float."""
+def sample_key(
+    problem: str, theta: Sequence[float], omega_S: float = 0.0, omega_T: float = 0.0
+) -> str:
+    """The key of one synthesis of a problem, or of what is known at a whole θ (both ω 0), exact in
+    every float."""
     return problem_hash({"problem": problem, "theta": list(theta), "omega": [omega_S, omega_T]})
 
 
 def best_key(inner: str, theta: Sequence[float]) -> str:
     """That of the best found at a θ from other controllers than the inner problem's own."""
-    return sample_key(problem_hash({"best": inner}), theta, 0.0, 0.0)
+    return sample_key(problem_hash({"best": inner}), theta)
 
 
 def _canonical(value: object) -> object:

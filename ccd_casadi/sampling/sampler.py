@@ -7,7 +7,7 @@ end is stored whole (`kept`), with the controller, as it is made.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
@@ -136,16 +136,18 @@ class Sampler:
     def _solve(self, problems: Mapping[tuple[float, ...], CoDesignProblem], label: str) -> None:
         """The inner problem at every θ, and the better one kept of it and what is known."""
         owners = {theta: hashes_of(problem)[1] for theta, problem in problems.items()}
-        keys = {theta: sample_key(owners[theta], theta, 0.0, 0.0) for theta in problems}
+        keys = {theta: sample_key(owners[theta], theta) for theta in problems}
         payloads = {key: self.store.get_result(key) for key in keys.values()}
         missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
             tasks = [(problems[theta], self.hash, key, theta) for key, theta in missing.items()]
-            for key, (rows, payload) in self.workers.map_unordered(inner_unit, tasks):
+            alone = len(tasks) == 1 < self.workers.count  # then it may spread its own searches
+            unit = partial(inner_unit, workers=self.workers) if alone else inner_unit
+            for key, (rows, payload) in self.workers.map_unordered(unit, tasks):
                 theta = missing[key]
                 self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
                 if theta not in self.solved:  # who goes on from the store asks for it by this key
-                    own = sample_key(self.inner_hash, theta, 0.0, 0.0)
+                    own = sample_key(self.inner_hash, theta)
                     self.store.put_unit([], (own, self.inner_hash, theta, payload))
                 payloads[key] = payload
                 progress.advance()
@@ -202,7 +204,7 @@ class Sampler:
     def cached(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
         """What `make` gives at a point of this problem, once for all runs on the store."""
         owner = problem_hash({what: self.inner_hash})
-        return self.store.cached(sample_key(owner, point, 0.0, 0.0), owner, point, kind, make)
+        return self.store.cached(sample_key(owner, point), owner, point, kind, make)
 
     def _recorded(self, x: Array, make: Callable[[], Sensitivities]) -> Sensitivities:
         """A design made outside the pool (IPOPT on the true function): a row too, and counted."""

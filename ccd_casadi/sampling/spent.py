@@ -4,9 +4,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-# The words of the keys of `spent` in result.json that do not say it themselves.
-SHOWN = {"races": "multi-start searches", "box_look": "global check"}
-
 
 class SynthesisCounts:
     """Counts of true syntheses; `purpose` is what is being done."""
@@ -62,14 +59,3 @@ def with_all_spent(result: Mapping[str, Any], spent: Mapping[str, int]) -> dict[
     """A result of a run of several searches with what all of them took."""
     moved = bool(result.get("box_look", {}).get("moved"))  # the global check led to the design
     return {**result, **spent_entry(spent, moved)}
-
-
-def cost_words(result: Mapping[str, Any]) -> str:
-    """`700 syntheses (30 samples, 17 rounds, 653 global check), 6.1 s`.
-
-    >>> cost_words({"syntheses": 9, "spent": {"races": 2, "box_look": 7}, "seconds": 1.25})
-    '9 syntheses (2 multi-start searches, 7 global check), 1.2 s'
-    """
-    parts = [f"{count} {SHOWN.get(name, name)}" for name, count in result["spent"].items()]
-    inside = f" ({', '.join(parts)})" if parts else ""
-    return f"{result['syntheses']} syntheses{inside}, {result['seconds']:.1f} s"

@@ -1,1 +1,1 @@
-"""What reproduces a paper: its own method, the sequential design, and what they are set beside."""
+"""What one command computes: methods side by side, other back ends, plants that exist."""

@@ -7,7 +7,7 @@ notebook it is on stdout, since stderr is painted there as a failure.
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Self, TextIO, TypeVar
 
 from ccd_casadi.support.notebook import in_notebook
@@ -16,6 +16,7 @@ from ccd_casadi.support.terminal import QUIET, columns
 T = TypeVar("T")
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
+Tell = Callable[[str], None]  # what is given lines of progress
 
 
 class Progress:
@@ -100,6 +101,15 @@ class Progress:
             self.stream.flush()
         except (OSError, ValueError):
             self.silent = True  # closed, or a broken pipe
+
+
+def silent(words: str) -> None:
+    """Lines of progress that nobody reads."""
+
+
+def titled(tell: Tell, title: str) -> Tell:
+    """Lines of progress with what they are of."""
+    return lambda words: tell(f"{title}: {words}")
 
 
 def duration(seconds: float) -> str:

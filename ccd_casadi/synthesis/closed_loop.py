@@ -8,7 +8,13 @@ from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome, figures_from_row
+from ccd_casadi.synthesis.synthesis import (
+    UNBOUNDED,
+    Design,
+    DesignFigures,
+    Outcome,
+    figures_from_row,
+)
 from ccd_casadi.synthesis.weights import Weights
 
 EPS = 2.0**-52
@@ -20,14 +26,15 @@ def measure(
     controller: StateSpace,
     weights: Weights,
     *,
-    gamma: float,
     omega_low: float,
+    gamma: float = UNBOUNDED,
     gamma_opt: float = np.nan,
     gamma_lower_bound: float = np.nan,
 ) -> DesignFigures:
     """Rebuild the loop from an SI controller (e in, u out), certify it against `gamma`, measure S.
 
-    The figures end where the certificate fails; ω_low in rad/s.
+    The figures end where the certificate fails; ω_low in rad/s. Without `gamma` the norm is not
+    judged.
     """
     w0, row = plant.omega_0, np.full(int(Column.COUNT), np.nan)
     row[Column.GAMMA_OPT], row[Column.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound

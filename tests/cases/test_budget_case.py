@@ -14,10 +14,11 @@ from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.design_entries import budget_entry, budget_lines
+from ccd_casadi.codesign.design_entries import budget_entry
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.budget_chapter import budget_chapter
+from ccd_casadi.reporting.facts import loop_lines
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import synthesise
@@ -118,7 +119,7 @@ def test_the_budget_of_a_design_in_result_terminal_and_page(tmp_path: Path) -> N
     assert budget["error_rms"] ** 2 == pytest.approx(squares)
     assert budget["error_rms_largest"] == pytest.approx(budget["error_rms"])
     assert budget["disagreement"] < 1e-5
-    (line,) = budget_lines({"budget": budget})
+    (line,) = loop_lines({"budget": budget})
     assert "cables has" in line
     (section,) = budget_chapter(problem, (55.0, 55.0), made.controller)
     for name in ("cables", "amplifier", "floor motion", "sensor noise", "setpoint", "together"):
@@ -126,7 +127,7 @@ def test_the_budget_of_a_design_in_result_terminal_and_page(tmp_path: Path) -> N
     none = replace(problem, budget=None)
     assert budget_entry(none, (55.0, 55.0), made.controller) == {}
     assert budget_chapter(none, (55.0, 55.0), made.controller) == []
-    assert budget_lines({}) == []
+    assert loop_lines({}) == []
 
 
 def test_the_rms_of_a_spectrum_is_its_integrals_root() -> None:

@@ -66,7 +66,7 @@ def looked(
     )
     outer = SimpleNamespace(
         problem=case, sampler=sampler, global_check_is_cheap=False, kkt_level=1e-2,
-        theta_of=lambda x: x, local_solve=local_solve,
+        theta_of=lambda x: x, local_solve=local_solve, promising=lambda thetas, _: thetas,
     )  # fmt: skip
     here, kkt = path[-1], SimpleNamespace(stationarity=0.0)
     end = SimpleNamespace(x=np.array(here.theta), objective=objective_of(case, here), kkt=kkt)

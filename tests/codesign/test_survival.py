@@ -221,7 +221,7 @@ def test_neither_the_set_nor_the_range_denies_the_other(
     loops, S_max = loops_and_bound(case, seed)
     whole = problem(robust=RobustSet(reach, 5, factors, 0.0))
     whole = replace(whole, inner=replace(whole.inner, S_max=S_max))
-    found, check = survived(whole, loops, CROSSOVER)
+    found, check = survived(whole, loops, SimpleNamespace(certified=True, bandwidth=CROSSOVER))
     assert check is not None
     within = found.within(-reach, reach)
     assert check.passed <= within
@@ -296,11 +296,13 @@ def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: boo
         ),
         controller=loops.run,
         sampling=sampling,
+        system=case.system(),
+        modal=lambda *off: modal_plant(case.system(), SUSPENSION, *off),
     )
     good = perturbed.PerturbedLoop((0.0,), True, 1.0, 1.0, -1.0)
     with mock.patch.object(perturbed, "judge", return_value=good):
-        line = perturbed.shift_line(run, case.system(), REACH, 2)
-        damped = perturbed.damping_line(run, case.system(), *FACTORS, 2)
+        line = perturbed.shift_line(run, REACH, 2)
+        damped = perturbed.damping_line(run, *FACTORS, 2)
     assert line.stable == pytest.approx(found.stable_shift, rel=1e-3, abs=1e-6)
     assert line.within == pytest.approx(found.S_max_shift, rel=1e-3, abs=1e-6)
     assert damped.stable == pytest.approx(found.stable_damping, rel=1e-3)

@@ -41,7 +41,7 @@ from ccd_casadi.reporting import verdict as shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from ccd_casadi.synthesis.statics import Statics
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
+from ccd_casadi.synthesis.synthesis import synthesise
 
 ROOT = Path(__file__).parents[2]
 KKT_LEVEL = VerifiedDesign.kkt_level
@@ -161,9 +161,10 @@ def corner_design() -> tuple[Survival, float]:
         problem().weights.at(*WEIGHTS),
         omega_low=problem().inner.omega_low,
     )
-    bandwidth = made.figures.bandwidth
     loops = loops_of(problem(), CORNER, made.controller)
-    return survived(problem(), loops, bandwidth)[0], bandwidth
+    found = survived(problem(), loops, made.figures)[0]
+    assert found is not None
+    return found, made.figures.bandwidth
 
 
 def test_the_range_found_is_where_stability_is_lost() -> None:
@@ -179,7 +180,7 @@ def test_the_range_found_is_where_stability_is_lost() -> None:
         system = mechanics(problem_plant(), CORNER)
         modal = modal_plant(system, problem().suspension, Perturbation(shift=shift))
         plant = scale_plant(modal, problem().weights.M_K)
-        loop = measure(plant, made.controller, made.weights, gamma=UNBOUNDED, omega_low=2.0 * np.pi)
+        loop = measure(plant, made.controller, made.weights, omega_low=2.0 * np.pi)
         return loop.certificate.stable
 
     low, high = found.stable_shift

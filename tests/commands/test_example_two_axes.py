@@ -19,9 +19,9 @@ from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_words import channel_words
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_search import prepared
+from ccd_casadi.reporting.facts import channel_words
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.errors import UserError
 

@@ -35,7 +35,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, synthesise
+from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 ROOT = Path(__file__).parents[2]
 QUICK = ["--quiet"]
@@ -111,7 +111,7 @@ def test_every_order_is_measured_on_the_true_loop(two_mass_run: Path) -> None:
     for row in rows:
         assert len(row.controller.A) == row.order
         again = measure(
-            run.plant, row.controller, run.weights, gamma=UNBOUNDED, omega_low=OMEGA_LOW
+            run.plant, row.controller, run.weights, omega_low=OMEGA_LOW
         )
         np.testing.assert_equal(again.sensitivity_peak, row.figures.sensitivity_peak)
     S_max = run.problem.inner.S_max

@@ -28,7 +28,6 @@ from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 GANTRY = """
 def gantry(theta, load=0.0):
@@ -103,7 +102,7 @@ def run_by_hand(folder: Path, harder: float = 1.0) -> FinishedRun:
     kappa = np.log([HAND[name.split(": ")[1]] for name in structure.names])
     kappa[structure.slices[1].start] += np.log(harder)
     plant, K = scaled_plant(problem, problem.start), structure.state_space(kappa)
-    figures = measure(plant, K, problem.weights, gamma=UNBOUNDED, omega_low=HZ)
+    figures = measure(plant, K, problem.weights, omega_low=HZ)
     result = {"status": "verified", "theta": dict(zip(problem.names, problem.start, strict=True))}
     return FinishedRun(folder, case, problem, problem.start, plant, problem.weights, K, figures,
                        result, kappa=kappa)  # fmt: skip

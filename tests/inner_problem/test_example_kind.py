@@ -33,7 +33,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.units import UNITS, Unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
+from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
 STEP = 1e-5  # relative, of central differences
@@ -71,7 +71,7 @@ class ByRule(InnerKind):
         plant, inner = scaled_plant(self.problem, theta), self.problem.inner
         K = pid(plant, made.share)
         weights = self.problem.weights
-        return K, measure(plant, K, weights, gamma=UNBOUNDED, omega_low=inner.omega_low)
+        return K, measure(plant, K, weights, omega_low=inner.omega_low)
 
     def value(self, theta: Sequence[float]) -> tuple[float, Array]:
         figures = self.at(theta)[1]
@@ -91,7 +91,9 @@ class ByRule(InnerKind):
         raise AssertionError("no page is drawn here")
 
 
-def rule_unit(case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]) -> Unit:
+def rule_unit(
+    case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...], workers: object
+) -> Unit:
     """One θ for the store."""
     value, slope = KINDS[RuleOfThumb](case).value(theta)
     feasible = bool(np.isfinite(value))
@@ -128,9 +130,6 @@ class VerifiedRule(Verified):
     def certified_line(self) -> VerdictLine:
         state = State.PASSED if self.feasible else State.FAILED
         return VerdictLine(state, "stable and within S_max and S_low on the model", {})
-
-    def survives_line(self) -> VerdictLine:
-        return VerdictLine(State.UNKNOWN, "not looked at", {})
 
     def gap_words(self) -> str:
         return ""

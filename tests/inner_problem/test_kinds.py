@@ -19,7 +19,6 @@ from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
 from ccd_casadi.codesign import outer_mixed, outer_structured
 from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.inner_answer import measured_answer
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
@@ -31,6 +30,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.sampling import sampler
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.studies.measured_answer import measured_answer
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.synthesis import derivatives, synthesis
 

@@ -20,7 +20,7 @@ from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.solve import main
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures, Outcome, sweep, synthesise
+from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, sweep, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 RUNS = Path(__file__).parents[2] / "runs"
@@ -187,7 +187,7 @@ def over_shifts(run: FinishedRun, count: int = 61) -> list[DesignFigures]:
     for shift in np.linspace(-0.03, 0.03, count):
         plant = scale_plant(shifted(system, run.theta, float(shift)), run.weights.M_K)
         low = run.problem.inner.omega_low
-        found.append(measure(plant, run.controller, run.weights, gamma=UNBOUNDED, omega_low=low))
+        found.append(measure(plant, run.controller, run.weights, omega_low=low))
     return found
 
 

@@ -40,7 +40,7 @@ from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
+from ccd_casadi.synthesis.synthesis import synthesise
 from surrogates.retrain import main as retrain_main
 
 COMMON = ["--quiet", "--workers", "1"]
@@ -305,7 +305,7 @@ def test_no_structure_has_a_stacked_norm_below_gamma_opt() -> None:
         assert len(stable) > 3
         for kappa in stable:
             K = structure.state_space(structure.in_units(kappa, plant.omega_0, plant.force))
-            found = measure(plant, K, weights, gamma=UNBOUNDED, omega_low=weights.omega_T)
+            found = measure(plant, K, weights, omega_low=weights.omega_T)
             stacked = found.certificate.norm if found.certificate.stable else np.inf
             assert stacked >= least * (1.0 - 1e-6)
 

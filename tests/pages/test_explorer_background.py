@@ -39,7 +39,7 @@ def test_the_background_tells_answers_and_outlives_the_death_of_its_process() ->
     came: Queue[object] = Queue()
     background = Background()
     for task in (2, 0, -1, 3):
-        background.ask(told_and_done, task, came.put, came.put, heard.append)
+        background.answer(background.ask(told_and_done, task, heard.append), came.put, came.put)
     first, failed, lost, last = (came.get(timeout=60.0) for _ in range(4))
     background.close()
     assert (first, last) == (3, 2)

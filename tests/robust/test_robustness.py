@@ -23,13 +23,7 @@ from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting.robustness_page import _bandwidth_lost
 from ccd_casadi.robust.hardware import tolerances
 from ccd_casadi.robust.margins import margins
-from ccd_casadi.robust.perturbed import (
-    damping_line,
-    shift_line,
-    single_modes,
-    system_of,
-    worst_in_box,
-)
+from ccd_casadi.robust.perturbed import damping_line, shift_line, single_modes, worst_in_box
 from ccd_casadi.robust.signals import gains, noise
 from ccd_casadi.robust.structured import structured_bound
 from ccd_casadi.robustness import main
@@ -138,12 +132,12 @@ def test_rms_values_against_integrals_over_frequency(run: FinishedRun) -> None:
 
 
 def shifted_stable(run: FinishedRun, shift: float) -> bool:
-    modal = modal_plant(system_of(run), run.problem.suspension, Perturbation(shift))
+    modal = run.modal(Perturbation(shift))
     return stable(scale_plant(modal, run.weights.M_K).plant_si(), run.controller)
 
 
 def test_the_ends_of_a_line_are_where_the_loop_is_lost(run: FinishedRun) -> None:
-    line = shift_line(run, system_of(run), 0.05, 21)
+    line = shift_line(run, 0.05, 21)
     low, high = line.stable
     assert -0.0077 < low < -0.0075  # the nominal design of case study 1 stands 0.76 %
     assert shifted_stable(run, low + 1e-6)
@@ -151,18 +145,18 @@ def test_the_ends_of_a_line_are_where_the_loop_is_lost(run: FinishedRun) -> None
     assert high == 0.05
     assert line.within[0] <= 0.0 <= line.within[1] < high
     assert len(line.judged) == 21
-    damped = damping_line(run, system_of(run), 0.5, 2.0, 7)
+    damped = damping_line(run, 0.5, 2.0, 7)
     assert damped.stable == pytest.approx((0.5, 2.0))
     # this plant has one flexible mode: alone it is all of them
-    alone = single_modes(run, system_of(run), 0.05)
+    alone = single_modes(run, 0.05)
     assert [item.stable for item in alone] == [False, True]
     # its damping matrix stays where the frequency moves, so both ways are the same plant
     assert alone[1].peak == pytest.approx(line.judged[-1].peak, rel=1e-9)
 
 
 def test_the_worst_of_a_box_is_worse_than_all_that_was_seen(run: FinishedRun) -> None:
-    line = shift_line(run, system_of(run), 0.006, 9)
-    worst = worst_in_box(run, system_of(run), 0.006, (0.8, 1.25))
+    line = shift_line(run, 0.006, 9)
+    worst = worst_in_box(run, 0.006, (0.8, 1.25))
     assert worst.badness >= max(item.badness for item in line.judged)
     assert abs(worst.place[0]) <= 0.006 * (1.0 + 1e-12)
     assert 0.8 * (1 - 1e-12) <= worst.place[1] <= 1.25 * (1 + 1e-12)
@@ -184,10 +178,10 @@ def test_random_hardware_repeats_and_its_worst_is_at_a_corner(run: FinishedRun) 
 
 def test_the_structured_bound_is_one_and_no_loose_one(run: FinishedRun) -> None:
     """One mode: the true limit is the shift at which stability is lost."""
-    modal = modal_plant(system_of(run), run.problem.suspension)
+    modal = run.modal()
     bound = structured_bound(run.plant, modal, run.controller, np.geomspace(0.2, 3000.0, 200))
     assert bound is not None
-    lost = shift_line(run, system_of(run), 0.05, 21).stable[0]
+    lost = shift_line(run, 0.05, 21).stable[0]
     # by so much a grid may miss it
     assert bound.stiffness == pytest.approx(1.0 - (1.0 + lost) ** 2, rel=1e-4)
     assert bound.shift == pytest.approx(np.sqrt(1.0 + bound.stiffness) - 1.0)

@@ -109,9 +109,7 @@ def test_a_dense_table_of_a_filter_has_the_filters_budget(sampling: Sampling | N
         hz = np.geomspace(1e-2, 1e4, 500)
         table = TabulatedSpectrum(tuple(hz), tuple(source.spectrum.at(hz)))
         other = replace(source, spectrum=table)
-        G, K = made.plant, made.controller
-        pair = [evaluate_budget(G, K, ErrorBudget((one,), WINDOW), made.sampling)
-                for one in (source, other)]  # fmt: skip
+        pair = [evaluate_budget(made, ErrorBudget((one,), WINDOW)) for one in (source, other)]
         figures = [[one.error, one.average, one.deviation, one.force] for one in pair]
         np.testing.assert_allclose(figures[1], figures[0], rtol=1e-3)
 
@@ -272,7 +270,7 @@ def test_the_matrix_of_the_moving_average_is_its_sum() -> None:
 
 def test_sources_add_in_squares_and_scale() -> None:
     made, _, _ = built(None)
-    whole = evaluate_budget(made.plant, made.controller, ErrorBudget((*SHAPED, *TABLES), WINDOW))
+    whole = evaluate_budget(made, ErrorBudget((*SHAPED, *TABLES), WINDOW))
     assert whole is not None
     squares = sum(item.error**2 for item in whole.sources)
     np.testing.assert_allclose(whole.error**2, squares, rtol=1e-12)
@@ -281,7 +279,7 @@ def test_sources_add_in_squares_and_scale() -> None:
         assert (np.diff(item.cumulative) >= 0.0).all()
         np.testing.assert_allclose(np.sqrt(item.cumulative[-1]), item.error, rtol=1e-6)
     twice = ErrorBudget(tuple(map(doubled, (*SHAPED, *TABLES))), WINDOW)
-    double = evaluate_budget(made.plant, made.controller, twice)
+    double = evaluate_budget(made, twice)
     assert double is not None
     np.testing.assert_allclose([double.error, double.force], [2 * whole.error, 2 * whole.force])
 
@@ -296,9 +294,9 @@ def test_white_noise_that_reaches_the_force_undamped_has_no_rms() -> None:
 def test_an_unstable_loop_has_no_budget() -> None:
     made, _, _ = built(None)
     K = made.controller
-    wrong = StateSpace(K.A, K.B, -K.C, -K.D)
-    assert (Loop(made.plant, wrong).poles.real > 0.0).any()
-    assert evaluate_budget(made.plant, wrong, ErrorBudget(SHAPED)) is None
+    wrong = Loop(made.plant, StateSpace(K.A, K.B, -K.C, -K.D))
+    assert (wrong.poles.real > 0.0).any()
+    assert evaluate_budget(wrong, ErrorBudget(SHAPED)) is None
 
 
 @pytest.mark.parametrize("wrong", [

@@ -22,7 +22,12 @@ from ccd_casadi.limitations.bound import lower_bound, upper_bound
 from ccd_casadi.limitations.certificate import rules_out, support, support_of
 from ccd_casadi.limitations.discs import circle, discs, ratio
 from ccd_casadi.limitations.limits import limits_of, response_of
-from ccd_casadi.limitations.of_problem import gap_of, limits_of_problem, opposite_corners
+from ccd_casadi.limitations.of_problem import (
+    gap_of,
+    limits_of_problem,
+    none_reaches,
+    opposite_corners,
+)
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
@@ -212,8 +217,11 @@ def test_two_plants_of_the_set_forbid_more_than_the_model() -> None:
     found = gap_of(problem, (55.0, 55.0), within=False)
     (model,) = limits_of_problem(problem, (55.0, 55.0))
     assert 48.04 * HZ < found.upper_bound < 1.3 * 48.04 * HZ
-    assert found.upper_bound < 0.95 * upper_bound(model)
+    of_model = upper_bound(model)
+    assert found.upper_bound < 0.95 * of_model
     assert found.plants == "the set"
+    reached = [none_reaches(problem, (55.0, 55.0), w) for w in (48.04 * HZ, 1.02 * of_model)]
+    assert reached == [False, True]
 
 
 def test_the_command_prints_the_bounds(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.studies.backends import StandardPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.backends import StandardPlant
 
 Rows = list[list[float]]
 

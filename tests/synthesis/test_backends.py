@@ -21,8 +21,7 @@ from ccd_casadi.cross_check import main
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space
-from ccd_casadi.support.errors import MissingPackage, require
-from ccd_casadi.synthesis.backends import (
+from ccd_casadi.studies.backends import (
     AGREE,
     SOLVERS,
     BackendResult,
@@ -31,6 +30,7 @@ from ccd_casadi.synthesis.backends import (
     synthesise_with,
     verdicts,
 )
+from ccd_casadi.support.errors import MissingPackage, require
 
 ROOT = Path(__file__).resolve().parents[2]
 

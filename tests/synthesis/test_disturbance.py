@@ -25,7 +25,7 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
-from ccd_casadi.synthesis.backends import balance, mixed_sensitivity
+from ccd_casadi.studies.backends import balance, mixed_sensitivity
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.statics import statics
 from ccd_casadi.synthesis.synthesis import Design, synthesise
@@ -143,7 +143,7 @@ def test_one_riccati_equation_stands_for_two_and_their_coupling(seed: int, p: in
 
 def test_gamma_opt_is_that_of_sb10ad() -> None:
     pytest.importorskip("slycot")
-    from ccd_casadi.synthesis.backends import solve_slicot
+    from ccd_casadi.studies.backends import solve_slicot
 
     compared = 0
     for seed in range(6):

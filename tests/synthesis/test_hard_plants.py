@@ -8,8 +8,8 @@ from benchmark_scripts import benchmark
 from hard_plants import HARD, close, regularised
 
 from ccd_casadi.lti.norms import gains
+from ccd_casadi.studies.backends import solve_slicot
 from ccd_casadi.support.worker_process import Runner
-from ccd_casadi.synthesis.backends import solve_slicot
 
 pytest.importorskip("cvxpy")
 pytest.importorskip("slycot")

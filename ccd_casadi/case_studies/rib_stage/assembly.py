@@ -24,15 +24,27 @@ COPIES = 4  # quarters in the stage
 @dataclass(frozen=True)
 class Pattern:
     """Rows and columns of the lower half of a CSR matrix, and which entries of the boxes its data
-    are sums of: of a fine mesh all of them are half a gigabyte more."""
+    are sums of, in as few bytes as hold them: those of a fine mesh are millions.
+
+    A datum is Σ sign · entry, times √½ for its row and for its column where these are `shared`
+    (`Fold.shared`). `signs` are ±1 and ±2 (int8), at `boxes`; `counts` of them make a datum.
+    """
 
     indices: np.ndarray
     indptr: np.ndarray
-    sums: sparse.csr_matrix  # (data, entries of the concatenated matrices of the boxes)
+    shared: np.ndarray
+    signs: np.ndarray
+    boxes: np.ndarray
+    counts: np.ndarray
 
     def fill(self, values: Array) -> sparse.csr_matrix:
-        """The symmetric matrix with these box entries."""
-        size, data = len(self.indptr) - 1, self.sums @ values
+        """The symmetric matrix with these entries of the boxes, concatenated."""
+        size, first = len(self.indptr) - 1, np.zeros(len(self.counts) + 1, np.int32)
+        np.cumsum(self.counts, out=first[1:])
+        shape = (len(self.counts), len(values))
+        data = sparse.csr_matrix((self.signs, self.boxes, first), shape=shape) @ values
+        halves = np.repeat(self.shared, np.diff(self.indptr)) + self.shared[self.indices]
+        data *= np.array([1.0, np.sqrt(0.5), 0.5])[halves]
         data[self.indptr[1:] - 1] *= 0.5  # the diagonal, which both halves have
         lower = sparse.csr_matrix((data, self.indices, self.indptr), shape=(size, size))
         return lower + lower.T.tocsr()
@@ -150,8 +162,7 @@ def build_sector(assembler: Assembler, symmetry: Symmetry) -> Sector:
             image = swap[places]
             maps.append((box, image, folded.weight[image], 1))
     sizes = [3 * len(block.nodes) for block in assembler.blocks]
-    stiffness = _pattern(maps, folded, sizes, 1)
-    mass = _pattern(maps, folded, sizes, 3)
+    stiffness, mass = (_pattern(maps, folded, sizes, stride) for stride in (1, 3))
     return Sector(folded, stiffness, mass, tuple(maps))
 
 
@@ -160,11 +171,12 @@ def _pattern(
 ) -> Pattern:
     """Stride 1: every pair of displacements; 3: pairs of one component, boxes being scalar."""
     starts = np.concatenate([[0], np.cumsum([(size // stride) ** 2 for size in sizes])])
-    rows, columns, boxes, weights = [], [], [], []
+    rows, columns, boxes, signs = [], [], [], []
     for box, places, weight, copies in maps:
         for part in range(stride):
             # a mirror image swaps components within a node: part still names one of the box's
-            index, w = folded.index[places[part::stride]], weight[part::stride]
+            index = folded.index[places[part::stride]]
+            w = np.sign(weight[part::stride]).astype(np.int8)
             live = np.flatnonzero(index >= 0)
             n = len(index)
             i, j = np.repeat(live, len(live)), np.tile(live, len(live))
@@ -173,23 +185,17 @@ def _pattern(
             rows.append(index[i].astype(np.int32))
             columns.append(index[j].astype(np.int32))
             boxes.append((starts[box] + i * n + j).astype(np.int32))
-            weights.append(_exact(copies * w[i] * w[j]))
+            signs.append(np.int8(copies) * w[i] * w[j])
     row, column = np.concatenate(rows), np.concatenate(columns)
     order = _sorted_by(column, folded.size)
     order = order[_sorted_by(row[order], folded.size)]
     row, column = row[order], column[order]
     first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(column, prepend=-1) != 0))
-    sums = sparse.csr_matrix(
-        (
-            np.concatenate(weights)[order],
-            np.concatenate(boxes)[order],
-            np.append(first, len(order)).astype(np.int32),
-        ),
-        shape=(len(first), int(starts[-1])),
-    )
-    counts = np.bincount(row[first], minlength=folded.size)
-    indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    return Pattern(column[first], indptr, sums)
+    counts = np.diff(np.append(first, len(order))).astype(np.uint8)
+    filled = np.bincount(row[first], minlength=folded.size)
+    indptr = np.concatenate([[0], np.cumsum(filled)]).astype(np.int32)
+    added = np.concatenate(signs)[order], np.concatenate(boxes)[order]
+    return Pattern(column[first], indptr, folded.shared, *added, counts)
 
 
 def _sorted_by(key: np.ndarray, size: int) -> np.ndarray:
@@ -199,9 +205,3 @@ def _sorted_by(key: np.ndarray, size: int) -> np.ndarray:
         (np.ones(count, dtype=bool), key, np.arange(count + 1, dtype=np.int32)), shape=(count, size)
     )
     return bins.tocsc().indices
-
-
-def _exact(products: Array) -> Array:
-    """Products of ±1, ±√½ and 2 without their rounding: their squares are powers of 2."""
-    powers = np.round(2.0 * np.log2(np.abs(products)))
-    return np.sign(products) * np.sqrt(np.exp2(powers))

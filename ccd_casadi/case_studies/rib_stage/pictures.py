@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from ccd_casadi.drawing.pictures import ModeShape, ModeShapes, outer_faces
 from ccd_casadi.support.arrays import Array
 
 QUADRANTS = ((False, False), (True, False), (True, True), (False, True))
+MOST = 6  # modes that a page shows
 CLOSEST = 0.02  # share of the side; drawn points keep this distance inside a bay
 SHAPES = {  # by symmetry; the diagonal and the mirrors of the square tell them apart
     "A1": "bowl",
@@ -37,15 +39,22 @@ FACES = (
 )
 
 
-def mode_shapes(stage: RibStage, theta: Sequence[float], count: int = 6) -> ModeShapes:
+def mode_shapes(stage: RibStage, theta: Sequence[float], count: int = MOST) -> ModeShapes:
     """The `count` lowest different flexible modes, whatever the model keeps; lowest first.
 
     A pair of equal frequency, which a quarter turn makes of each other, is one of them.
     """
+    found = _lowest_shapes(stage, tuple(float(v) for v in theta), max(count, MOST))
+    return replace(found, modes=found.modes[:count])
+
+
+@lru_cache(maxsize=2)
+def _lowest_shapes(stage: RibStage, theta: tuple[float, ...], count: int) -> ModeShapes:
+    """A page draws a few of them here and more there: the elements are solved once."""
     # the modes of the model are not the lowest of all; at worst every picture stands for a pair
     total = 2 * count if has_square_symmetry(stage.geometry) else count
     whole = replace(stage, truncation="frequency", modes=ModeCount(total, 0, 0, 0, 0))
-    here = np.array([float(v) for v in theta])
+    here = np.array(theta)
     mesh = discretisation(whole).assembler.mesh
     points, first, faces = _surface(mesh, here, stage)
     corners = np.isclose(np.abs(points), (*[0.5 * stage.geometry.side] * 2, 0.0)).all(axis=1)

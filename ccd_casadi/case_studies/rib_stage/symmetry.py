@@ -55,6 +55,13 @@ class Fold:
         entries = (self.weight[live], (live, self.index[live]))
         return sparse.csr_matrix(entries, shape=(len(self.index), self.size))
 
+    @cached_property
+    def shared(self) -> np.ndarray:
+        """(size,) int8: 1 where two displacements have √½ of it each."""
+        found = np.zeros(self.size, np.int8)
+        found[self.index[(self.index >= 0) & (np.abs(self.weight) < 1.0)]] = 1
+        return found
+
 
 def swap_displacements(mesh: Mesh) -> np.ndarray:
     """(3 nodes,) the displacement that the diagonal mirror makes of each one."""

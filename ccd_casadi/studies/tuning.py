@@ -4,7 +4,6 @@ A model becomes lines, hold and delay exact, and is designed on as a measured re
 end it is a model again: the poles of the sampled loop and ‖S‖∞ by a Hamiltonian matrix decide.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis import interchange
 
@@ -72,7 +72,7 @@ def tune(
     structure: Structure | None = None,
     starts: int = 24,
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    progress: Tell | None = None,
     workers: Pool | None = None,
 ) -> Tuned:
     """The largest bandwidth of integrator, lead, notches and a second-order roll-off.
@@ -131,7 +131,7 @@ def tune(
     for _ in range(ROUNDS):
         aim = replace(bounds, S_max=S_max - inside)
         design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
-                                effort=effort, given_up=GIVEN_UP, progress=progress,
+                                effort=effort, given_up=GIVEN_UP, progress=progress or silent,
                                 workers=workers)  # fmt: skip
         peaks = [None if G is None else _peak(G, design.controller) for G in models]
         over = [(i, *peak) for i, peak in enumerate(peaks) if peak and not peak[0] <= S_max]
