@@ -187,7 +187,8 @@ def survives(
     closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
 ) -> VerdictLine:
-    """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none).
+    """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none;
+    `robust_words` are then a warning).
 
     `other_damping`: what that set does not keep, in words; `closer` models of the plant by name:
     stable, and the peak of S; `figures`: more of them.
@@ -196,7 +197,7 @@ def survives(
         if robust is False:
             return VerdictLine(State.FAILED, robust_words, figures or {})
         return VerdictLine(State.UNKNOWN, "the loop could not be perturbed", figures or {})
-    state, said = State.PASSED, []
+    state, said = State.WARNED if robust is None and robust_words else State.PASSED, []
     low, high = survival.stable_shift
     said.append(f"stable for resonances {_range(low, high)}")
     if low > -LEAST_SHIFT or high < LEAST_SHIFT:

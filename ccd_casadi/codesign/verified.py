@@ -16,7 +16,7 @@ from ccd_casadi.codesign.design_entries import controller_dict
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
-from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence
+from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence, survives
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
@@ -97,9 +97,16 @@ class Verified(ABC):
     def certified_line(self) -> VerdictLine:
         """What its certificate rests on."""
 
-    @abstractmethod
     def survives_line(self) -> VerdictLine:
-        """Whether the case's own set of plants is kept, and closer models."""
+        """What the loop survives off its model, and whether the case's own set is kept."""
+        damping = "" if self.damping is None else self.damping.words
+        return survives(
+            self.survival, S_max=self.problem.inner.S_max, other_damping=damping, **self.own_set()
+        )
+
+    def own_set(self) -> dict[str, Any]:
+        """What `survives` takes of the case's own set of plants, and of closer models."""
+        return {}
 
     @abstractmethod
     def gap_words(self) -> str:

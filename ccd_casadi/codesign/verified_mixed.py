@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from ccd_casadi.codesign.design_entries import mixed_dict
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
-from ccd_casadi.codesign.verdict import State, VerdictLine, survives
+from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -110,18 +110,14 @@ class VerifiedDesign(Verified):
         good = design.certified and self.feasible
         return VerdictLine(State.PASSED if good else State.FAILED, words, figures)
 
-    def survives_line(self) -> VerdictLine:
-        return survives(
-            self.survival,
-            S_max=self.problem.inner.S_max,
-            robust=None if self.robust is None else self.robust.passed,
-            robust_words="" if self.robust is None else self.robust.words,
-            other_damping="" if self.damping is None else self.damping.words,
-            closer=[
-                (check.name, check.figures.certificate.stable, check.figures.sensitivity_peak)
-                for check in self.references
-            ],
-        )
+    def own_set(self) -> dict[str, Any]:
+        found = [
+            (check.name, check.figures.certificate.stable, check.figures.sensitivity_peak)
+            for check in self.references
+        ]
+        if self.robust is None:
+            return {"closer": found}
+        return {"robust": self.robust.passed, "robust_words": self.robust.words, "closer": found}
 
     def gap_words(self) -> str:
         return f"other weights at the same theta give {100 * self.inner_gap:.2g} % more bandwidth"

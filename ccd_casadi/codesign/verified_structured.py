@@ -14,7 +14,7 @@ from ccd_casadi.codesign.structured_entries import (
     robust_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.verdict import State, VerdictLine, survives
+from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
@@ -177,7 +177,7 @@ class VerifiedStructured(Verified):
         words = f"stable and within every bound on {where} that it was designed on"
         return VerdictLine(State.PASSED, words, figures)
 
-    def survives_line(self) -> VerdictLine:
+    def own_set(self) -> dict[str, Any]:
         excess, proof = math.expm1(self.worst.value), self.proof
         drawn = "" if self.drawn is None else self.drawn.words
         figures = {
@@ -202,16 +202,7 @@ class VerifiedStructured(Verified):
             words = "; ".join(part for part in (words, drawn, proof.words) if part)
         else:
             words = f"within every bound on {where}, but not all along its common resonance shift"
-        line = survives(
-            self.survival,
-            S_max=self.problem.inner.S_max,
-            robust=robust,
-            robust_words=words,
-            other_damping="" if self.damping is None else self.damping.words,
-            figures=figures,
-        )
-        state = State.WARNED if robust is None and line.state is State.PASSED else line.state
-        return VerdictLine(state, line.words, line.figures)
+        return {"robust": robust, "robust_words": words, "figures": figures}
 
     def gap_words(self) -> str:
         figure = self.problem.figure

@@ -7,7 +7,7 @@ end is stored whole (`kept`), with the controller, as it is made.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
@@ -141,7 +141,9 @@ class Sampler:
         missing = {keys[theta]: theta for theta in problems if not payloads[keys[theta]]}
         with Progress(len(missing), label, quiet=self.quiet) as progress:
             tasks = [(problems[theta], self.hash, key, theta) for key, theta in missing.items()]
-            for key, (rows, payload) in self.workers.map_unordered(inner_unit, tasks):
+            alone = len(tasks) == 1 < self.workers.count  # then it may spread its own searches
+            unit = partial(inner_unit, workers=self.workers) if alone else inner_unit
+            for key, (rows, payload) in self.workers.map_unordered(unit, tasks):
                 theta = missing[key]
                 self.store.put_unit(rows, (key, owners[theta], theta, payload), self.hash)
                 if theta not in self.solved:  # who goes on from the store asks for it by this key

@@ -16,20 +16,27 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult
 from ccd_casadi.sampling.rows import Sample, sample_key
 from ccd_casadi.sampling.samples import sample_of
+from ccd_casadi.support.process_pool import Pool
 
 NOTHING = (np.nan, np.nan)
 Unit = tuple[list[Sample], dict]  # rows of the store, and payload of the inner problem
 
 
-def inner_unit(task: tuple[CoDesignProblem, str, str, tuple[float, ...]]) -> tuple[str, Unit]:
-    """Solve the inner problem at one θ; every synthesis becomes a row. First the unit's key."""
+def inner_unit(
+    task: tuple[CoDesignProblem, str, str, tuple[float, ...]], workers: Pool | None = None
+) -> tuple[str, Unit]:
+    """Solve the inner problem at one θ; every synthesis becomes a row. First the unit's key.
+
+    `workers`: those that have nothing else to do.
+    """
     problem, problem_key, key, theta = task
-    return key, UNITS[type(problem.controller)](problem, problem_key, key, theta)
+    return key, UNITS[type(problem.controller)](problem, problem_key, key, theta, workers)
 
 
 def mixed_unit(
-    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]
-) -> Unit:
+    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...],
+    workers: Pool | None = None,
+) -> Unit:  # fmt: skip
     """The search of (ω_S, ω_T) at one θ."""
     began = perf_counter()
     result = true_inner(problem, theta)
@@ -61,10 +68,11 @@ def unit_of(
 
 
 def structured_unit(
-    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]
-) -> Unit:
+    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...],
+    workers: Pool | None = None,
+) -> Unit:  # fmt: skip
     """The best design of a fixed structure at one θ: one row, without weights' frequencies."""
-    value = structured_value(problem, theta)
+    value = structured_value(problem, theta, workers)
     design, judged = value.design, value.design.certificate
     peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]
     highest = max(((plant.S_peak, plant.S_peak_frequency) for plant in peaks), default=NOTHING)
@@ -98,8 +106,10 @@ def structured_unit(
 
 
 # One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
-UNITS: dict[type[ControllerProblem], Callable[[CoDesignProblem, str, str, tuple[float, ...]], Unit]]
-UNITS = {MixedSensitivityProblem: mixed_unit, StructuredProblem: structured_unit}
+UNITS: dict[type[ControllerProblem], Callable[..., Unit]] = {
+    MixedSensitivityProblem: mixed_unit,
+    StructuredProblem: structured_unit,
+}
 
 
 def design_unit(

@@ -91,7 +91,9 @@ class ByRule(InnerKind):
         raise AssertionError("no page is drawn here")
 
 
-def rule_unit(case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]) -> Unit:
+def rule_unit(
+    case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...], workers: object
+) -> Unit:
     """One θ for the store."""
     value, slope = KINDS[RuleOfThumb](case).value(theta)
     feasible = bool(np.isfinite(value))
@@ -128,9 +130,6 @@ class VerifiedRule(Verified):
     def certified_line(self) -> VerdictLine:
         state = State.PASSED if self.feasible else State.FAILED
         return VerdictLine(state, "stable and within S_max and S_low on the model", {})
-
-    def survives_line(self) -> VerdictLine:
-        return VerdictLine(State.UNKNOWN, "not looked at", {})
 
     def gap_words(self) -> str:
         return ""
