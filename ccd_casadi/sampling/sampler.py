@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from ccd_casadi.inner_problem.objective import objective, violated
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.neighbours import from_controller, from_neighbour, promising_starts
 from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, problem_hash, sample_key
@@ -182,6 +182,8 @@ class Sampler:
             raise self.store.damaged()
         todo = list({k: x for k, x in zip(keys, points, strict=True) if k not in known}.items())
         size = min(CHUNK, max(1, -(-len(todo) // self.workers.count)))  # a few keep all at work
+        if plant_of(self.problem).nearby is not None:  # seconds each: none waits for seven others
+            size = 1
         chunks = [todo[i : i + size] for i in range(0, len(todo), size)]
         with Progress(len(todo), label, quiet=self.quiet) as progress:
             tasks = [(self.problem, chunk) for chunk in chunks]
