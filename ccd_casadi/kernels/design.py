@@ -93,33 +93,35 @@ def _measured(G, K, Dk, omega_low, loop, wr, wi, row):
     return Code.CERTIFIED.value if np.isfinite(row[Column.BANDWIDTH]) else Code.NO_BANDWIDTH.value
 
 
-# Numba optimises a kernel anew inside every kernel that calls it. What follows only strings
-# compiled kernels together: 2 % slower in Python, and half the time to compile.
-
-
-def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
-    """Certify a controller against `gamma` and fill in its closed-loop figures as far as it comes.
-
-    With δ > 0 the norm is that of the four blocks [W1 I; W2 K; W3 K] S [I δG].
-    """
-    row[_CODE] = _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
-
-
+@compiled
 def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     """How it ended."""
     row[Column.GAMMA] = gamma
     if not (np.isfinite(Ak).all() and np.isfinite(Bk).all() and np.isfinite(Ck).all()):
-        return Code.NOT_FINITE
+        return Code.NOT_FINITE.value
     code, loop, poles, G, K = _closed(A, B, C, Ak, Bk, Ck, Dk, row)
-    if code != Code.CERTIFIED:
+    if code != Code.CERTIFIED.value:
         return code
     grid = certificate_grid(*poles)
     matrices = (A, B, C, Ak, Bk, Ck)
     norm, at, held, loop = _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop)
     row[Column.NORM], row[Column.NORM_FREQUENCY] = norm, at
     if not held:
-        return Code.LEVEL_TEST_FAILED if norm <= gamma else Code.NORM_EXCEEDED
+        return Code.LEVEL_TEST_FAILED.value if norm <= gamma else Code.NORM_EXCEEDED.value
     return _measured(G, K, Dk, omega_low, loop, *poles, row)
+
+
+@compiled
+def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
+    """Certify a controller against `gamma` and fill in its closed-loop figures as far as it comes.
+
+    With δ > 0 the norm is that of the four blocks [W1 I; W2 K; W3 K] S [I δG].
+    """
+    row[Column.CODE] = _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
+
+
+# Numba optimises a kernel anew inside every kernel that calls it. What follows only strings
+# compiled kernels together: 2 % slower in Python, and half the time to compile.
 
 
 def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0):
