@@ -186,7 +186,7 @@ def build_resolvent(
         operator = np.eye(len(space.T)) - (value + pencil.shift) * space.T
         return np.asarray(np.linalg.solve(operator, space.V.T @ M_start))
 
-    for space in krylov_spaces(pencil, start, modes):
+    for space in krylov_spaces(pencil, start, orthonormal(pencil, modes)):
         size = np.linalg.norm(space.V.T @ M_start, axis=0).max()
         left = (largest + pencil.shift) * space.beside(of(space, largest)).max()
         if left < SOLVED * size:
