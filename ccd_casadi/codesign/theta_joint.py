@@ -2,15 +2,15 @@
 
 The plants of the set around the best θ so far are known by a reduced basis, or by their matrices to
 first order, within a reach of |Δz| (z is θ in shares of its box). On these θ, the controller and
-ω_b are searched at once (`joint_model`). At the end the plants are made anew and the controller
-adapts to them in a few steps; J there tells how far such knowledge may reach. Where no more is
-promised the conditions of optimality hold for the true plants too, as values and slopes are exact
-in the middle.
+ω_b are searched at once (`joint_model`). At the end the plants are made anew, unless a basis stands
+so near that it tells the same, and the controller adapts to them in a few steps; J there tells how
+far such knowledge may reach. Where no more is promised the conditions of optimality hold for the
+true plants too, as values and slopes are exact in the middle.
 """
 
 import gc
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -35,7 +35,6 @@ from ccd_casadi.support.arrays import Array
 
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the models count
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
-KNOWN = 3  # θ that a reduced basis is made of: its memory grows by their square
 TURNS = 25  # times at most that the plants are made anew
 APART = 200  # looks for worse plants at an end are numbered from it, each elsewhere in the box
 AGAIN = (0, 101)  # looks that a run has at its end, where a return costs finite elements
@@ -45,6 +44,26 @@ STILL, NEARBY = 2e-3, 0.05  # of the box: a basis is that of the place; errs by 
 COARSE = 1e-5  # of J: with less promised a basis is that of the place itself
 ENDINGS, KEPT = 24, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 3e-9  # of w2 ω_b: less is rounding
+
+
+@dataclass(frozen=True)
+class Around:
+    """The plants as a reduced basis at θ knows them, or their matrices to first order there."""
+
+    models: tuple[Evaluate, ...]
+    theta: tuple[float, ...]
+
+    @staticmethod
+    def of(problem: CoDesignProblem, place: JointPoint) -> "Around":
+        """Those around a place."""
+        bent = plant_of(problem).nearby is not None
+        return Around(nearby(problem, [place.theta] if bent else (), place.theta), place.theta)
+
+    def at(self, problem: CoDesignProblem, place: JointPoint, within: float) -> "Around":
+        """These, if a basis is so near the place, else those around it."""
+        bent = plant_of(problem).nearby is not None
+        near = bent and _apart(problem, place.theta, self.theta) < within
+        return self if near or place.theta == self.theta else Around.of(problem, place)
 
 
 def joint_search(
@@ -62,48 +81,46 @@ def joint_search(
     problem, first = sampler.problem, sampler.values(theta, "polishing")[0]
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
-    best, known = JointPoint(first.theta, first.kappa, first.bandwidth), [first.theta]
+    best = JointPoint(first.theta, first.kappa, first.bandwidth)
+    plants = Around.of(problem, best)
     reach, settled, working = REACH, False, WorkingSet(sampler)
     bent = plant_of(problem).nearby is not None
     for turn in range(TURNS):
-        models = nearby(problem, known, best.theta)
         within = LOOSE if turn else WITHIN
-        working, best, J = working.on_worse_plants(models, best, (turn,), within, tell)
-        working = working.reduced(models, best)
+        working, best, J = working.on_worse_plants(plants.models, best, (turn,), within, tell)
+        working = working.reduced(plants.models, best)
         problem = working.sampler.problem
         if _arrived(problem, best, J, ends or ()):
             return sampler, first, False
         if not np.isfinite(J):
             break
-        make = partial(proposed, problem, models, best, reach, bent=bent)
+        make = partial(proposed, problem, plants.models, best, reach, bent=bent)
         found = working.sampler.cached("together", (*best.theta, reach, turn), Proposal, make)
         if tell is not None:
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
+        del make
+        gc.collect()  # searches are large, and hold themselves in circles
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
             settled = ends is not None
             if settled:
                 break
-            del make, models
-            gc.collect()  # with which the bases go
             look = APART + ENDINGS * turn
-            working, best, settled = finished(working.whole, best, look, tell)
+            working, best, settled = finished(working.whole, best, plants, look, tell)
             if settled:
                 break
-            known = [best.theta]
+            plants = Around.of(problem, best)
             continue
-        known = [*(known if len(known) < KNOWN else [best.theta]), found.end.theta]
-        gc.collect()  # bases are large, and searches before hold theirs in circles
-        models = nearby(problem, known, found.end.theta)
-        end, there = JointModel(problem, models, found.end, reach).adapted()
-        gained = J - there
+        there = plants.at(problem, found.end, NEARBY)
+        end, worth = JointModel(problem, there.models, found.end, reach).adapted()
+        gained = J - worth
         if gained > 0.0:
-            best = end
+            best, plants = end, there
         if gained > GOOD * found.gain:
             reach = min(2.0 * reach, LARGEST)
         elif gained < POOR * found.gain:
             reach *= 0.3
     if not (settled or ends is not None):
-        working, best, _ = finished(working.whole, best, APART, tell)
+        working, best, _ = finished(working.whole, best, plants, APART, tell)
     counted = structured_of(working.sampler.problem).scenarios
     worse = set(counted) - set(structured_of(sampler.problem).scenarios)
     if best.theta == first.theta and not worse:
@@ -131,7 +148,11 @@ def _apart(problem: CoDesignProblem, one: Sequence[float], other: Sequence[float
 
 
 def finished(
-    working: WorkingSet, start: JointPoint, look: int, tell: Callable[[str], None] | None
+    working: WorkingSet,
+    start: JointPoint,
+    plants: Around,
+    look: int,
+    tell: Callable[[str], None] | None,
 ) -> tuple[WorkingSet, JointPoint, bool]:
     """The joint optimum near by on all plants that searches find worse on the way to it, the set
     that has these, and whether no more is promised there.
@@ -142,25 +163,23 @@ def finished(
     from `look`; at the end they are of the plants themselves."""
     bent = plant_of(working.sampler.problem).nearby is not None
     reach, again = (REACH, AGAIN) if bent else (CLOSE, ())
-
-    def around(place: JointPoint) -> tuple[Evaluate, ...]:
-        return nearby(working.sampler.problem, [place.theta] if bent else (), place.theta)
-
-    models, middle = around(start), start.theta
-    best, J = JointModel(working.sampler.problem, models, start, reach).adapted()
+    plants = plants.at(working.sampler.problem, start, NEARBY)
+    best, J = JointModel(working.sampler.problem, plants.models, start, reach).adapted()
     for step in range(1, ENDINGS):
         problem = working.sampler.problem
-        make = partial(proposed, problem, models, best, reach, LAST_GAIN, bent)
+        make = partial(proposed, problem, plants.models, best, reach, LAST_GAIN, bent)
         key = (*best.theta, best.bandwidth, reach, bent)
         found = working.sampler.cached("finished", key, Proposal, make)
         if tell is not None:
             tell(f"J {J:.8g}, predicted gain of a last step {max(found.gain, 0.0):.2g}")
         del make
         gc.collect()  # searches are large, and hold themselves in circles
-        if found.gain <= KEPT * abs(J) and bent and _apart(problem, best.theta, middle) > STILL:
-            models, middle = around(best), best.theta
-            best, J = JointModel(problem, models, best, reach).adapted()
-            continue
+        if found.gain <= COARSE * abs(J):
+            exact = plants.at(problem, best, STILL)
+            if exact is not plants:
+                plants = exact
+                best, J = JointModel(problem, plants.models, best, reach).adapted()
+                continue
         if found.gain <= KEPT * abs(J):
             before, true = working, nearby(problem, (), best.theta)
             working, best, there = working.on_worse_plants(true, best, (look, *again), WITHIN, tell)
@@ -168,14 +187,12 @@ def finished(
                 return working, best, True
             J = there
             continue
-        near = NEARBY if found.gain > COARSE * abs(J) else STILL
-        still = bent and _apart(problem, found.end.theta, middle) < near
-        others = models if still else around(found.end)
-        end, there = JointModel(problem, others, found.end, reach).adapted()
+        beside = plants.at(problem, found.end, NEARBY if found.gain > COARSE * abs(J) else STILL)
+        end, there = JointModel(problem, beside.models, found.end, reach).adapted()
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
-            models, middle = others, middle if still else found.end.theta
-            working, best, J = working.on_worse_plants(models, end, (look + step,), WITHIN, tell)
+            plants, looks = beside, (look + step,)
+            working, best, J = working.on_worse_plants(plants.models, end, looks, WITHIN, tell)
     return working, best, False
 
 
