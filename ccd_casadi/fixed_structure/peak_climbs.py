@@ -43,10 +43,10 @@ class Peak:
 
 def climbed(loop: LoopOnBox, points: Sequence[tuple[int, Array]]) -> tuple[list[Excess], int]:
     """The worst plants found from these points (option, point) on, the worst first, and how many
-    were looked at."""
+    were looked at; of those within every bound the worst alone."""
     loops = loop.assessed(loop.uncertain.plants(points))
     peaks, looked = _distinct(points, loops), len(points)
-    ends = [Excess(*points[i], float(loops.largest[i])) for i in _unstable(loops)]
+    ends: list[Peak] = []
     for _ in range(CLIMBS):
         steps = _towards_corners(loop, peaks)
         if not steps:
@@ -55,14 +55,27 @@ def climbed(loop: LoopOnBox, points: Sequence[tuple[int, Array]]) -> tuple[list[
         moved = _moved(loop, peaks, steps)
         rising = [after.value > before.value + LEAST and after.value < UNSTABLE
                   for before, after in zip(peaks, moved, strict=True)]  # fmt: skip
-        ends += [_excess(peak) for peak, on in zip(moved, rising, strict=True) if not on]
+        ends += [peak for peak, on in zip(moved, rising, strict=True) if not on]
         peaks = [peak for peak, on in zip(moved, rising, strict=True) if on]
-    ends += [_excess(peak) for peak in peaks]
-    return sorted(ends, key=lambda end: -end.value), looked
+    ends += peaks
+    ends.sort(key=lambda end: -end.value)
+    lost = [Excess(*points[i], float(loops.largest[i])) for i in _unstable(loops)]
+    found = [*lost, *_apart(loop, [end for end in ends if end.value > 0.0] or ends[:1])]
+    return sorted(found, key=lambda end: -end.value), looked
 
 
-def _excess(peak: Peak) -> Excess:
-    return Excess(peak.option, peak.point, peak.largest)
+def _apart(loop: LoopOnBox, peaks: Sequence[Peak]) -> list[Excess]:
+    """The plants of these peaks, the highest first, without those whose peak is as high on one
+    before it."""
+    if not peaks:
+        return []
+    loops = loop.assessed(loop.uncertain.plants([(peak.option, peak.point) for peak in peaks]))
+    found: list[int] = []
+    for i, peak in enumerate(peaks):
+        rows = [peak.row_of(loops, j) for j in found if peaks[j].option == peak.option]
+        if all(row is None or loops.value[row] < peak.value - WITHIN for row in rows):
+            found.append(i)
+    return [Excess(peaks[i].option, peaks[i].point, float(loops.largest[i])) for i in found]
 
 
 def _unstable(loops: Loops) -> list[int]:
@@ -74,7 +87,7 @@ def _distinct(points: Sequence[tuple[int, Array]], loops: Loops) -> list[Peak]:
     found, many = list[Peak](), Counter[tuple[int, int, int]]()
     for row in np.argsort(-loops.value, kind="stable").tolist():
         value, plant = float(loops.value[row]), int(loops.plant[row])
-        if value < -BELOW or len(found) == PEAKS:
+        if found and (value < -BELOW or len(found) == PEAKS):
             break
         option, point = points[plant]
         curve, log_omega = int(loops.curve[row]), float(loops.log_omega[row])

@@ -25,6 +25,7 @@ from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_on_box import LoopOnBox
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve
 from ccd_casadi.fixed_structure.optimality import optimality
+from ccd_casadi.fixed_structure.peak_climbs import climbed
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -284,6 +285,15 @@ def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
     assert heads[0].value == pytest.approx(
         asked.excesses([(heads[0].option, heads[0].point)])[0]
     )
+
+
+def test_far_within_all_bounds_the_worst_plant_is_named_too(design) -> None:
+    box = uncertain(mode_shift=1e-3, gain=1e-3)
+    asked = LoopOnBox(box, SMALL, design.kappa, 0.5 * design.bandwidth, EASY.looser(10.0))
+    points = lattice(box, 12, 0)
+    heads, _ = climbed(asked, points)
+    assert heads[0].value < 0.0
+    assert heads[0].value >= asked.excesses(points).max() - 1e-6
 
 
 @pytest.mark.parametrize("S_low", [EASY.S_low, 1e-3 * EASY.S_low])
