@@ -83,7 +83,7 @@ def joint_search(
         return sampler, first, True
     best = JointPoint(first.theta, first.kappa, first.bandwidth)
     plants = Around.of(problem, best)
-    reach, widened, settled, working = REACH, False, False, WorkingSet(sampler)
+    reach, settled, working = REACH, False, WorkingSet(sampler)
     bent = plant_of(problem).nearby is not None
     for turn in range(TURNS):
         within = LOOSE if turn else WITHIN
@@ -101,9 +101,6 @@ def joint_search(
         del make
         gc.collect()  # searches are large, and hold themselves in circles
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
-            if bent and ends is None and reach < LARGEST and not widened:
-                reach, widened = LARGEST, True  # little is promised near by: is there more beyond?
-                continue
             settled = ends is not None
             if settled:
                 break
