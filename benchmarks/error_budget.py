@@ -19,7 +19,7 @@ sys.path += [str(folder) for folder in (Path(__file__).parents[1] / "tests").ite
 from fixed_structure_loops import FAST, LATE, SLOW
 from test_error_budget import SHAPED, built, simulated
 
-from ccd_casadi.budget.derivatives import of_filter
+from ccd_casadi.budget.derivatives import of_source
 from ccd_casadi.budget.loops import process
 from ccd_casadi.fixed_structure import Structure
 
@@ -35,7 +35,7 @@ def main() -> None:
         sampling = (SLOW, LATE, FAST)[number % 3]
         source = (*SHAPED, *SHAPED)[number]
         made, _, _ = built(sampling, number, structures[number % 2])
-        exact = float(of_filter(made, source, None, ())[0][0])
+        exact = float(of_source(made, source, None)[0])
         model = process(made, source)
         mean, error = simulated(model, samples, number, 100)
         scores.append((mean - exact) / error)

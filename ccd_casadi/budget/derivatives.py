@@ -1,8 +1,8 @@
-"""Variances of the budget and their derivatives to parameters of plant and controller.
+"""Variances of the budget, and the derivatives of that of the error to plant and controller.
 
-A parameter moves the matrices of G and K by (dG, dK). Of a filter's process a step ih along them
-gives dA, dQ, dC exactly (no difference is taken, so h = 1e-30), and one adjoint Lyapunov equation
-dσ². Of a table it is the derivative of the quadrature's sum, at its nodes:
+Of filters one Lyapunov equation gives the variances, and one adjoint equation the derivatives to
+every matrix of the process, in which the controller M enters affinely. A table's are those of the
+quadrature's sum, at its nodes:
 
     dS = -S (dG K + G dK) S,   d‖H‖² = 2 Re tr(H* dH)
 
@@ -10,20 +10,23 @@ dσ². Of a table it is the derivative of the quadrature's sum, at its nodes:
     sampled      (1 + A) P (1 + A)' - P + Q = 0   and alike, with A_c = (2 + A)⁻¹A continuous
 
     d tr(W P) = 2 tr(X dA P) + tr(X dQ)           sampled 2 tr(X dA P (1 + A)') + …
+
+What moves is given as matrices with a step ih along the imaginary axis: no difference is taken, so
+h = 1e-30.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property, partial
 
 import numpy as np
-from scipy.linalg import solve_continuous_lyapunov
+from scipy.linalg.lapack import dgees, dtrsyl
 
 from ccd_casadi.budget.frequency import integrated, responses
-from ccd_casadi.budget.loops import FORCES, Disturbed, Process, closed, disturbed
-from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope
+from ccd_casadi.budget.loops import FORCES, Matrix, Process, disturbed, process, run_matrix
+from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
-from ccd_casadi.lti.hold import sampled, tustin
+from ccd_casadi.lti.hold import Sampling, sampled, tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -32,126 +35,107 @@ from ccd_casadi.support.units import HZ
 STEP = 1e-30  # along the imaginary axis
 
 
-@dataclass(frozen=True)
-class Change:
-    """dG and dK of one parameter, as matrices of the shapes of G and K; None where one stays."""
-
-    plant: StateSpace | None = None
-    controller: StateSpace | None = None
-
-
-@dataclass(frozen=True)
-class VarianceSlopes:
-    """σ² of error (m²), of its moving average (NaN without a window) and of force (N²), summed.
-
-    `value` (3,) in that order; `gradient` (3, n) to the parameters.
-    """
-
-    value: Array
-    gradient: Array
-
-
-def variance_slopes(
-    loop: Loop, budget: ErrorBudget, changes: Sequence[Change]
-) -> VarianceSlopes | None:
-    """The variances of a loop under all sources, and their derivatives; None if it is unstable."""
+def variances(loop: Loop, budget: ErrorBudget) -> Array | None:
+    """(3,) σ² of error (m²), of its moving average (NaN without a window) and of force (N²) of a
+    loop under all sources; None if it is unstable."""
     if not loop.stable:
         return None
-    value, gradient = np.zeros(3), np.zeros((3, len(changes)))
-    for source in budget.sources:
-        own = of_filter if source.shaped else _of_table
-        found = own(loop, source, budget.window, changes)
-        value, gradient = value + found[0], gradient + found[1]
-    return VarianceSlopes(value, gradient)
-
-
-def of_filter(
-    loop: Loop, source: Source, window: float | None, changes: Sequence[Change]
-) -> tuple[Array, Array]:
-    """As `VarianceSlopes`, of one shaped source in a stable loop, by Lyapunov's equation."""
-    plant = disturbed(loop.plant, source, loop.sampling)
-    model = closed(plant, loop.controller)
-    scale = model.scales()
-    model = model.transformed(scale)
-    moved = [_moved(loop, plant, source, change).transformed(scale) for change in changes]
-    P = covariance(model.A, model.noise, sampled=model.sampled)
-    steps = [(d.A.imag / STEP, d.noise.imag / STEP) for d in moved]
-    C, F, V = model.C, model.F, model.V
-
-    after = P @ (model.A.T + np.eye(len(model.A))) if model.sampled else P
-
-    def slopes(weight: Array) -> Array:
-        """d tr(W P) at a fixed symmetric W (n, n)."""
-        X = covariance(model.A.T, weight, sampled=model.sampled)
-        return np.array([2.0 * np.sum(X * (dA @ after).T) + np.sum(X * dQ) for dA, dQ in steps])
-
-    def outputs(name: str, after: Array) -> Array:
-        """2 tr(dC after) for outputs C or F."""
-        return np.array([2.0 * np.sum(getattr(d, name).imag / STEP * after.T) for d in moved])
-
-    error, force = np.trace(C @ P @ C.T), np.trace(F @ P @ F.T) + (V**2).sum()
-    d_error = slopes(C.T @ C) + outputs("C", P @ C.T)
-    direct = np.array([2.0 * np.sum(V * d.V.imag / STEP) for d in moved])
-    d_force = slopes(F.T @ F) + outputs("F", P @ F.T) + direct
-    average, d_average = np.nan, np.full(len(changes), np.nan)
-    if window is not None:
-        M = average_matrix(model.A, window, loop.period)
-        average = np.trace(C @ M @ P @ C.T)
-        weight = C.T @ C @ M
-        by_matrix = average_slope(model.A, P @ C.T @ C, window, loop.period)
-        through = np.array([np.sum(by_matrix * dA) for dA, _ in steps])
-        both = 0.5 * (M @ P + P @ M.T) @ C.T
-        d_average = slopes(0.5 * (weight + weight.T)) + through + outputs("C", both)
-    value = np.array([
-        np.inf if model.infinite_error else error, average,
-        np.inf if model.infinite_force else force,
-    ])  # fmt: skip
-    return value, np.array([d_error, d_average, d_force])
-
-
-def _moved(loop: Loop, plant: Disturbed, source: Source, change: Change) -> Process:
-    """The process a step along the imaginary axis away."""
-    if change.plant is not None:
-        plant = disturbed(_stepped(loop.plant, change.plant), source, loop.sampling)
-    return closed(plant, _stepped(loop.controller, change.controller))
-
-
-def _stepped(system: StateSpace, change: StateSpace | None) -> StateSpace:
-    if change is None:
-        return system
-    return StateSpace(
-        *(getattr(system, name) + 1j * STEP * getattr(change, name) for name in "ABCD")
+    return np.asarray(
+        np.sum([of_source(loop, source, budget.window) for source in budget.sources], 0)
     )
 
 
-def _of_table(
-    loop: Loop, source: Source, window: float | None, changes: Sequence[Change]
-) -> tuple[Array, Array]:
+def of_source(loop: Loop, source: Source, window: float | None) -> Array:
+    """As `variances`, of one source in a stable loop."""
+    average = np.nan
+    if source.shaped:
+        model = process(loop, source).balanced()
+        P = Lyapunov(model.A, sampled=model.sampled).covariance(model.noise)
+        error, force = np.trace(model.C @ P @ model.C.T), np.trace(model.F @ P @ model.F.T)
+        force = np.inf if model.infinite_force else force + (model.V**2).sum()
+        if window is not None:
+            M = average_matrix(model.A, window, loop.period)
+            average = np.trace(model.C @ M @ P @ model.C.T)
+    elif window is None:
+        error, force, _ = integrated(loop, source, np.zeros_like).value
+    else:
+        gain = partial(average_gain, window=window, period=loop.period)
+        error, force, average = integrated(loop, source, gain).value
+    return np.array([error, average, force])
 
-    def weight(hz: Array) -> Array:
-        return np.full_like(hz, np.nan) if window is None else average_gain(hz, window, loop.period)
 
-    whole = integrated(loop, source, lambda hz: np.nan_to_num(weight(hz)))
-    hz, weights = whole.nodes, whole.weights
-    averaging = weight(hz)
-    at = responses(loop, hz)
-    H_e, H_u = at.of(source.kind)
-    seen = at.seen(source.kind)
-    density = source.density(hz) * weights
-    error, force = ((np.abs(H) ** 2).sum((1, 2)) for H in (H_e, H_u))
-    value = np.array([density @ error, (density * averaging) @ error, density @ force])
-    gradient = np.zeros((3, len(changes)))
-    moving = _ResponseChanges(loop, hz)
-    for i, change in enumerate(changes):
-        dG, dK, dfree = moving.of(change)
-        dS = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
-        d = dS if source.kind is Kind.SETPOINT else -dS
-        if source.kind in FORCES:
-            d = -dS @ at.free - at.S @ dfree
-        slope = 2.0 * (H_e.conj() * d).real.sum((1, 2))
-        other = 2.0 * (H_u.conj() * (dK @ seen + at.K @ d)).real.sum((1, 2))
-        gradient[:, i] = density @ slope, (density * averaging) @ slope, density @ other
-    return value, gradient
+@dataclass(frozen=True)
+class ErrorVariance:
+    """σ² of the error of a plant (SI) under a budget, with controllers of one order."""
+
+    plant: StateSpace
+    budget: ErrorBudget
+    hold: Sampling | None
+    order: int
+
+    @cached_property
+    def filters(self) -> tuple[Source, ...]:
+        """The sources with a state space."""
+        return tuple(source for source in self.budget.sources if source.shaped)
+
+    @cached_property
+    def open(self) -> Process:
+        """The process of the filters without a controller."""
+        return disturbed(self.plant, self.filters, self.hold, self.order)
+
+    def at(
+        self, parts: Sequence[Matrix], plants: Sequence[StateSpace] = ()
+    ) -> tuple[float, Array] | None:
+        """σ² (m²) and its derivatives (n + k,), None for an unstable loop.
+
+        A, B, C, D (n + 1, ·, ·) of the controller, and of it after a step ih along each of n
+        parameters; `plants`: k such steps of the plant.
+        """
+        M = run_matrix(parts, None if self.hold is None else self.hold.period)
+        model = self.open.closed(M[0].real)
+        scale = model.scales()
+        model = model.transformed(scale)
+        equation, C = Lyapunov(model.A, sampled=model.sampled), model.C
+        if not equation.stable:
+            return None
+        P, X = equation.covariance(model.noise), equation.adjoint(C.T @ C)
+        out, after = P @ C.T, P + model.A @ P if model.sampled else P
+        to_M = 2.0 * model.L.T @ X @ (after @ model.R.T + model.E @ model.W.T)
+        value, slopes = float(np.sum(C.T * out)), [np.tensordot(M[1:].imag / STEP, to_M, 2)]
+        for G in plants:
+            moved = disturbed(G, self.filters, self.hold, self.order).closed(M[0].real)
+            moved = moved.transformed(scale)
+            dA, dQ, dC = (part.imag / STEP for part in (moved.A, moved.noise, moved.C))
+            half = np.sum(X * (dA @ after.T)) + 0.5 * np.sum(X * dQ) + np.sum(dC.T * out)
+            slopes.append(np.array([2.0 * half]))
+        gradient = np.concatenate(slopes)
+        for source in self.budget.sources:
+            if not source.shaped:
+                found = self._of_table(source, parts, plants)
+                value, gradient = value + found[0], gradient + found[1]
+        return value, gradient
+
+    def _of_table(
+        self, source: Source, parts: Sequence[Matrix], plants: Sequence[StateSpace]
+    ) -> tuple[float, Array]:
+        K, *stepped = (StateSpace(*own) for own in zip(*parts, strict=True))
+        K = StateSpace(*(np.real(part) for part in (K.A, K.B, K.C, K.D)))
+        loop = Loop(self.plant, K, self.hold)
+        whole = integrated(loop, source, np.zeros_like)
+        hz = whole.nodes
+        density, moving = source.density(hz) * whole.weights, _ResponseChanges(loop, hz)
+        at = responses(loop, hz)
+        H = at.of(source.kind)[0]
+        value = density @ (np.abs(H) ** 2).sum((1, 2))
+        gradient = []
+        for dG, dK, dfree in [*map(moving.of_controller, stepped), *map(moving.of_plant, plants)]:
+            d = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
+            if source.kind in FORCES:
+                d = -d @ at.free - at.S @ dfree
+            elif source.kind is not Kind.SETPOINT:
+                d = -d
+            gradient.append(density @ (2.0 * (H.conj() * d).real.sum((1, 2))))
+        return float(value), np.array(gradient)
 
 
 class _ResponseChanges:
@@ -161,23 +145,22 @@ class _ResponseChanges:
     """
 
     def __init__(self, loop: Loop, hz: Array) -> None:
-        self.loop, self.hz = loop, hz
-        omega = HZ * np.asarray(hz, float)
-        self.s = loop.as_run[0].variable(omega)
+        self.hold, self.free = loop.sampling, 1j * HZ * np.asarray(hz, float)
+        self.s = loop.as_run[0].variable(HZ * np.asarray(hz, float))
+        self.none = np.zeros((len(hz), 1, 1))
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
-    def of(self, change: Change) -> tuple[Any, Any, Any]:
-        hold = self.loop.sampling
-        dG = dK = dfree = np.zeros((len(self.hz), 1, 1))
-        if change.plant is not None:
-            G = _stepped(self.loop.plant, change.plant)
-            dG = dfree = self._change("free", G, 1j * HZ * self.hz)
-            if hold is not None:
-                dG = self._change("G", sampled(G, hold.period, hold.delay), self.s)
-        if change.controller is not None:
-            K = _stepped(self.loop.controller, change.controller)
-            dK = self._change("K", K if hold is None else tustin(K, hold.period), self.s)
-        return dG, dK, dfree
+    def of_controller(self, K: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(dG, dK, d of the disturbed G) of a stepped controller."""
+        run = K if self.hold is None else tustin(K, self.hold.period)
+        return self.none, self._change("K", run, self.s), self.none
+
+    def of_plant(self, G: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """And of a stepped plant."""
+        dG = dfree = self._change("free", G, self.free)
+        if self.hold is not None:
+            dG = self._change("G", sampled(G, self.hold.period, self.hold.delay), self.s)
+        return dG, self.none, dfree
 
     def _change(self, name: str, system: StateSpace, s: np.ndarray) -> np.ndarray:
         """By the imaginary parts of a system's matrices over the step."""
@@ -190,10 +173,31 @@ class _ResponseChanges:
         return np.asarray((Y @ dA + dC) @ X + Y @ dB + dD)
 
 
-def covariance(A: Array, Q: Array, *, sampled: bool) -> Array:
-    """P of a stable process with Q symmetric; a sampled one's A is the change over a period."""
-    if sampled:
-        inverse = np.linalg.inv(2.0 * np.eye(len(A)) + A)
-        A, Q = inverse @ A, 2.0 * inverse @ Q @ inverse.T
-    P = solve_continuous_lyapunov(A, -Q)
-    return np.asarray(0.5 * (P + P.T))
+class Lyapunov:
+    """The equations of a process with this A, and with A', by one Schur form; a sampled one's A is
+    the change over a period."""
+
+    def __init__(self, A: Array, *, sampled: bool) -> None:
+        self.inverse = np.linalg.inv(2.0 * np.eye(len(A)) + A) if sampled else None
+        continuous = A if self.inverse is None else self.inverse @ A
+        self.T, _, real, _, self.U, *_ = dgees(_unsorted, continuous)
+        self.stable = bool(real.max(initial=-np.inf) < 0.0)
+
+    def covariance(self, Q: Array) -> Array:
+        """P of a stable process, Q symmetric."""
+        return self._solved(self.inverse, Q, "N", "T")
+
+    def adjoint(self, W: Array) -> Array:
+        """X at a symmetric weight W."""
+        return self._solved(None if self.inverse is None else self.inverse.T, W, "T", "N")
+
+    def _solved(self, inverse: np.ndarray | None, Q: Array, left: str, right: str) -> Array:
+        if inverse is not None:
+            Q = 2.0 * inverse @ Q @ inverse.T
+        found, scale, _ = dtrsyl(self.T, self.T, -self.U.T @ Q @ self.U, left, right)
+        P = scale * self.U @ found @ self.U.T
+        return np.asarray(0.5 * (P + P.T))
+
+
+def _unsorted(real: float, imaginary: float) -> bool:
+    return False

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.budget.derivatives import of_filter
+from ccd_casadi.budget.derivatives import of_source
 from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.moving_average import average_gain
 from ccd_casadi.budget.sources import ErrorBudget, Source
@@ -91,7 +91,7 @@ def _figures(loop: Loop, source: Source, window: float | None) -> SourceFigures:
 
     whole = integrated(loop, source, weight)
     if source.shaped:
-        error, average, force = map(float, of_filter(loop, source, window, ())[0])
+        error, average, force = map(float, of_source(loop, source, window))
         ratio = whole.value[0] / error if error > 0.0 else 1.0
         disagreement = abs(float(ratio) - 1.0)
     else:

@@ -1,25 +1,25 @@
-"""One source in one closed loop as a stationary process, continuous or sampled, exactly.
+"""Sources in one closed loop as a stationary process, continuous or sampled, exactly.
 
     ẋ = A x + w                x_{k+1} = (1 + A) x_k + w_k
     e = C x,   u = F x + v
 
-x holds the plant, of a sampled loop the forces that are under way, the controller, and the source's
-filter. Sampled, e is the error at the samples, and white sensor noise that of the samples: its
-density counts up to half the rate. The controller runs by Tustin's rule without prewarping. A loop
-of changes over a period is that of the changes of plant and controller: transitions would lose the
-digits of slow poles next to 1. Everything is analytic in the matrices of both, so that a step along
-the imaginary axis gives derivatives to rounding (Squire and Trapp 1998).
+x holds the plant with the filters of forces, of a sampled loop the forces that are under way, the
+controller, and the other filters. Sampled, e is the error at the samples, and white sensor noise
+that of the samples: its density counts up to half the rate. The controller runs by Tustin's rule
+without prewarping. A loop of changes over a period is that of the changes of plant and controller:
+transitions would lose the digits of slow poles next to 1. Everything is analytic in the matrices of
+both, so that a step along the imaginary axis gives derivatives to rounding (Squire and Trapp 1998).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import expm, matrix_balance
+from scipy.linalg import block_diag, expm, matrix_balance
 
 from ccd_casadi.budget.sources import Kind, Source
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import Sampling, delay_parts, delayed, tustin
+from ccd_casadi.lti.hold import Sampling, delay_parts, delayed
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 
@@ -33,7 +33,8 @@ class Process:
 
         cov w = Q + E E',   v = V ν,   w = E ν + …
 
-    Infinite: where e or u holds white noise of continuous time. `sampled`: A is the change.
+    `sampled`: A is the change over a period. The matrix M of a controller (`run_matrix`) is in it
+    as A = … + L M R and E = … + L M W; L (n, m + o), R (p + o, n), W (p + o, q).
     """
 
     A: Matrix
@@ -42,14 +43,26 @@ class Process:
     F: Matrix
     E: Matrix
     V: Matrix
+    L: Matrix
+    R: Matrix
+    W: Matrix
     sampled: bool
-    infinite_error: bool
-    infinite_force: bool
+
+    @property
+    def infinite_force(self) -> bool:
+        """Whether u holds white noise of continuous time."""
+        return not self.sampled and bool(np.any(self.V))
 
     @property
     def noise(self) -> Matrix:
         """cov w."""
         return self.Q + self.E @ self.E.T
+
+    def closed(self, M: Matrix) -> "Process":
+        """With this controller where there was none."""
+        LM, of_u = self.L @ M, M[: len(self.F)]
+        return replace(self, A=self.A + LM @ self.R, E=self.E + LM @ self.W, F=of_u @ self.R,
+                       V=of_u @ self.W)  # fmt: skip
 
     def transformed(self, scale: Matrix) -> "Process":
         """The same process in states x/scale."""
@@ -60,6 +73,8 @@ class Process:
             C=self.C * scale,
             F=self.F * scale,
             E=self.E / scale[:, None],
+            L=self.L / scale[:, None],
+            R=self.R * scale,
         )
 
     def scales(self) -> Matrix:
@@ -72,80 +87,82 @@ class Process:
         return self.transformed(self.scales())
 
 
-@dataclass(frozen=True)
-class Disturbed:
-    """A plant with a source, as they run: all of its process that no controller changes.
-
-    Sampled, A of `plant` and `filter` are changes over a `period`. `plant` has the filter of a
-    force among its states; `filter` is that of noise or setpoint. The states that the source
-    drives, the first of the plant's or the filter's, have `noise` (Q) of a period, or in continuous
-    time `enters` (E).
-    """
-
-    kind: Kind
-    period: float | None
-    plant: StateSpace
-    filter: StateSpace
-    noise: Matrix
-    enters: Matrix
-
-
-def disturbed(G: StateSpace, source: Source, hold: Sampling | None) -> Disturbed:
-    """A plant without feedthrough (SI) under a source of white noise through a filter.
+def disturbed(
+    G: StateSpace, sources: Sequence[Source], hold: Sampling | None, order: int
+) -> Process:
+    """A plant without feedthrough (SI) under independent sources of white noise through filters,
+    with the states of a controller of this order that does nothing yet.
 
     Raises ValueError for a tabulated source, which has no state space.
     """
-    if not source.shaped:
-        raise ValueError("a tabulated source has no state space")
-    is_force = source.kind in FORCES
-    own, each = source.shaping(), np.eye(G.B.shape[1] if is_force else len(G.C))
-    f = StateSpace(*(np.asarray(np.kron(each, getattr(own, name)), float) for name in "ABCD"))
-    driven, W = f, f.B
-    if is_force:
-        none = np.zeros((len(f.A), len(G.A) + G.B.shape[1]))
-        W = np.vstack([G.B @ f.D, f.B])
-        G = driven = StateSpace(
-            np.block([[G.A, G.B @ f.C], [none[:, : len(G.A)], f.A]]),
-            np.vstack([G.B, none[:, len(G.A) :]]),
-            np.hstack([G.C, np.zeros((len(G.C), len(f.A)))]),
-            G.D,
-        )
-    if hold is None:
-        return Disturbed(source.kind, None, G, f, 0.0 * driven.A, W / np.sqrt(2.0))
-    T = hold.period
-    noise, f = noise_of_a_period(driven.A, W, T), replace(f, A=over(f.A, T)[0])
-    return Disturbed(source.kind, T, _held(G, hold), f, noise, 0.0 * W)
+    (p, n), m, T = G.C.shape, G.B.shape[1], 0.0 if hold is None else hold.period
+    force, _ = _joined([one for one in sources if one.kind in FORCES], m)
+    f, true = _joined([one for one in sources if one.kind not in FORCES], p)
+    drive, driven = np.vstack([G.B @ force.D, force.B]), n + len(force.A)
+    G = StateSpace(
+        np.block([[G.A, G.B @ force.C], [np.zeros((driven - n, n)), force.A]]),
+        np.vstack([G.B, np.zeros((driven - n, m))]),
+        np.hstack([G.C, np.zeros((p, driven - n))]),
+        G.D,
+    )
+    enters, noise = [drive / np.sqrt(2.0), f.B / np.sqrt(2.0)], [0.0 * G.A, 0.0 * f.A]
+    if hold is not None:
+        enters = [0.0 * part for part in enters]
+        noise = [noise_of_a_period(G.A, drive, T), noise_of_a_period(f.A, f.B, T)]
+        G, f = _held(G, hold), replace(f, A=over(f.A, T)[0])
+    held = len(G.A)
+    first = held + order  # of the filters that the controller reads
+    count, q, kind = first + len(f.A), drive.shape[1], np.result_type(G.A, G.B, G.C)
+    A, Q = np.zeros((2, count, count), kind)
+    E, L = np.zeros((count, q + f.B.shape[1]), kind), np.zeros((count, m + order), kind)
+    R, W = np.zeros((p + order, count), kind), np.zeros((p + order, E.shape[1]))
+    A[:held, :held], A[first:, first:] = G.A, f.A
+    Q[:driven, :driven], Q[first:, first:] = noise
+    E[:driven, :q], E[first:, q:] = enters
+    L[:held, :m], L[held:first, m:] = G.B, np.eye(order)
+    R[:p, :held], R[:p, first:], R[p:, held:first] = -G.C, f.C, np.eye(order)
+    W[:p, q:] = f.D / np.sqrt(2.0 * (T or 1.0))  # of samples: the density times half the rate
+    C = np.hstack([R[:p, :first], true])
+    return Process(
+        A, Q, C, np.zeros((m, count)), E, np.zeros((m, len(W.T))), L, R, W, hold is not None
+    )
 
 
-def closed(plant: Disturbed, K: StateSpace) -> Process:
-    """The process of a disturbed plant with a controller around it."""
-    f, kind, T = plant.filter, plant.kind, plant.period
-    if T is not None and K.period:
-        K = replace(K, A=K.A - np.eye(len(K.A)))
-    elif T is not None:
-        change: Matrix = T * np.linalg.solve(np.eye(len(K.A)) - 0.5 * T * K.A, K.A)
-        K = replace(tustin(K, T), A=change)
-    loop = closed_loop(plant.plant, K)
-    A, C, F = loop.A, -loop.C_y, loop.C_u
-    E, V, first = np.zeros((len(A), plant.enters.shape[1])), np.zeros((len(F), 1)), 0
-    if kind not in FORCES:
-        first, sign = len(A), -1.0 if kind is Kind.SENSOR_NOISE else 1.0
-        A = np.block([[A, sign * loop.B_r @ f.C], [np.zeros((len(f.A), first)), f.A]])
-        C = np.hstack([C, f.C * (kind is Kind.SETPOINT)])
-        F = np.hstack([F, sign * loop.D_u @ f.C])
-        # The white part enters by way of e alone; sampled, of variance density times half the rate.
-        white = sign * f.D / np.sqrt(2.0 * (T or 1.0))
-        E, V = np.vstack([loop.B_r @ white, 0.0 * f.B]), loop.D_u @ white
-    Q, E = np.zeros_like(A), E.astype(A.dtype)
-    at = slice(first, first + len(plant.noise))
-    Q[at, at], E[at] = plant.noise, plant.enters
-    white_error = T is None and kind is Kind.SETPOINT and bool(np.any(f.D))
-    return Process(A, Q, C, F, E, V, T is not None, white_error, T is None and bool(np.any(V)))
+def _joined(sources: Sequence[Source], channels: int) -> tuple[StateSpace, Matrix]:
+    """The filters side by side, each in every channel, with their sum as the controller reads it;
+    and C of what of it is true."""
+    none, out = np.zeros((0, 0)), np.zeros((channels, 0))
+    parts: list[list[Matrix]] = [[none], [none], [out], [out], [out]]
+    for one in sources:
+        if not one.shaped:
+            raise ValueError("a tabulated source has no state space")
+        own, sign = one.shaping(), -1.0 if one.kind is Kind.SENSOR_NOISE else 1.0
+        A, B, C, D = (np.kron(np.eye(channels), part) for part in (own.A, own.B, own.C, own.D))
+        added = (A, B, sign * C, sign * D, C * (one.kind is Kind.SETPOINT))
+        for part, own_part in zip(parts, added, strict=True):
+            part.append(own_part)
+    A, B = (block_diag(*part) for part in parts[:2])
+    return StateSpace(A, B, np.hstack(parts[2]), np.hstack(parts[3])), np.hstack(parts[4])
+
+
+def run_matrix(parts: Sequence[Matrix], period: float | None) -> Matrix:
+    """M = [[D, C], [B, A]] (..., m + o, p + o) of continuous controllers A, B, C, D as they run:
+    sampled by Tustin's rule, A then the change over a period."""
+    A, B, C, D = parts
+    if period is not None:
+        inverse = np.linalg.inv(np.eye(A.shape[-1]) - 0.5 * period * A)
+        C = C @ inverse
+        A, B, D = period * inverse @ A, period * inverse @ B, D + 0.5 * period * C @ B
+    return np.block([[D, C], [B, A]])
 
 
 def process(loop: Loop, source: Source) -> Process:
     """A loop whose plant has no feedthrough, under a source."""
-    return closed(disturbed(loop.plant, source, loop.sampling), loop.controller)
+    K, T = loop.controller, loop.period
+    if K.period:
+        K, T = replace(K, A=K.A - np.eye(len(K.A))), None
+    M = run_matrix((K.A, K.B, K.C, K.D), T)
+    return disturbed(loop.plant, (source,), loop.sampling, len(K.A)).closed(M)
 
 
 def _held(G: StateSpace, hold: Sampling) -> StateSpace:

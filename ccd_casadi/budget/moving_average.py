@@ -49,10 +49,3 @@ def average_matrix(A: Array, window: float, period: float | None) -> Array:
     # Σ_{j=0}^{N-2} (N - 1 - j) A^j: the block of a path of two steps right in N steps.
     power = np.linalg.matrix_power(joint, N)[:n, 2 * n :]
     return (N * one + 2.0 * A @ power) / N**2
-
-
-def average_slope(A: Array, dual: Array, window: float, period: float | None) -> Array:
-    """∂ tr(M F(A))/∂A for a fixed M = `dual`: F of a block matrix holds its derivative."""
-    n = len(A)
-    joint = np.block([[A, dual], [np.zeros((n, n)), A]])
-    return average_matrix(joint, window, period)[:n, n:].T

@@ -15,12 +15,13 @@ but for that payment, `REWARD` dτ/dθ.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.budget.derivatives import Change, variance_slopes
+from ccd_casadi.budget.derivatives import STEP, ErrorVariance
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
@@ -34,7 +35,6 @@ from ccd_casadi.fixed_structure.sections_design import (
 )
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -42,7 +42,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 
-STEP = 1e-30  # of κ along the imaginary axis
 REWARD = 1e-6  # of ln ω_b in ln v
 SLOWER = 0.1  # of the largest bandwidth: where a search from a given κ begins
 KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
@@ -72,39 +71,43 @@ class RmsError:
     budget: ErrorBudget
     hold: Sampling | None
 
+    @cached_property
+    def variances(self) -> tuple[ErrorVariance, ...]:
+        """Those of every plant."""
+        rest = self.budget, self.hold, self.structure.order
+        return tuple(ErrorVariance(plant.plant_si(), *rest) for plant in self.plants)
+
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
         kappa = np.asarray(kappa, float)
-        stepped = self.structure.state_spaces(kappa + 1j * STEP * np.eye(len(kappa)))
-        changes = [
-            Change(None, StateSpace(*(part[i].imag / STEP for part in stepped)))
-            for i in range(len(kappa))
-        ]
-        return self._summed(kappa, [changes] * len(self.plants))
+        steps = 1j * STEP * np.eye(len(kappa) + 1, len(kappa), -1)
+        parts = self.structure.state_spaces(kappa + steps)
+        return _of_mean([variance.at(parts) for variance in self.variances], len(kappa))
 
     def to_theta(self, kappa: Array) -> Array:
         """∂ ln e/∂θ at a fixed κ."""
-        none = np.zeros((1, 1))
-        changes = [
-            [Change(StateSpace(*change, none), None) for change in plant.changes_si()]
-            for plant in self.plants
-        ]
-        return self._summed(np.asarray(kappa, float), changes)[1]
+        parts = self.structure.state_spaces(np.asarray(kappa, complex)[None])
+        found = []
+        for variance, plant in zip(self.variances, self.plants, strict=True):
+            G, step = variance.plant, 1j * STEP
+            moved = [StateSpace(G.A + step * dA, G.B + step * dB, G.C + step * dC, G.D)
+                     for dA, dB, dC in plant.changes_si()]  # fmt: skip
+            found.append(variance.at(parts, moved))
+        return _of_mean(found, len(moved))[1]
 
     def shown(self, value: float) -> str:
         """In nm."""
         return f"{1e9 * value:.4g} nm RMS"
 
-    def _summed(self, kappa: Array, changes: Sequence[Sequence[Change]]) -> tuple[float, Array]:
-        """ln e and its derivatives to what the changes of each plant's loop are of."""
-        K, budget = self.structure.state_space(kappa), replace(self.budget, window=None)
-        variance, slopes = 0.0, np.zeros(len(changes[0]))
-        for plant, own in zip(self.plants, changes, strict=True):
-            found = variance_slopes(Loop(plant.plant_si(), K, self.hold), budget, own)
-            if found is None:
-                return np.inf, np.full(len(own), np.nan)
-            variance, slopes = variance + found.value[0], slopes + found.gradient[0]
-        return 0.5 * float(np.log(variance / len(self.plants))), 0.5 * slopes / variance
+
+def _of_mean(found: Sequence[tuple[float, Array] | None], count: int) -> tuple[float, Array]:
+    """½ ln of the mean of variances, and its gradient (count,)."""
+    known = [one for one in found if one is not None]
+    if len(known) < len(found):
+        return np.inf, np.full(count, np.nan)
+    value = sum(one[0] for one in known)
+    slope = np.sum([one[1] for one in known], axis=0)
+    return 0.5 * float(np.log(value / len(found))), 0.5 * slope / value
 
 
 @dataclass(frozen=True)

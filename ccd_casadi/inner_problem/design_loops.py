@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
 from ccd_casadi.budget import BudgetFigures, evaluate_budget
-from ccd_casadi.budget.derivatives import variance_slopes
+from ccd_casadi.budget.derivatives import variances
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.loop import Loop
@@ -64,7 +64,7 @@ def loop_budget(
         return None
     loops = design_loops(problem, theta, controller)
     model = evaluate_budget(loops[0], problem.budget)
-    found = [variance_slopes(loop, problem.budget, ()) for loop in loops]
-    largest = np.max([np.full(3, np.inf) if item is None else item.value for item in found], axis=0)
+    found = [variances(loop, problem.budget) for loop in loops]
+    largest = np.max([np.full(3, np.inf) if item is None else item for item in found], axis=0)
     error, force = np.sqrt(largest[[0, 2]]).tolist()
     return LoopBudget(model, len(loops), error, force, problem.sampling is not None)

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.budget.derivatives import covariance
+from ccd_casadi.budget.derivatives import Lyapunov
 from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.sources import Kind, ShapedSpectrum, Source
 from ccd_casadi.lti.closed_loop import ClosedLoop, responses_of, sigma_max
@@ -70,7 +70,7 @@ def noise(loop: Loop, sensor: float, disturbance: float) -> Noise:
     found = []
     for kind, density in ((Kind.SENSOR_NOISE, sensor), (Kind.FORCE, disturbance)):
         of = process(loop, Source(kind.value, kind, ShapedSpectrum(density**2))).balanced()
-        P = covariance(of.A, of.noise, sampled=of.sampled)
+        P = Lyapunov(of.A, sampled=of.sampled).covariance(of.noise)
         position, force = (np.einsum("ij,jk,ik->i", C, P, C) for C in (of.C, of.F))
         force = np.full_like(force, np.inf) if of.infinite_force else force + (of.V**2).sum(1)
         found += [np.sqrt(np.maximum(position, 0.0)), np.sqrt(np.maximum(force, 0.0))]

@@ -19,7 +19,7 @@ from ccd_casadi.budget import (
     TabulatedSpectrum,
     evaluate_budget,
 )
-from ccd_casadi.budget.derivatives import Change, of_filter, variance_slopes
+from ccd_casadi.budget.derivatives import STEP, ErrorVariance, of_source, variances
 from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.loops import Process, noise_of_a_period, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
@@ -40,9 +40,9 @@ class Variances(NamedTuple):
     force: float
 
 
-def variances(made: Loop, source: Source, window: float | None) -> Variances:
-    """Of a shaped source by Lyapunov's equation."""
-    return Variances(*map(float, of_filter(made, source, window, ())[0]))
+def by_lyapunov(made: Loop, source: Source, window: float | None) -> Variances:
+    """Of a shaped source."""
+    return Variances(*map(float, of_source(made, source, window)))
 
 
 SHAPED = (
@@ -93,7 +93,7 @@ def test_lyapunov_equals_the_integral_over_frequency(sampling: Sampling | None) 
     made, _, _ = built(sampling)
     period = None if sampling is None else sampling.period
     for source in SHAPED:
-        found = variances(made, source, WINDOW)
+        found = by_lyapunov(made, source, WINDOW)
         whole = integrated(made, source, lambda hz: average_gain(hz, WINDOW, period))
         expected = [whole.value[0], whole.value[2], whole.value[1]]
         np.testing.assert_allclose(
@@ -122,36 +122,33 @@ def test_derivatives_to_controller_and_plant(
     sampling: Sampling | None, sources: tuple[Source, ...]
 ) -> None:
     made, structure, kappa = built(sampling)
-    budget = ErrorBudget(sources, WINDOW)
-    scaled = plant()
-    w0 = scaled.omega_0
-    stepped = structure.state_spaces(kappa + 1e-30j * np.eye(len(kappa)))
-    changes = [Change(None, StateSpace(*(part[i].imag / 1e-30 for part in stepped)))
-               for i in range(len(kappa))]  # fmt: skip
-    to_theta = [
-        StateSpace(w0 * scaled.dA[i], w0 / scaled.force * scaled.dB[i], scaled.dC[i],
-                   np.zeros((1, 1)))
-        for i in range(2)
-    ]  # fmt: skip
-    changes += [Change(part, None) for part in to_theta]
-    found = variance_slopes(made, budget, changes)
+    budget, scaled, n = ErrorBudget(sources), plant(), len(kappa)
+    parts = structure.state_spaces(kappa + 1j * STEP * np.eye(n + 1, n, -1))
+
+    def moved(x: Array) -> StateSpace:
+        G = made.plant
+        return StateSpace(
+            *(part + x[0] * first + x[1] * second for part, first, second
+              in zip((G.A, G.B, G.C), *scaled.changes_si(), strict=True)), G.D)  # fmt: skip
+
+    plants = [moved(1j * STEP * one) for one in np.eye(2)]
+    found = ErrorVariance(made.plant, budget, made.sampling, len(made.controller.A)).at(
+        parts, plants
+    )
     assert found is not None
-    rng = np.random.default_rng(5)
-    for _ in range(1):
-        way = rng.normal(size=len(changes)) / np.sqrt(len(changes))
+    whole = variances(made, budget)
+    assert whole is not None
+    assert found[0] == pytest.approx(whole[0], rel=1e-9)
+    way = np.random.default_rng(5).normal(size=n + 2) / np.sqrt(n + 2)
 
-        def at(h: float, way: Array = way) -> Array:
-            G = made.plant
-            for i, part in enumerate(to_theta):
-                x = h * way[len(kappa) + i]
-                G = StateSpace(*(getattr(G, n) + x * getattr(part, n) for n in "ABCD"))
-            K = structure.state_space(kappa + h * way[: len(kappa)])
-            value = variance_slopes(Loop(G, K, made.sampling), budget, [])
-            assert value is not None
-            return np.log(value.value)
+    def at(h: float) -> Array:
+        K = structure.state_space(kappa + h * way[:n])
+        value = variances(Loop(moved(h * way[n:]), K, made.sampling), budget)
+        assert value is not None
+        return np.log(value[:1])
 
-        expected = found.gradient @ way / found.value
-        np.testing.assert_allclose(expected, difference(at, 2e-3), atol=1e-6, rtol=1e-6)
+    expected = found[1] @ way / found[0]
+    np.testing.assert_allclose(expected, difference(at, 2e-3)[0], atol=1e-6, rtol=1e-6)
 
 
 @pytest.mark.parametrize("sampling", [FAST, SLOW])
@@ -168,7 +165,7 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
         model = process(made, source)
         moved = model.A + np.eye(len(model.A))
         P = _settled(moved, model.noise)
-        found = variances(made, source, None)
+        found = by_lyapunov(made, source, None)
         np.testing.assert_allclose(np.trace(model.C @ P @ model.C.T), found.error, rtol=1e-8)
         f = source.shaping()
         A = np.block([[made.plant.A, made.plant.B @ f.C], [np.zeros((len(f.A), 4)), f.A]])
@@ -217,7 +214,7 @@ def test_rms_equals_a_simulation_within_its_statistical_error(sampling: Sampling
     for seed, source in enumerate((SHAPED[0], SHAPED[4], SHAPED[6])):
         model = process(made, source)
         mean, error = simulated(model, 100_000, seed)
-        found = variances(made, source, None)
+        found = by_lyapunov(made, source, None)
         assert abs(mean - found.error) < 6.0 * error
         assert error < 0.2 * found.error
 
@@ -249,12 +246,12 @@ def test_moving_average_and_deviation_share_the_variance() -> None:
     made, _, _ = built(FAST)
     T = FAST.period
     source = SHAPED[0]
-    whole = variances(made, source, T)
+    whole = by_lyapunov(made, source, T)
     np.testing.assert_allclose(whole.average, whole.error, rtol=1e-12)
-    averages = [variances(made, source, window).average for window in (1e-3, 1e-2, 1e-1, 1e4)]
+    averages = [by_lyapunov(made, source, window).average for window in (1e-3, 1e-2, 1e-1, 1e4)]
     assert (np.diff(averages) < 0.0).all()
     assert averages[-1] < 1e-3 * whole.error
-    slow = variances(Loop(made.plant, made.controller), source, 1e-9)
+    slow = by_lyapunov(Loop(made.plant, made.controller), source, 1e-9)
     np.testing.assert_allclose(slow.average, slow.error, rtol=1e-9)
 
 
@@ -286,7 +283,7 @@ def test_sources_add_in_squares_and_scale() -> None:
 
 def test_white_noise_that_reaches_the_force_undamped_has_no_rms() -> None:
     made, _, _ = built(None, structure=Structure(roll_off=0))
-    found = variances(made, SHAPED[4], None)
+    found = by_lyapunov(made, SHAPED[4], None)
     assert np.isinf(found.force)
     assert np.isfinite(found.error)
 
