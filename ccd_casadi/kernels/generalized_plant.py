@@ -47,9 +47,17 @@ def first_order_weights(w):
     return out
 
 
-@compiled
 def generalized_plant(A, B, C, w):
     """That of A (n, n), B (n, m), C (p, n), of the order N = n + 2p + m."""
+    return MixedPlant(*plant_matrices(A, B, C, w))
+
+
+@compiled
+def plant_matrices(A, B, C, w):
+    """The entries of `generalized_plant`, a plain tuple: no kernel returns a named one to Python.
+
+    Numba looks up its class in Python code, and where Ctrl-C raises there calls a null pointer.
+    """
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     f = first_order_weights(w)
     N = n + 2 * p + m
@@ -73,7 +81,7 @@ def generalized_plant(A, B, C, w):
         Ag[i2 + i, i2 + i] = -f[1, 0]
         B2[i2 + i, i] = f[1, 1]
         C1[p + i, i2 + i] = f[1, 2]
-    return MixedPlant(Ag, B1, B2, C1, C2, f[0, 3], f[1, 3])
+    return Ag, B1, B2, C1, C2, f[0, 3], f[1, 3]
 
 
 @compiled

@@ -9,7 +9,7 @@ from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, i
 from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, optimal_gamma
-from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.kernels.generalized_plant import MixedPlant, plant_matrices
 from ccd_casadi.kernels.lapack import stable_subspace
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian
 
@@ -59,9 +59,9 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
 
 @compiled
 def _mixed(A, B, C, w, grid, sigma):
-    """The generalized plant of mixed sensitivity and γ_jω."""
+    """What the generalized plant of mixed sensitivity has, and γ_jω."""
     bound = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[0]
-    return generalized_plant(A, B, C, w), bound
+    return plant_matrices(A, B, C, w), bound
 
 
 # What follows is plain NumPy around these.
@@ -75,7 +75,8 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
     plant's own ones always. δ > 0 is the four-block problem of `disturbance`.
     """
     if delta == 0.0:
-        gp, bound = _mixed(A, B, C, w, grid, sigma)
+        matrices, bound = _mixed(A, B, C, w, grid, sigma)
+        gp = MixedPlant(*matrices)
     else:
         Y, ok = filter_solution(A, B, C, delta)
         if not ok:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
-from numba.core import event
+from numba.core import event, types
 
 from ccd_casadi.kernels import compilation
 from ccd_casadi.kernels.gamma import plant_gain
@@ -51,6 +51,25 @@ def test_what_the_set_up_compiles_is_all_that_the_library_calls() -> None:
             search(plant.A, plant.B, plant.C, weights.scaled(plant.omega_0), *numbers, True)
     assert isinstance(design.controller, StateSpace)
     assert found.names == []
+
+
+def _parts(made: types.Type) -> list[types.Type]:
+    parts = [*made] if isinstance(made, types.BaseTuple) else []
+    return [made, *(part for inside in parts for part in _parts(inside))]
+
+
+def test_no_kernel_returns_a_named_tuple_to_python() -> None:
+    """Numba asks Python for its class and does not look whether Ctrl-C came first: signal 11."""
+    for part in compilation.PARTS:
+        compilation.compile_part(part)
+    returned = {
+        (name, part)
+        for name, kernel in compilation._kernels().items()
+        for made in kernel.overloads.values()
+        for part in _parts(made.signature.return_type)
+    }
+    assert "ccd_casadi.kernels.synthesis._mixed" in {name for name, _ in returned}
+    assert {name for name, part in returned if isinstance(part, types.BaseNamedTuple)} == set()
 
 
 @pytest.fixture
