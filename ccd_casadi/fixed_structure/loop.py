@@ -241,7 +241,8 @@ def closed_loops(
     joint[..., :n, n:] = B @ (m @ c)
     joint[..., n:, :n] = -b @ (C - D @ (m @ d) @ C)
     joint[..., n:, n:] = a - b @ D @ (m @ c)
-    return np.where(posed[..., None], np.linalg.eigvals(joint), np.nan)
+    # Complex also where all are real: of such a type the kernels take them.
+    return np.where(posed[..., None], np.linalg.eigvals(joint), complex(np.nan))
 
 
 def all_stable(poles: np.ndarray) -> np.ndarray:

@@ -2,8 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from benchmark_scripts import benchmark
+
+from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop import closed_loops
+from ccd_casadi.fixed_structure.loop_problem import FIRST
+from ccd_casadi.fixed_structure.starts import at_random, stabilising
 
 
 @pytest.fixture(scope="module")
@@ -32,3 +39,16 @@ def test_the_judge_refutes_what_does_not_hold(study) -> None:
     assert study.figures(asked, nominal, faster)["SHAPE"] > 1.0
     other = replace(design, kappa=design.kappa + 0.1)
     assert "STATE_SPACE" in study.figures(asked, nominal, other)
+
+
+def test_loops_of_real_poles_alone_are_looked_at(study) -> None:
+    """NumPy gives their eigenvalues as real numbers, which the kernels did not take."""
+    asked, rng = study.case(11), np.random.default_rng(0)
+    plants = asked.uncertain.plants(asked.uncertain.corners())
+    problem = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
+    drawn = stabilising(problem, at_random(problem, np.geomspace(0.01, 1.0, 200), rng))
+    poles = closed_loops(problem.plants, asked.structure, drawn)
+    real = drawn[(poles.imag == 0.0).all(axis=(1, 2))]
+    assert len(real)
+    for kappa in real:
+        assert assess(problem, kappa, FIRST).stable
