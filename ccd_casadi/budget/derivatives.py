@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg.lapack import dgees, dtrsyl
 
 from ccd_casadi.budget.frequency import integrated, responses
-from ccd_casadi.budget.loops import FORCES, Matrix, Process, disturbed, process, run_matrix
+from ccd_casadi.budget.loops import FORCES, Matrix, Process, disturbed, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
 from ccd_casadi.lti.hold import Sampling, sampled, tustin
@@ -84,14 +84,13 @@ class ErrorVariance:
         return disturbed(self.plant, self.filters, self.hold, self.order)
 
     def at(
-        self, parts: Sequence[Matrix], plants: Sequence[StateSpace] = ()
+        self, parts: Sequence[Matrix], M: Matrix, plants: Sequence[StateSpace] = ()
     ) -> tuple[float, Array] | None:
         """σ² (m²) and its derivatives (n + k,), None for an unstable loop.
 
         A, B, C, D (n + 1, ·, ·) of the controller, and of it after a step ih along each of n
-        parameters; `plants`: k such steps of the plant.
+        parameters, with their `run_matrix` M; `plants`: k such steps of the plant.
         """
-        M = run_matrix(parts, None if self.hold is None else self.hold.period)
         model = self.open.closed(M[0].real)
         scale = model.scales()
         model = model.transformed(scale)

@@ -13,6 +13,7 @@ both, so that a step along the imaginary axis gives derivatives to rounding (Squ
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -96,8 +97,8 @@ def disturbed(
     Raises ValueError for a tabulated source, which has no state space.
     """
     (p, n), m, T = G.C.shape, G.B.shape[1], 0.0 if hold is None else hold.period
-    force, _ = _joined([one for one in sources if one.kind in FORCES], m)
-    f, true = _joined([one for one in sources if one.kind not in FORCES], p)
+    force, _ = _joined(tuple(one for one in sources if one.kind in FORCES), m)
+    f, true = _joined(tuple(one for one in sources if one.kind not in FORCES), p)
     drive, driven = np.vstack([G.B @ force.D, force.B]), n + len(force.A)
     G = StateSpace(
         np.block([[G.A, G.B @ force.C], [np.zeros((driven - n, n)), force.A]]),
@@ -128,7 +129,8 @@ def disturbed(
     )
 
 
-def _joined(sources: Sequence[Source], channels: int) -> tuple[StateSpace, Matrix]:
+@lru_cache(64)  # every plant of a set has the same
+def _joined(sources: tuple[Source, ...], channels: int) -> tuple[StateSpace, Matrix]:
     """The filters side by side, each in every channel, with their sum as the controller reads it;
     and C of what of it is true."""
     none, out = np.zeros((0, 0)), np.zeros((channels, 0))

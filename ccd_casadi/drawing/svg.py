@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from html import escape
 from io import StringIO
 from typing import TYPE_CHECKING, Any
@@ -49,11 +50,19 @@ def style() -> Iterator[None]:
     """Our style while a figure is built and written, and the caller's again after it."""
     import matplotlib
 
-    sheet = package_path("drawing/assets/figures.mplstyle")
-    with matplotlib.rc_context(fname=sheet), warnings.catch_warnings():
+    with matplotlib.rc_context(_sheet()), warnings.catch_warnings():
         # A letter that DejaVu lacks is only measured with it; the browser draws it.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
+
+
+@cache
+def _sheet() -> Any:
+    """Our style, read once."""
+    import matplotlib
+
+    sheet = package_path("drawing/assets/figures.mplstyle")
+    return matplotlib.rc_params_from_file(sheet, use_default_template=False)
 
 
 def new_figure(height: float, width: float = WIDTH) -> "Figure":

@@ -22,6 +22,7 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.budget.derivatives import STEP, ErrorVariance
+from ccd_casadi.budget.loops import run_matrix
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
@@ -79,35 +80,35 @@ class RmsError:
 
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
-        kappa = np.asarray(kappa, float)
         steps = 1j * STEP * np.eye(len(kappa) + 1, len(kappa), -1)
-        parts = self.structure.state_spaces(kappa + steps)
-        return _of_mean([variance.at(parts) for variance in self.variances], len(kappa))
+        return self._of_mean(np.asarray(kappa, float) + steps, [()] * len(self.plants))
 
     def to_theta(self, kappa: Array) -> Array:
         """∂ ln e/∂θ at a fixed κ."""
-        parts = self.structure.state_spaces(np.asarray(kappa, complex)[None])
-        found = []
-        for variance, plant in zip(self.variances, self.plants, strict=True):
-            G, step = variance.plant, 1j * STEP
-            moved = [StateSpace(G.A + step * dA, G.B + step * dB, G.C + step * dC, G.D)
-                     for dA, dB, dC in plant.changes_si()]  # fmt: skip
-            found.append(variance.at(parts, moved))
-        return _of_mean(found, len(moved))[1]
+        moved = [
+            [StateSpace(G.A + 1j * STEP * dA, G.B + 1j * STEP * dB, G.C + 1j * STEP * dC, G.D)
+             for dA, dB, dC in plant.changes_si()]
+            for G, plant in ((plant.plant_si(), plant) for plant in self.plants)
+        ]  # fmt: skip
+        return self._of_mean(np.asarray(kappa, complex)[None], moved)[1]
 
     def shown(self, value: float) -> str:
         """In nm."""
         return f"{1e9 * value:.4g} nm RMS"
 
-
-def _of_mean(found: Sequence[tuple[float, Array] | None], count: int) -> tuple[float, Array]:
-    """½ ln of the mean of variances, and its gradient (count,)."""
-    known = [one for one in found if one is not None]
-    if len(known) < len(found):
-        return np.inf, np.full(count, np.nan)
-    value = sum(one[0] for one in known)
-    slope = np.sum([one[1] for one in known], axis=0)
-    return 0.5 * float(np.log(value / len(found))), 0.5 * slope / value
+    def _of_mean(
+        self, kappa: np.ndarray, moved: Sequence[Sequence[StateSpace]]
+    ) -> tuple[float, Array]:
+        """ln e and its gradient to the steps of κ after the first and to those of each plant."""
+        parts = self.structure.state_spaces(kappa)
+        M = run_matrix(parts, None if self.hold is None else self.hold.period)
+        value, slopes = 0.0, np.zeros(len(kappa) - 1 + len(moved[0]))
+        for variance, own in zip(self.variances, moved, strict=True):
+            found = variance.at(parts, M, own)
+            if found is None:
+                return np.inf, np.full(len(slopes), np.nan)
+            value, slopes = value + found[0], slopes + found[1]
+        return 0.5 * float(np.log(value / len(moved))), 0.5 * slopes / value
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ccd_casadi.budget import (
 )
 from ccd_casadi.budget.derivatives import STEP, ErrorVariance, of_source, variances
 from ccd_casadi.budget.frequency import integrated
-from ccd_casadi.budget.loops import Process, noise_of_a_period, process
+from ccd_casadi.budget.loops import Process, noise_of_a_period, process, run_matrix
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.lti.hold import delay_parts
@@ -132,9 +132,8 @@ def test_derivatives_to_controller_and_plant(
               in zip((G.A, G.B, G.C), *scaled.changes_si(), strict=True)), G.D)  # fmt: skip
 
     plants = [moved(1j * STEP * one) for one in np.eye(2)]
-    found = ErrorVariance(made.plant, budget, made.sampling, len(made.controller.A)).at(
-        parts, plants
-    )
+    variance = ErrorVariance(made.plant, budget, made.sampling, len(made.controller.A))
+    found = variance.at(parts, run_matrix(parts, made.period), plants)
     assert found is not None
     whole = variances(made, budget)
     assert whole is not None
