@@ -19,6 +19,7 @@ from ccd_casadi.support.arrays import Array
 # exponents of (l_x, l_y, l_z) in the coefficients: the six of K, then that of M
 EXPONENTS = np.array([[1 - (d == p) - (d == q) for d in range(3)] for p, q in PAIRS] + [[1, 1, 1]])
 COPIES = 4  # quarters in the stage
+AT_ONCE = 500_000  # data of a matrix that are summed: the signs of all as floats are 100 MB
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,14 @@ class Pattern:
 
     def fill(self, values: Array) -> sparse.csr_matrix:
         """The symmetric matrix with these entries of the boxes, concatenated."""
-        size, first = len(self.indptr) - 1, np.zeros(len(self.counts) + 1, np.int32)
-        np.cumsum(self.counts, out=first[1:])
-        shape = (len(self.counts), len(values))
-        data = sparse.csr_matrix((self.signs, self.boxes, first), shape=shape) @ values
+        size, data = len(self.indptr) - 1, np.empty(len(self.counts))
+        first = np.append(0, np.cumsum(self.counts, dtype=np.int32))
+        for low in range(0, len(data), AT_ONCE):
+            own = first[low : low + AT_ONCE + 1]
+            part, count = slice(own[0], own[-1]), len(own) - 1
+            entries = self.signs[part], self.boxes[part], own - own[0]
+            terms = sparse.csr_matrix(entries, shape=(count, len(values)))
+            data[low : low + count] = terms @ values
         halves = np.repeat(self.shared, np.diff(self.indptr)) + self.shared[self.indices]
         data *= np.array([1.0, np.sqrt(0.5), 0.5])[halves]
         data[self.indptr[1:] - 1] *= 0.5  # the diagonal, which both halves have
@@ -91,11 +96,11 @@ class Assembler:
         stiff, mass = [], []
         for block, factors in zip(self.blocks, c, strict=True):
             M = factors[6] * cube_mass(block.orders)
-            K = np.tensordot(factors[:6], cube_stiffness(block.orders, self.material), 1)
-            n = len(M)
-            view = K.reshape(n, 3, n, 3)
+            K = np.zeros((len(M), 3, len(M), 3))
+            for pair, i, j, part in cube_stiffness(block.orders, self.material):
+                K[:, i, :, j] += factors[pair] * part
             for component in range(3):
-                view[:, component, :, component] += shift * M
+                K[:, component, :, component] += shift * M
             stiff.append(K.ravel())
             mass.append(M.ravel())
         return np.concatenate(stiff), np.concatenate(mass)
@@ -107,11 +112,11 @@ class Assembler:
         for box, places, weight, copies in sector.maps:
             block = self.blocks[box]
             a, b = (weight[:, None] * v[sector.fold.index[places]] for v in pad)
-            K = cube_stiffness(block.orders, self.material)
-            out[box, :6] += copies * (a.T @ (K @ b))
             n, M = len(block.nodes), cube_mass(block.orders)
-            wide = (M @ b.reshape(n, -1)).reshape(b.shape)
-            out[box, 6] += copies * (a.T @ wide)
+            out[box, 6] += copies * (a.T @ (M @ b.reshape(n, -1)).reshape(b.shape))
+            a, b = (v.reshape(n, 3, -1).transpose(1, 0, 2) for v in (copies * a, b))
+            for pair, i, j, part in cube_stiffness(block.orders, self.material):
+                out[box, pair] += a[i].T @ (part @ b[j])
         return out
 
     def moved(self, sector: Sector, theta: Array, values: Array, vectors: Array) -> Array:
@@ -123,12 +128,14 @@ class Assembler:
         for box, places, weight, copies in sector.maps:
             block = self.blocks[box]
             index = sector.fold.index[places]
-            b = weight[:, None] * padded[index]
-            K = cube_stiffness(block.orders, self.material) @ b
-            wide = (cube_mass(block.orders) @ b.reshape(len(block.nodes), -1)).reshape(b.shape)
-            d = dc[:, box]
-            found = np.tensordot(d[:, :6], K, 1) - d[:, 6, None, None] * (wide * values)
-            rows = copies * weight[:, None] * found.transpose(1, 0, 2).reshape(len(b), -1)
+            b = (weight[:, None] * padded[index]).reshape(len(block.nodes), 3, k)
+            wide = np.tensordot(cube_mass(block.orders), b, 1) * values
+            d = dc[:, box, :, None, None]
+            found = -d[:, 6, None] * wide
+            for pair, i, j, part in cube_stiffness(block.orders, self.material):
+                found[:, :, i] += d[:, pair] * (part @ b[:, j])
+            moved = found.reshape(len(theta), len(index), k).transpose(1, 0, 2)
+            rows = copies * weight[:, None] * moved.reshape(len(index), -1)
             np.add.at(out, index, rows)
         return out[:n]
 

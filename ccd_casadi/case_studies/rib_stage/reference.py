@@ -49,33 +49,41 @@ def cube_mass(orders: tuple[int, int, int]) -> Array:
 
 
 @cache
-def cube_stiffness(orders: tuple[int, int, int], material: Material) -> Array:
-    """K_pq for the six PAIRS, (6, 3n, 3n), component fastest; Pa.
+def cube_stiffness(
+    orders: tuple[int, int, int], material: Material
+) -> tuple[tuple[int, int, int, Array], ...]:
+    """K_pq of the PAIRS as (pair, i, j, (n, n) in Pa): what component j of nodes does to i.
 
     K_pq collects C_ikjl ∂_k N_a ∂_l N_b for {k, l} = {p, q}, with
-    C_ikjl = λ δ_ik δ_jl + μ (δ_ij δ_kl + δ_il δ_kj).
+    C_ikjl = λ δ_ik δ_jl + μ (δ_ij δ_kl + δ_il δ_kj). What is left out is zero.
     """
     lame, mu = material.lame
     lines = [line_matrices(p) for p in orders]
-    n = int(np.prod([p + 1 for p in orders]))
-    unit = np.eye(3)
-    out = np.zeros((6, n, 3, n, 3))
+
+    def moved(k: int, m: int) -> Array:
+        """∫ ∂_k N_a ∂_m N_b."""
+        factors = []
+        for axis, (mass, slope, stiffness) in enumerate(lines):
+            if k == m == axis:
+                factors.append(stiffness)
+            elif axis == k:
+                factors.append(slope)
+            elif axis == m:
+                factors.append(slope.T)
+            else:
+                factors.append(mass)
+        return _tensor(factors)
+
+    found = []
     for pair, (p, q) in enumerate(PAIRS):
-        for k, m in {(p, q), (q, p)}:
-            factors = []
-            for axis, (mass, slope, stiffness) in enumerate(lines):
-                if k == m == axis:
-                    factors.append(stiffness)
-                elif axis == k:
-                    factors.append(slope)
-                elif axis == m:
-                    factors.append(slope.T)
-                else:
-                    factors.append(mass)
-            tensor = lame * np.outer(unit[k], unit[m]) + mu * np.outer(unit[m], unit[k])
-            tensor = tensor + mu * unit * float(k == m)
-            out[pair] += _tensor(factors)[:, None, :, None] * tensor[None, :, None, :]
-    return out.reshape(6, 3 * n, 3 * n)
+        one = moved(p, q)
+        if p == q:
+            own = mu * one
+            found += [(pair, i, i, (lame + 2.0 * mu) * one if i == p else own) for i in range(3)]
+        else:
+            across = lame * one + mu * one.T
+            found += [(pair, p, q, across), (pair, q, p, across.T)]
+    return tuple(found)
 
 
 def _tensor(factors: list[Array]) -> Array:
