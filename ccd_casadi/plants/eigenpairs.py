@@ -5,7 +5,7 @@ serves the eigen-solve and all derivatives. Point masses are a low-rank change o
 the Woodbury identity, so the same code solves one symmetry or the direct sum of all of them.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -40,13 +40,13 @@ class Pencil:
 
 
 def build_pencil(
-    shifted: list[sparse.csr_matrix],
+    shifted: Iterable[sparse.csr_matrix],
     masses: list[sparse.csr_matrix],
     shift: float,
     points: Array,
     added: Array,
 ) -> Pencil:
-    """The direct sum of elastic bodies (A_i, M_i), coupled by point masses.
+    """The direct sum of elastic bodies (A_i, M_i), coupled by point masses; A_i is not kept.
 
     `points` (n, r) are displacement functionals and `added` (r,) their masses in kg: M gains
     points diag(added) pointsᵀ.
@@ -56,7 +56,7 @@ def build_pencil(
     factors = [
         OwnThreads(partial(splu, A.T, **how, options={"SymmetricMode": True})) for A in shifted
     ]
-    cuts = np.cumsum([A.shape[0] for A in shifted])
+    cuts = np.cumsum([M.shape[0] for M in masses])
     M_body = sparse.block_diag(masses, format="csr") if len(masses) > 1 else masses[0]
 
     def bodies(x: Array) -> Array:

@@ -1,7 +1,7 @@
 """The stage as a plant: θ in, modal matrices and their exact derivatives out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.case_studies.rib_stage import geometry as shape
 from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point, has_square_symmetry
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
-from ccd_casadi.case_studies.rib_stage.modes import Discretisation, discretise, functionals, slopes
+from ccd_casadi.case_studies.rib_stage.modes import Discretisation, discretise, heights
 from ccd_casadi.case_studies.rib_stage.rigid import RIGID_NAMES, rigid_fields, rigid_values
 from ccd_casadi.case_studies.rib_stage.truncation import (
     Mode,
@@ -22,11 +22,9 @@ from ccd_casadi.case_studies.rib_stage.truncation import (
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.threads import side_by_side
 
 APART = 1e-9  # relative: a mode with less of z is not moved by it
 OUTPUTS = ("corners", "rigid", "modal4", "z")
-_spectra: dict[tuple[Any, ...], ModeSet] = {}
 ROWS = {"z": 1, "rigid": 3, "modal4": 4}  # directions of those that are not the corners
 
 
@@ -134,22 +132,21 @@ def discretisation(stage: RibStage) -> Discretisation:
     return discretise(stage.order, stage.geometry.side, stage.geometry.material)
 
 
-def modes_at(stage: RibStage, theta: tuple[float, ...]) -> ModeSet:
-    """The spectra at θ, whatever actuators, sensors and outputs it has; the last are kept."""
-    key = (stage.order, stage.geometry, stage.modes, stage.truncation, stage.fading, theta)
-    if key not in _spectra:
-        _spectra.clear()  # factorisations are large: they go before others are made
-        by_frequency = stage.truncation == "frequency"
-        _spectra[key] = solve_modes(
-            discretisation(stage), stage.geometry, np.array(theta), stage.modes, by_frequency,
-            stage.fading,
-        )  # fmt: skip
-    return _spectra[key]
+def modes_at(stage: RibStage, theta: tuple[float, ...], points: tuple[Point, ...] = ()) -> ModeSet:
+    """The modes at θ, whatever actuators, sensors and outputs it has; the last are kept.
+
+    With slopes of displacements at points, if there are any."""
+    own = replace(stage, actuators=None, sensors=None, outputs="corners", damping_ratio=0.01)
+    return _modes(own, theta, points)
 
 
-def forget_spectra() -> None:
-    """Let the last factorisations go before memory is needed for others."""
-    _spectra.clear()
+@lru_cache(maxsize=2)
+def _modes(stage: RibStage, theta: tuple[float, ...], points: tuple[Point, ...]) -> ModeSet:
+    by_frequency = stage.truncation == "frequency"
+    return solve_modes(
+        discretisation(stage), stage.geometry, np.array(theta), stage.modes, by_frequency,
+        stage.fading, points,
+    )  # fmt: skip
 
 
 _rigid_function = lru_cache(maxsize=16)(rigid_fields)
@@ -157,8 +154,9 @@ _rigid_function = lru_cache(maxsize=16)(rigid_fields)
 
 @lru_cache(maxsize=256)
 def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> Mechanics:
-    found, here = modes_at(stage, theta), np.array(theta)
-    u, du, dK = _displacements(stage, found, here, points_of(stage), derivatives)
+    points, here = points_of(stage), np.array(theta)
+    found = modes_at(stage, theta, points if derivatives else ())
+    u, du, dK = _displacements(stage, found, here, points)
     lam = np.array([(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible])
     return assembled(stage, lam, u, du, dK)
 
@@ -215,33 +213,32 @@ def assembled(
 
 
 def _displacements(
-    stage: RibStage, found: ModeSet, theta: Array, points: tuple[Point, ...], derivatives: bool
+    stage: RibStage, found: ModeSet, theta: Array, points: tuple[Point, ...]
 ) -> tuple[Array, Array, Array]:
     """u_z of every mode at the points (n, p), its slopes (θ, n, p), and ∂K (θ, n, n).
 
-    Without derivatives the last two have no entry along θ.
+    Of modes without slopes the last two have no entry along θ.
     """
     disc, n = discretisation(stage), 3 + len(found.flexible)
-    count = len(theta) if derivatives else 0
+    count = len(theta) if found.spectra[0].slopes else 0
     u, du = np.zeros((n, len(points))), np.zeros((count, n, len(points)))
     dK = np.zeros((count, n, n))
     u[:3], slope = rigid_part(stage, theta)
     du[:, :3] = slope[:count]
 
-    def fill(index: int) -> None:
-        """The rows of one group: no two write the same."""
-        item, keep = found.spectra[index], found.kept(index)
-        made = [functionals(disc, image, theta, points) for image in item.group.images]
-        F = np.hstack([values[:, 2] for values, _ in made])
+    for index, item in enumerate(found.spectra):
+        keep = found.kept(index)
+        F, _ = heights(disc, item.group, theta, points)
         own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
-        seen = [slice(k * len(points), (k + 1) * len(points)) for k in range(len(made))]
+        seen = [
+            slice(k * len(points), (k + 1) * len(points)) for k in range(len(item.group.images))
+        ]
         for row, mode in own:
             u[row] = F[:, seen[mode.image]].T @ item.vectors[:, mode.place]
         next_one = keep + bool(stage.fading)
         modes_dK = np.zeros((0, next_one, next_one))
-        if derivatives:
-            dF = np.concatenate([steps[:, :, 2] for _, steps in made], axis=2)
-            modes_dK, modes_du = slopes(disc, stage.geometry, item, next_one, F, dF)
+        if item.slopes:
+            modes_dK, modes_du = item.slopes
             for row, mode in own:
                 du[:, row] = modes_du[:, seen[mode.image], mode.place]
                 for column, other in own:
@@ -253,7 +250,4 @@ def _displacements(
             for row, mode in own:
                 du[:, row] = w[mode.place] * du[:, row] + dw[:, mode.place, None] * u[row]
                 u[row] *= w[mode.place]
-
-    kept = [index for index in range(len(found.spectra)) if found.kept(index)]
-    side_by_side(fill, kept[::-1])  # the last one, of the tilts, takes longest
     return u, du, dK

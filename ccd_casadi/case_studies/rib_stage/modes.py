@@ -137,19 +137,47 @@ def spectrum(
     `boxes`: `Assembler.box_matrices` at θ and SHIFT, which all groups share, where they are known.
     """
     stiff, body = disc.assembler.box_matrices(theta, SHIFT) if boxes is None else boxes
-    names = [SA.name if s is AS else s.name for s in group.solved]
-    made = {
-        name: (disc.sectors[name].stiffness.fill(stiff), disc.sectors[name].mass.fill(body))
-        for name in dict.fromkeys(names)
-    }
+    sectors = [sector_of(disc, symmetry) for symmetry in group.solved]
     G, masses, _ = _point_masses(disc, group, theta, geometry.point_masses)
-    pencil = build_pencil(
-        [made[n][0] for n in names], [made[n][1] for n in names], SHIFT, G, masses
-    )
+    shifted = (sector.stiffness.fill(stiff) for sector in sectors)  # one at a time: they are large
+    bodies = [sector.mass.fill(body) for sector in sectors]
+    pencil = build_pencil(shifted, bodies, SHIFT, G, masses)
     rigid = orthonormal(pencil, rigid_vectors(disc, group, theta))
     values, vectors = flexible_modes(pencil, rigid, count)
     vectors = vectors * np.where(sign_functional(disc, group, theta) @ vectors < 0.0, -1.0, 1.0)
     return Spectrum(group, theta, pencil, rigid, values, vectors)
+
+
+@dataclass(frozen=True)
+class GroupModes:
+    """Modes of a group without its factorisation: λ (k,), vectors (n, k), and `slopes` of them."""
+
+    group: Group
+    values: Array
+    vectors: Array
+    slopes: tuple[Array, Array] | None
+
+
+def group_modes(
+    disc: Discretisation, geometry: Geometry, found: Spectrum, keep: int, points: Sequence[Point]
+) -> GroupModes:
+    """Those of a spectrum, with slopes of the `keep` lowest if there are points to see them at."""
+    moved = None
+    if points:
+        F, dF = heights(disc, found.group, found.theta, points)
+        moved = slopes(disc, geometry, found, keep, F, dF)
+    return GroupModes(found.group, found.values, found.vectors, moved)
+
+
+def heights(
+    disc: Discretisation, group: Group, theta: Array, points: Sequence[Point]
+) -> tuple[Array, Array]:
+    """u_z at points, image after image: (n, images points), and (θ, n, images points)."""
+    made = [functionals(disc, image, theta, points) for image in group.images]
+    return (
+        np.hstack([values[:, 2] for values, _ in made]),
+        np.concatenate([steps[:, :, 2] for _, steps in made], axis=2),
+    )
 
 
 def slopes(

@@ -27,7 +27,6 @@ from ccd_casadi.case_studies.rib_stage.model import (
     RibStage,
     assembled,
     discretisation,
-    forget_spectra,
     points_of,
     rigid_part,
 )
@@ -144,7 +143,6 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> Bases:
     last = _bases.pop(stage, Bases())
     have, made = (last.known, last.of) if last.known == known[: len(last.known)] else ((), ())
     disc = discretisation(stage)
-    forget_spectra()
     for theta in map(np.array, known[len(have) :]):
         before = made or [_of_rigid(stage, disc, group, theta) for group in SQUARE_GROUPS]
 

@@ -1,16 +1,18 @@
 """Which flexible modes the plant keeps: a fixed number of each symmetry, or the lowest of all."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.case_studies.rib_stage.geometry import Geometry, has_square_symmetry
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point, has_square_symmetry
 from ccd_casadi.case_studies.rib_stage.modes import (
     EXTRA,
     SHIFT,
     Discretisation,
     Group,
-    Spectrum,
+    GroupModes,
+    group_modes,
     groups_of,
     spectrum,
 )
@@ -64,9 +66,9 @@ class Mode:
 
 @dataclass(frozen=True)
 class ModeSet:
-    """The spectra solved at one θ and the flexible modes kept of them, in the model's order."""
+    """The modes solved at one θ and the flexible ones kept of them, in the model's order."""
 
-    spectra: tuple[Spectrum, ...]
+    spectra: tuple[GroupModes, ...]
     flexible: tuple[Mode, ...]
 
     def kept(self, group: int) -> int:
@@ -98,12 +100,14 @@ def solve_modes(
     count: ModeCount,
     by_frequency: bool,
     fading: int = 0,
+    points: Sequence[Point] = (),
 ) -> ModeSet:
     """Solve every symmetry (or direct sums of them) at θ and choose the modes of the model.
 
     By symmetry the order is A1, B1, B2, A2, then SA and AS in turns, or the even and the odd ones
     about an axis, lowest first in each: it does not change where frequencies of different
-    symmetries cross. So many `fading` ones of every group follow.
+    symmetries cross. So many `fading` ones of every group follow. With `points` they have slopes of
+    displacements there, made beside their factorisations: all of these at once are large.
     """
     square = has_square_symmetry(geometry)
     wanted = {}
@@ -115,8 +119,10 @@ def solve_modes(
             wanted[group] = number
     boxes = disc.assembler.box_matrices(theta, SHIFT)
 
-    def solved(group: Group) -> Spectrum:
-        return spectrum(disc, geometry, theta, group, wanted[group] + fading + EXTRA, boxes)
+    def solved(group: Group) -> GroupModes:
+        keep = wanted[group] + fading
+        found = spectrum(disc, geometry, theta, group, keep + EXTRA, boxes)
+        return group_modes(disc, geometry, found, keep + bool(fading), points)
 
     largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
     found = dict(zip(largest_first, side_by_side(solved, largest_first), strict=True))
@@ -133,7 +139,7 @@ def solve_modes(
     return ModeSet(spectra, tuple(flexible))
 
 
-def _mode(item: Spectrum, group: int, place: int, image: int) -> Mode:
+def _mode(item: GroupModes, group: int, place: int, image: int) -> Mode:
     symmetries = item.group.images[image]
     known = len(symmetries) == 1
     hertz = float(np.sqrt(item.values[place]) / (2.0 * np.pi))
