@@ -19,6 +19,8 @@ from importlib import import_module
 from multiprocessing import connection, resource_tracker
 from typing import Any, ParamSpec, TypeVar
 
+from ccd_casadi.support.memory import large_arrays_apart
+
 T = TypeVar("T")
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -188,6 +190,7 @@ def _serve(pipe: connection.Connection, module: str) -> None:
 
     threading.Thread(target=leave, daemon=True).start()
     _to_parent.append(pipe)
+    large_arrays_apart()
     import_module(module)
     with suppress(EOFError, OSError):
         while True:
