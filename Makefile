@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 # One BLAS thread per process: the matrices are small and the work is spread over processes.
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# Modules are kept as bytecode, also where the environment says otherwise: see setup.
+export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
 .PHONY: solve test tests test-fast test-room test-pythons test-processors lint docs bench peers setup setup-test clean
@@ -76,10 +78,10 @@ setup: $(VENV)/.ready
 setup-test: $(VENV)/.ready-test
 
 # The kernels are compiled once here, so that the first solve does not wait for them; what they need
-# is installed first, the other wheels meanwhile.
+# is installed first, as bytecode only where it is imported, the other wheels meanwhile.
 $(VENV)/.ready: requirements.lock pyproject.toml
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
-	$(PIP) -c requirements.lock numba scipy
+	$(PIP) --no-compile -c requirements.lock numba scipy
 	$(BIN)/python -c "from ccd_casadi.kernels import compilation; compilation.ensure_compiled()" & \
 	kernels=$$!; \
 	$(PIP) -r requirements.lock && \

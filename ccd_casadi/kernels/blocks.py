@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 
 
 @compiled
@@ -37,7 +37,7 @@ def transposed(M):
     return out
 
 
-@compiled
+@inlined
 def scaled(factor, M):
     """factor · M."""
     out = np.empty(M.shape)

@@ -11,7 +11,7 @@ the spectral factor is used.
 import numpy as np
 
 from ccd_casadi.kernels.blocks import add, frobenius, place
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.frequency import narrow, next_trial, promised, response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.sensitivity import axis_frequencies
@@ -67,7 +67,7 @@ def stack_gain(G, K, Dk, w, delta, ω):
     return _stack(response(G, ω), response(K, ω), Dk, w, delta, ω)
 
 
-@compiled
+@inlined
 def stack_gains(G, K, Dk, w, delta, ω):
     """The stack's gain at every ω of an array."""
     g, k = responses(G, ω), responses(K, ω)
@@ -77,7 +77,7 @@ def stack_gains(G, K, Dk, w, delta, ω):
     return out
 
 
-@compiled
+@inlined
 def stack_norm(G, K, Dk, w, delta, grid):
     """sup over ω of the stack's gain: the grid, then successive parabolas at its top peaks."""
     n = grid.size
@@ -109,7 +109,7 @@ def stack_norm(G, K, Dk, w, delta, grid):
     return best, at
 
 
-@compiled
+@inlined
 def level_test(G, K, Dk, w, delta, loop, level):
     """Whether the Hamiltonian of the weighted loop shows no gain above `level`.
 

@@ -9,7 +9,7 @@ taken from the synthesis; a controller of any other form keeps its full order.
 import numpy as np
 
 from ccd_casadi.kernels.blocks import add, place
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.generalized_plant import first_order_weights
 
 EPS = 2.220446049250313e-16
@@ -33,7 +33,7 @@ def loop_matrices(A, B, C, Ak, Bk, Ck, Dk):
     return As, Bs, Cs
 
 
-@compiled
+@inlined
 def pole_rounding(A):
     """What rounding may move an eigenvalue of A by: a pole closer to the axis may lie on it.
 
@@ -42,7 +42,7 @@ def pole_rounding(A):
     return 10.0 * EPS * np.sqrt((A * A).sum())
 
 
-@compiled
+@inlined
 def weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta):
     """State space of r to [W1 e; W2 u; W3 y], states [x; x_K; W1; W2; W3].
 
@@ -80,7 +80,7 @@ def weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta):
     return Az, Bz, Cz, Dz
 
 
-@compiled
+@inlined
 def reachable_loop(loop, n, N):
     """The weighted loop without z - x_K where that difference is cut off from r, and whether.
 

@@ -12,7 +12,7 @@ from ccd_casadi.kernels.closed_loop import (
     reachable_loop,
     weighted_loop,
 )
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.generalized_plant import generalized_plant
@@ -25,7 +25,7 @@ _COUNT, _CODE, _GAMMA_OPT = int(Column.COUNT), int(Column.CODE), int(Column.GAMM
 _BALANCED = int(Column.BALANCED)
 
 
-@compiled
+@inlined
 def certificate_grid(wr, wi):
     """Frequencies for the norm: 12 a decade beyond the poles, and every pole with its flanks."""
     low, high = np.inf, 0.0
@@ -47,7 +47,7 @@ def certificate_grid(wr, wi):
     return np.sort(grid[:k])
 
 
-@compiled
+@inlined
 def _closed(A, B, C, Ak, Bk, Ck, Dk, row):
     """How the loop's poles end; its matrices r to e, plant and controller prepared, a grid."""
     As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
@@ -58,10 +58,10 @@ def _closed(A, B, C, Ak, Bk, Ck, Dk, row):
         code = Code.EIGENVALUES_FAILED.value
     elif not wr.max() < -pole_rounding(As):
         code = Code.UNSTABLE_LOOP.value
-    return code, (As, Bs, Cs), (wr, wi), prepare(A, B, C), prepare(Ak, Bk, Ck)
+    return code, (As, Bs, Cs), wr, wi, prepare(A, B, C), prepare(Ak, Bk, Ck)
 
 
-@compiled
+@inlined
 def _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop):
     """The norm, where, whether it and the Hamiltonian stay below γ, and the least r to e."""
     A, B, C, Ak, Bk, Ck = matrices
@@ -79,36 +79,37 @@ def _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop):
     return norm, at, level_test(G, K, Dk, w, delta, whole, gamma), loop
 
 
-@compiled
+@inlined
 def _measured(G, K, Dk, omega_low, loop, wr, wi, row):
     """How the figures of S end."""
+    As, Bs, Cs = loop
     row[Column.LOW] = sensitivity_gain(G, K, Dk, omega_low)
-    value, at, confirmed = peak(G, K, Dk, *loop, wr, wi)
+    value, at, confirmed = peak(G, K, Dk, As, Bs, Cs, wr, wi)
     row[Column.PEAK], row[Column.PEAK_FREQUENCY] = value, at
     if not confirmed:
         return Code.PEAK_NOT_CONFIRMED.value
-    row[Column.BANDWIDTH], info = bandwidth(G, K, Dk, *loop)
+    row[Column.BANDWIDTH], info = bandwidth(G, K, Dk, As, Bs, Cs)
     if info != 0:
         return Code.EIGENVALUES_FAILED.value
     return Code.CERTIFIED.value if np.isfinite(row[Column.BANDWIDTH]) else Code.NO_BANDWIDTH.value
 
 
-@compiled
+@inlined
 def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     """How it ended."""
     row[Column.GAMMA] = gamma
     if not (np.isfinite(Ak).all() and np.isfinite(Bk).all() and np.isfinite(Ck).all()):
         return Code.NOT_FINITE.value
-    code, loop, poles, G, K = _closed(A, B, C, Ak, Bk, Ck, Dk, row)
+    code, loop, wr, wi, G, K = _closed(A, B, C, Ak, Bk, Ck, Dk, row)
     if code != Code.CERTIFIED.value:
         return code
-    grid = certificate_grid(*poles)
+    grid = certificate_grid(wr, wi)
     matrices = (A, B, C, Ak, Bk, Ck)
     norm, at, held, loop = _stack_proof(G, K, Dk, w, delta, grid, gamma, matrices, loop)
     row[Column.NORM], row[Column.NORM_FREQUENCY] = norm, at
     if not held:
         return Code.LEVEL_TEST_FAILED.value if norm <= gamma else Code.NORM_EXCEEDED.value
-    return _measured(G, K, Dk, omega_low, loop, *poles, row)
+    return _measured(G, K, Dk, omega_low, loop, wr, wi, row)
 
 
 @compiled

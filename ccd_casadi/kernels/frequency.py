@@ -7,7 +7,7 @@ whole grid runs through it in vector instructions.
 
 import numpy as np
 
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.lapack import balanced, schur
 
 CHUNK = 32  # frequencies at a time: the working rows stay in the first-level cache
@@ -51,7 +51,7 @@ def _solve(T, X, ω):
         i = first - 1
 
 
-@compiled
+@inlined
 def _solve_chunk(T, b, ω, x, y):
     """x + jy = (jω - T)⁻¹ b at every ω of a chunk; x, y are (n, CHUNK)."""
     n, count = b.size, ω.size

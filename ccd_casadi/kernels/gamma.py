@@ -8,7 +8,7 @@ place: a step of order four from one Schur form, whose own terms tell when it is
 import numpy as np
 
 from ccd_casadi.kernels.blocks import frobenius
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.frequency import narrow, next_trial, prepare, response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.lapack import lyapunov_triangular
@@ -17,7 +17,7 @@ from ccd_casadi.kernels.riccati import riccati_level, root_nearby
 BACKWARD = 8.0 * 2.0**-52  # |δH|/|H| of a Schur form; 6 eps was measured, N up to 35
 
 
-@compiled
+@inlined
 def lower_bound_squared(w, gain, ω):
     """γ_jω²(ω) = |W1|² R/(|W1|² + R), R = |W2|²/σ² + |W3|²: no controller does better at ω."""
     W1, W2, W3 = squared_weights(w, ω)
@@ -35,7 +35,7 @@ def plant_gain(A, B, C, ω):
     return np.ascontiguousarray(gains[:, -1])
 
 
-@compiled
+@inlined
 def _least_gain(g):
     p, m = g.shape
     if m < p:
@@ -95,7 +95,7 @@ def rounding_error(frame, t, d1):
     return moved * t / abs(np.dot(q, Z @ q)) * t / (2.0 * (t + d1**2))
 
 
-@compiled
+@inlined
 def undecided(frame, t, f, slope, d1, gamma_jw):
     """How far above γ_jω, relative, γ_X may yet lie where f > 0 at t, a hair above; 0: nowhere.
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import types
 from numba.extending import get_cython_function_address
 
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 
 _F = types.CPointer(types.float64)
 _I = types.CPointer(types.int32)
@@ -24,6 +24,8 @@ def _external(name: str, *args: types.Type) -> types.ExternalFunction:
     return types.ExternalFunction(symbol, types.void(*args))
 
 
+# n nrhs a lda ipiv b ldb info
+_dgesv = _external("dgesv", _I, _I, _F, _I, _I, _F, _I, _I)
 # job n a lda ilo ihi scale info
 _dgebal = _external("dgebal", _C, _I, _F, _I, _I, _I, _F, _I)
 # jobvs sort select n a lda sdim wr wi vs ldvs work lwork bwork info
@@ -66,7 +68,7 @@ def _schur(F):
     return V, wr, wi, info[0]
 
 
-@compiled
+@inlined
 def schur(A):
     """Real Schur form A = Q T Qᵀ (dgees). Returns T, Q, wr, wi, info."""
     F = A.T.copy()
@@ -74,7 +76,7 @@ def schur(A):
     return F.T.copy(), V.T.copy(), wr, wi, info
 
 
-@compiled
+@inlined
 def balanced(A):
     """D⁻¹ A D with rows and columns of one size, and D's diagonal, powers of the radix (dgebal)."""
     F = A.T.copy()
@@ -85,6 +87,18 @@ def balanced(A):
         info.ctypes,
     )  # fmt: skip
     return F.T.copy(), scale
+
+
+@compiled
+def solve(A, B):
+    """X of A X = B, and whether A is regular (dgesv); `numpy.linalg.solve` compiles for 4 s."""
+    F, X = A.T.copy(), B.T.copy()
+    N, columns, info = _int(A.shape[0]), _int(B.shape[1]), _int(0)
+    pivots = np.empty(A.shape[0], np.int32)
+    _dgesv(
+        N.ctypes, columns.ctypes, F.ctypes, N.ctypes, pivots.ctypes, X.ctypes, N.ctypes, info.ctypes
+    )
+    return X.T.copy(), info[0] == 0
 
 
 @compiled

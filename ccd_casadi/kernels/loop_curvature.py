@@ -15,7 +15,7 @@ holds where the model does.
 
 import numpy as np
 
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.limits import LoopCurve, warped
 from ccd_casadi.kernels.loop_point import (
     FREE,
@@ -81,7 +81,7 @@ def second(curve, number, which, v, loop):
     return bends
 
 
-@compiled
+@inlined
 def _over_gap(σ, other):
     """1/(λ (λ - λ_m)), σ's gap to σ_m kept from zero."""
     gap, least = σ - other, LEAST_GAP * σ
@@ -90,7 +90,7 @@ def _over_gap(σ, other):
     return 1.0 / (σ * σ * gap * (σ + other))
 
 
-@compiled
+@inlined
 def _by_channel(curve, number, place, into, p, own, at, of, crossed, moved, back, ahead):
     """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
     of z_m (m, c).

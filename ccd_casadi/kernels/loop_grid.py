@@ -37,7 +37,8 @@ def merged(fixed, roots, poles, flanks, ends, apart, far):
     first = size
     for i in range(count):
         x, at, last = np.full(size, np.nan), F, top
-        x[:F] = fixed[i]
+        for j in range(F):  # an array put into a slice compiles for 1.5 s
+            x[j] = fixed[i, j]
         for own in (roots, poles[i]):
             for root in own:
                 if root.imag >= 0.0:

@@ -20,8 +20,8 @@ from ccd_casadi.kernels.blocks import (
     symmetric_part,
     transposed,
 )
-from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
+from ccd_casadi.kernels.compiled import compiled, inlined
+from ccd_casadi.kernels.lapack import lyapunov_triangular, solve, stable_subspace
 
 NOISE = 1e-7  # |λ(X)| below which its sign may be rounding: see `riccati_level`
 
@@ -105,7 +105,7 @@ def riccati_level(H0, B1, C1, d1, t, noise):
     return f, slope, True, (H, T11, U1, U2, V, Z, q, left, c[index])
 
 
-@compiled
+@inlined
 def _singularity(U1, U2, Z, q, p):
     """g of [[U1 - U2 Z, p], [qᵀ, 0]][v; g] = [0; 1]: zero where U1 - U2 Z is singular.
 
@@ -118,13 +118,11 @@ def _singularity(U1, U2, Z, q, p):
     for i in range(N):
         M[i, N], M[N, i] = p[i], q[i]
     right[N, 0] = 1.0
-    try:
-        return np.linalg.solve(M, right)[N, 0]
-    except Exception:  # numba names no others
-        return np.nan
+    solution, regular = solve(M, right)
+    return solution[N, 0] if regular else np.nan
 
 
-@compiled
+@inlined
 def root_nearby(B1, C1, d1, frame, δ):
     """Where X is infinite, as a change of 1/t from the frame's, and an estimate of its error.
 

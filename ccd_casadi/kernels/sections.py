@@ -5,12 +5,12 @@
 The parameters of all channels stand one after the other in κ = ln(values), g = ∂ln K_i/∂κ.
 """
 
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 
 GAIN, INTEGRATOR, REAL, PAIR = 0, 1, 2, 3
 
 
-@compiled
+@inlined
 def gains(factors, values, s, k):
     """Fills k (c,) = K_i(s); `factors` (f, 4): channel, kind, +1 above or -1 below, parameter."""
     for j in range(factors.shape[0]):
@@ -47,7 +47,7 @@ def gains_and_slopes(factors, values, s, k, slope, g):
         slope[i] -= g[at]
 
 
-@compiled
+@inlined
 def second_slopes(factors, g, out):
     """Fills out (n, n) = ∂²ln K_i/∂κ²; zero between parameters of different factors.
 

@@ -9,7 +9,7 @@ Bruinsma & Steinbuch 1990.) Frequencies are in the units of A.
 import numpy as np
 
 from ccd_casadi.kernels.blocks import add, place, place_transposed, transposed
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.frequency import response, response_and_slope, responses
 from ccd_casadi.kernels.lapack import eigenvalues
 from ccd_casadi.kernels.small import invert, largest_singular, multiply
@@ -53,7 +53,7 @@ def axis_frequencies(A, B, C, D, level):
     return np.sort(found[:count]), info
 
 
-@compiled
+@inlined
 def _gain(g, k, Dk):
     """σ_max((I + G K)⁻¹) from the two responses at one frequency."""
     p = g.shape[0]
@@ -115,7 +115,7 @@ def sensitivity_slope(G, K, Dk, ω):
     return s[0], slope
 
 
-@compiled
+@inlined
 def bandwidth(G, K, Dk, As, Bs, Cs):
     """First ω at which σ_max(S) crosses 1/√2 from below; NaN where there is none, and info."""
     p = Bs.shape[1]
@@ -136,7 +136,7 @@ def bandwidth(G, K, Dk, As, Bs, Cs):
     return np.nan, info
 
 
-@compiled
+@inlined
 def _level_root(G, K, Dk, low, high, x):
     """Root of σ_max(S) = 1/√2 in [low, high], Newton from x kept inside the bracket."""
     for _ in range(80):
@@ -200,7 +200,7 @@ def _climb(G, K, Dk, start):
     return x, value
 
 
-@compiled
+@inlined
 def peak(G, K, Dk, As, Bs, Cs, poles_re, poles_im):
     """‖S‖∞, its frequency (0 and inf allowed), and whether the level test confirmed it.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.compiled import compiled, inlined
 
 ALIGNED = 1e-28  # square of the cosine between two columns below which they count as orthogonal
 
@@ -124,7 +124,7 @@ def largest_singular(M):
     return sigma[0]
 
 
-@compiled
+@inlined
 def largest_gain(M, rows, columns):
     """Not below any singular value: the root of the largest row sum of |MᴴM|."""
     sums = np.zeros(columns)

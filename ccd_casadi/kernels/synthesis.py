@@ -10,7 +10,7 @@ from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, optimal_gamma
 from ccd_casadi.kernels.generalized_plant import MixedPlant, plant_matrices
-from ccd_casadi.kernels.lapack import stable_subspace
+from ccd_casadi.kernels.lapack import solve, stable_subspace
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian
 
 _COUNT = int(Column.COUNT)
@@ -26,9 +26,10 @@ def central_controller(gp, H0, gamma):
     t = gamma**2 - d1**2
     _, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
     N = Ag.shape[0]
-    if not ok:
+    X, regular = solve(transposed(U1), transposed(U2))
+    if not (ok and regular):
         return np.zeros((N, N)), B1, np.zeros((m, N)), False
-    X = symmetric_part(np.linalg.solve(transposed(U1), transposed(U2)), 0.5)
+    X = symmetric_part(X, 0.5)
     F, Ak = transposed(B2) @ X, Ag.copy()
     for i in range(m):
         for j in range(N):
