@@ -26,7 +26,7 @@ from ccd_casadi.codesign.joint_model import (
 from ccd_casadi.codesign.working_set import WorkingSet
 from ccd_casadi.fixed_structure.loop_on_box import WITHIN
 from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import nearby, structured_of
 from ccd_casadi.plants.plant import Evaluate
 from ccd_casadi.sampling.sampler import Sampler
@@ -44,6 +44,7 @@ STILL, NEARBY = 2e-3, 0.05  # of the box: a basis is that of the place; errs by 
 COARSE = 1e-5  # of J: with less promised a basis is that of the place itself
 ENDINGS, KEPT = 24, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 3e-9  # of w2 ω_b: less is rounding
+POLL, LITTLE = 0.15, 2e-3  # of the box, and of J: with less promised, places so far away are tried
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ def joint_search(
     plants = Around.of(problem, best)
     reach, settled, working = REACH, False, WorkingSet(sampler)
     bent = plant_of(problem).nearby is not None
+    polls = bent
     for turn in range(TURNS):
         within = LOOSE if turn else WITHIN
         working, best, J = working.on_worse_plants(plants.models, best, (turn,), within, tell)
@@ -100,6 +102,16 @@ def joint_search(
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         del make
         gc.collect()  # searches are large, and hold themselves in circles
+        if polls and found.gain <= LITTLE * abs(J):
+            polls = False
+            other = polled(problem, plants.models, best)
+            there = Around.of(problem, other)
+            wider, other, worth = working.on_worse_plants(there.models, other, (turn,), LOOSE, tell)
+            if tell is not None:
+                tell(f"J {worth:.6g} at the best place {POLL:g} of the box away along one axis")
+            if worth < J - SETTLED * abs(J):
+                working, best, plants, reach = wider, other, there, REACH
+                continue
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
             settled = ends is not None
             if settled:
@@ -129,6 +141,20 @@ def joint_search(
     if worse or objective_of(problem, last) < objective_of(problem, first):
         return working.sampler, last, settled
     return sampler, first, True
+
+
+def polled(problem: CoDesignProblem, models: Sequence[Evaluate], best: JointPoint) -> JointPoint:
+    """The best of the places to both sides along every θ, with the controller adapted to each.
+
+    A search by slopes stands still where peaks change places, though J falls beyond (a poll of
+    compass searches: Kolda, Lewis and Torczon 2003)."""
+    width = np.subtract(problem.upper, problem.lower)
+    places = np.clip(
+        best.theta + POLL * np.vstack([np.diag(width), -np.diag(width)]), *box(problem)
+    )
+    far = [tuple(z.tolist()) for z in places if _apart(problem, z, best.theta) > 0.5 * POLL]
+    ends = [JointModel(problem, models, replace(best, theta=z), 0.0).adapted() for z in far]
+    return min(ends, key=lambda end: end[1], default=(best, np.inf))[0]
 
 
 def _arrived(

@@ -111,7 +111,9 @@ class CompositeProblem(LoopProblem):
     def gains_of(self, constraints: Constraints) -> np.ndarray:
         out = np.zeros((len(constraints.v), 2), int)
         for number, (part, at, own) in enumerate(self.split(constraints)):
-            out[at] = part.problem.gains_of(own) + np.array([number, 0])
+            # Coupled plants are in several parts for speed alone: theirs are one.
+            one = len(self.parts) if part.channel is None else number
+            out[at] = part.problem.gains_of(own) + np.array([one, 0])
         return out
 
     def plants_of(self, constraints: Constraints) -> np.ndarray:

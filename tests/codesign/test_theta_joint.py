@@ -14,7 +14,7 @@ from ccd_casadi.codesign.formulations import usual_name
 from ccd_casadi.codesign.joint_model import PENALTY, JointModel, JointPoint, proposed
 from ccd_casadi.codesign.outer import Place
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
+from ccd_casadi.codesign.theta_joint import POLL, joint_search, objectives_beside, polled
 from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
@@ -142,6 +142,21 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         told = objectives_beside(problem, best, there)
         true = [objective_of(problem, one) for one in sampler.values(there)]
         assert told == pytest.approx(np.array(true) - objective_of(problem, best), rel=0.02)
+
+
+@pytest.mark.parametrize("theta", [(60.0, 58.0), (55.0, 58.0)])
+def test_a_poll_has_the_best_place_along_the_axes(theta: tuple[float, float]) -> None:
+    """Of those inside the box: at an end of it there is nothing beyond."""
+    problem = built(start=theta)
+    at = JointPoint(theta, tuple(STORED["sections"]["kappa"]), 2.0 * np.pi * 20.0)
+    models = nearby(problem, (), theta)
+    width = np.subtract(problem.upper, problem.lower)
+    steps = [sign * POLL * row for row in np.diag(width) for sign in (1.0, -1.0)]
+    places = [place for step in steps if ((place := theta + step) >= problem.lower).all()]
+    J = [JointModel(problem, models, replace(at, theta=tuple(place)), 0.0).adapted()[1]
+         for place in places]  # fmt: skip
+    assert np.isfinite(J).any()
+    assert polled(problem, models, at).theta == pytest.approx(places[int(np.argmin(J))])
 
 
 def test_a_local_solve_takes_joint_steps_and_stops_where_another_has_ended(tmp_path: Path) -> None:
