@@ -1,6 +1,7 @@
 // In the browser alone: sent back they would be heard here as changes. What somebody zoomed stays.
 if (message.content == null) return
-const [words, changes, numbers] = message.content
+const [text, numbers] = message.content
+const [words, changes] = JSON.parse(text)
 for (const [id, html] of Object.entries(words)) {
   const place = document.getElementById(id)
   if (place.said !== html) place.innerHTML = place.said = html
