@@ -21,6 +21,7 @@ from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Tell
 
 ROUNDS, STEPS = 27, 15  # at most, steps of each
+RECENT = 8  # the last steps of a round, which show whether it ended in a crawl
 HALVINGS = (0, 2, 6)  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
@@ -43,7 +44,8 @@ class LocalOptimum:
 
 @dataclass(frozen=True)
 class Runner(Ascent):
-    """One search: where it is, with the loops looked at in all, and what its last round gained.
+    """One search: where it is, with the loops looked at in all, and what its last round gained,
+    or where that ended in a crawl gains at this rate.
 
     `running`: it goes on. `count`: searches that it stands for.
     """
@@ -166,16 +168,22 @@ def _climbed(problem: LoopProblem, running: Sequence[Runner], workers: Pool | No
     ends = dict(results(workers, _climb, tasks))
     found = []
     for i, runner in enumerate(running):
-        end = ends[i]
+        end, gained = ends[i]
         spent = runner.evaluations + end.evaluations
-        gained = end.point.merit() - runner.merit
         found.append(Runner(end.point, end.radius, spent, end.done, gained, not end.done,
                             runner.count))  # fmt: skip
     return found
 
 
-def _climb(problem: LoopProblem, point: Point, radius: float) -> Ascent:
-    return ascend(problem, point, iterations=STEPS, radius=radius)
+def _climb(problem: LoopProblem, point: Point, radius: float) -> tuple[Ascent, float]:
+    """A round of a climb, and what it gained; at the rate of its last steps where these crawl."""
+    before = ascend(problem, point, iterations=STEPS - RECENT, radius=radius)
+    if before.done:
+        return before, before.point.merit() - point.merit()
+    end = ascend(problem, before.point, iterations=RECENT, radius=before.radius)
+    recent = STEPS / RECENT * (end.point.merit() - before.point.merit())
+    gained = recent if recent < WORTH else end.point.merit() - point.merit()
+    return replace(end, evaluations=before.evaluations + end.evaluations), gained
 
 
 def _merged(field: Sequence[Runner]) -> list[Runner]:
