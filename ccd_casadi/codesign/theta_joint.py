@@ -39,6 +39,7 @@ TURNS = 25  # times at most that the plants are made anew
 APART = 200  # looks for worse plants at an end are numbered from it, each elsewhere in the box
 AGAIN = (0, 101)  # looks that a run has at its end, where a return costs finite elements
 LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
+ON_THE_WAY = 50  # plants from which the worst are looked for there; at an end from all of a lattice
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
 STILL, NEARBY = 2e-3, 0.05  # of the box: a basis is that of the place; errs by some 1e-6 of J
 COARSE = 1e-5  # of J: with less promised a basis is that of the place itself
@@ -89,7 +90,9 @@ def joint_search(
     polls = bent
     for turn in range(TURNS):
         within = LOOSE if turn else WITHIN
-        working, best, J = working.on_worse_plants(plants.models, best, (turn,), within, tell)
+        working, best, J = working.on_worse_plants(
+            plants.models, best, (turn,), within, tell, ON_THE_WAY
+        )
         working = working.reduced(plants.models, best)
         problem = working.sampler.problem
         if _arrived(problem, best, J, ends or ()):

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.codesign.joint_model import JointModel, JointPoint
+from ccd_casadi.fixed_structure.worst_plant import LATTICE
 from ccd_casadi.inner_problem.structured_plant_set import (
     structured_of,
     uncertain_plant,
@@ -72,16 +73,17 @@ class WorkingSet:
         looks: Sequence[int],
         within: float,
         tell: Callable[[str], None] | None,
+        count: int = LATTICE,
     ) -> tuple["WorkingSet", JointPoint, float]:
         """With the plants on which the controller exceeds a bound, the controller adapted to them,
         and J there; `looks`: the searches for worse plants, one after the other, each elsewhere in
-        the box."""
+        the box, from a lattice of `count`."""
         sampler, aside, back, J = self.sampler, self.aside, self.back, np.inf
         for look in looks:
             problem, known = sampler.problem, [model(best.theta) for model in models]
             uncertain, kappa = uncertain_plant(problem, best.theta, known), np.array(best.kappa)
             scenarios = violations(
-                problem, uncertain, kappa, best.bandwidth, look, tell, within, aside
+                problem, uncertain, kappa, best.bandwidth, look, tell, within, aside, count
             )[1]
             if scenarios:
                 sampler = with_scenarios(sampler, scenarios)

@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.loop_on_box import WITHIN, Excess, LoopOnBox
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import lattice, worst_plants
+from ccd_casadi.fixed_structure.worst_plant import LATTICE, lattice, worst_plants
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -175,15 +175,16 @@ def violations(
     tell: Tell | None = None,
     within: float = WITHIN,
     others: Sequence[Scenario] = (),
+    count: int = LATTICE,
 ) -> tuple[Excess, tuple[Scenario, ...]]:
-    """The worst plant found for κ (SI) at ω_b in rad/s, and new ones over a bound by `within`; the
-    `others` are known and tried besides."""
+    """The worst plant found for κ (SI) at ω_b in rad/s from a lattice of `count`, and new ones over
+    a bound by `within`; the `others` are known and tried besides."""
     structured = structured_of(problem)
     loop = LoopOnBox(uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem),
                      structured.sampling)  # fmt: skip
     known = [(option, np.array(point)) for option, point in others]
     tried = loop.excesses(known).tolist() if known else []
-    heads, count = worst_plants(loop, structured.seed + turn)
+    heads, count = worst_plants(loop, structured.seed + turn, count)
     heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
     heads.sort(key=lambda head: -head.value)
     if tell is not None:
