@@ -45,7 +45,8 @@ STILL, NEARBY = 2e-3, 0.05  # of the box: a basis is that of the place; errs by 
 COARSE = 1e-5  # of J: with less promised a basis is that of the place itself
 ENDINGS, KEPT = 24, 1e-7  # last steps; of J: a promise at which the conditions of optimality hold
 LAST_GAIN = 3e-9  # of w2 ω_b: less is rounding
-POLL, LITTLE = 0.15, 2e-3  # of the box, and of J: with less promised, places so far away are tried
+POLL = 0.15  # of the box: how far away places are tried
+LITTLE = 2e-3  # of J: with less gained or promised they are
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def joint_search(
     plants = Around.of(problem, best)
     reach, settled, working = REACH, False, WorkingSet(sampler)
     bent = plant_of(problem).nearby is not None
-    polls = bent
+    polls, before = bent, np.inf
     for turn in range(TURNS):
         within = LOOSE if turn else WITHIN
         working, best, J = working.on_worse_plants(
@@ -105,7 +106,7 @@ def joint_search(
             tell(f"J {J:.6g}, predicted gain of a step {max(found.gain, 0.0):.2g}")
         del make
         gc.collect()  # searches are large, and hold themselves in circles
-        if polls and found.gain <= LITTLE * abs(J):
+        if polls and min(found.gain, before - J) <= LITTLE * abs(J):
             polls = False
             other = polled(problem, plants.models, best)
             there = Around.of(problem, other)
@@ -115,6 +116,7 @@ def joint_search(
             if worth < J - SETTLED * abs(J):
                 working, best, plants, reach = wider, other, there, REACH
                 continue
+        before = J
         if found.gain <= SETTLED * abs(J) or reach <= LEAST:
             settled = ends is not None
             if settled:
@@ -227,7 +229,7 @@ def finished(
 
 def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Array) -> Array:
     """By how much J is larger at θ (n, n_θ) beside a sample, by climbs of its controller on the
-    plants as a basis knows them, or to first order; the best of these counts at every one."""
+    plants as a basis knows them, or to first order; where J falls, of the best one's there too."""
     here = JointPoint(sample.theta, sample.kappa, sample.bandwidth)
     models = nearby(problem, [here.theta] if plant_of(problem).nearby else (), here.theta)
     places = [here.theta, *(tuple(theta.tolist()) for theta in thetas)]
@@ -237,6 +239,7 @@ def objectives_beside(problem: CoDesignProblem, sample: InnerSample, thetas: Arr
         return [JointModel(problem, models, one, 0.0).adapted(STEPS) for one in starts]
 
     own = climbed(here)
-    other = climbed(min(own, key=lambda end: end[1])[0])
+    best = min(own, key=lambda end: end[1])
+    other = own if best is own[0] else climbed(best[0])
     J = np.array([min(a[1], b[1]) for a, b in zip(own, other, strict=True)])
     return J[1:] - J[0]
