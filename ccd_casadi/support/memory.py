@@ -3,7 +3,7 @@
 import ctypes
 from contextlib import suppress
 
-LARGE = 4_000_000  # bytes: these and more are an array's own pages
+LARGE = 8_000_000  # bytes of what has its own pages; from 4 MB on, four times the page faults
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 
 

@@ -86,9 +86,9 @@ def test_pages_of_large_arrays_go_back_whatever_small_is_made_after_them() -> No
     for _ in range(3):
         large = []
         for _ in range(30):
-            large.append(np.ones(750_000))
+            large.append(np.ones(1_250_000))
             small.append(np.ones(1_000))
-        assert PAGE * resident_pages() - before > 150e6
+        assert PAGE * resident_pages() - before > 250e6
         large.clear()
     assert PAGE * resident_pages() - before < 30e6
 
