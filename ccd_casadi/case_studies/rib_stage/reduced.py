@@ -12,7 +12,7 @@ the small problems. Derivatives are those of the small problem. Nodes move with 
 not: vectors of different θ may be combined. (Noor and Peters 1980; Rozza, Huynh and Patera 2008.)
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from weakref import WeakValueDictionary
@@ -21,7 +21,13 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import block_diag, eigh
 
-from ccd_casadi.case_studies.rib_stage.geometry import LOWER, UPPER, Material, has_square_symmetry
+from ccd_casadi.case_studies.rib_stage.geometry import (
+    LOWER,
+    UPPER,
+    Material,
+    Point,
+    has_square_symmetry,
+)
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
 from ccd_casadi.case_studies.rib_stage.model import (
     RibStage,
@@ -105,8 +111,15 @@ def applies(stage: RibStage) -> bool:
 def mechanics(stage: RibStage, known: Bases, theta: Sequence[float]) -> Mechanics:
     """`RibStage.mechanics` in bases of what is known, but for the signs of modes."""
     here, masses, points = np.array(theta, float), stage.geometry.point_masses, points_of(stage)
+    assembler = discretisation(stage).assembler
+    c, dc = assembler.coefficients(here)
+    both, lower = np.concatenate([c[None], dc]), assembler.mesh.number[:, :, 0].ravel()
+    seen = [*points, *((p.x, p.y) for p in masses)]
+    # the corners are one point of the quarter
+    weights = {place: np.vstack(assembler.mesh.interpolate(here, *place))[:, lower]
+               for place in {(abs(x), abs(y)) for x, y in seen}}  # fmt: skip
     groups = zip(SQUARE_GROUPS, known.of, strict=True)
-    small = [_modes(stage, group, basis, here) for group, basis in groups]
+    small = [_modes(stage, group, basis, both, seen, weights) for group, basis in groups]
     of = {s: one for group, own in zip(SQUARE_GROUPS, small, strict=True)
           for (s,), one in zip(group.images, own, strict=True)}  # fmt: skip
     coupled, row, later = groups_of(stage.geometry), 3, 3 + stage.modes.total
@@ -234,28 +247,31 @@ def _terms(order: MeshOrder, side: float, material: Material) -> tuple[Terms, Te
     return found[0], found[1]
 
 
-def _modes(stage: RibStage, group: Group, basis: Basis, theta: Array) -> tuple[Small, ...]:
-    """The small problem of a group at θ for every image."""
-    disc, masses = discretisation(stage), stage.geometry.point_masses
-    c, dc = disc.assembler.coefficients(theta)
-    both, count = np.concatenate([c[None], dc]), len(theta) + 1
+def _modes(
+    stage: RibStage,
+    group: Group,
+    basis: Basis,
+    c: Array,
+    seen: Sequence[Point],
+    weights: Mapping[Point, Array],
+) -> tuple[Small, ...]:
+    """The small problem of a group for every image, of coefficients c and their slopes
+    (1 + θ, blocks, 7) and the points to see u at; `weights` of the nodes for each point."""
+    disc, masses, count = discretisation(stage), stage.geometry.point_masses, len(c)
     of_K, of_M = _terms(stage.order, disc.side, stage.geometry.material)
-    K = _whole(both[:, :, :6].reshape(count, -1)[:, of_K[0]] @ basis.stiff)
-    M = _whole(both[:, :, 6][:, of_M[0]] @ basis.mass)
+    K = _whole(c[:, :, :6].reshape(count, -1)[:, of_K[0]] @ basis.stiff)
+    M = _whole(c[:, :, 6][:, of_M[0]] @ basis.mass)
     values, modes = eigh(K[0], M[0])
     kept = RIGID.get(group.solved[0].name, 0) + stage.modes.of(group)
-    lower = disc.assembler.mesh.number[:, :, 0].ravel()
     found = []
     for (symmetry,), face in zip(group.images, basis.faces, strict=True):
-        known, fields = dict[tuple[float, float], Array](), []
-        for x, y in [*points_of(stage), *((p.x, p.y) for p in masses)]:
-            here = abs(x), abs(y)
-            if here not in known:  # the corners are one point of the quarter
-                N = np.vstack(disc.assembler.mesh.interpolate(theta, *here))[:, lower]
-                flat = N @ face.reshape(len(face), -1)
-                known[here] = flat.reshape(count, 3, -1) @ modes
+        flat, fields = face.reshape(len(face), -1), []
+        at_places = {
+            place: (N @ flat).reshape(count, 3, -1) @ modes for place, N in weights.items()
+        }
+        for x, y in seen:
             signs = np.array(mirror_signs(symmetry, x < 0.0, y < 0.0), float)[:, None]
-            fields.append((signs * known[here]).transpose(0, 2, 1))
+            fields.append((signs * at_places[abs(x), abs(y)]).transpose(0, 2, 1))
         u, lam, left = np.stack(fields, 3), values, modes
         if masses:
             lam, turn = _lowest(values, u[0])
