@@ -166,6 +166,7 @@ def run(
             raise
         say(f"interrupted: {_RESUMABLE}", sys.stderr)
     finally:
+        gc.unfreeze()  # cycles that an earlier command had left were frozen too
         end_early()
     return int(code)
 
