@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
-from ccd_casadi.support.memory import large_arrays_apart
 from ccd_casadi.support.options import DEFAULT_CASE, Option, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import option as option
@@ -122,7 +121,6 @@ def run(
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
-    large_arrays_apart()
     if (of_workers := early(options)) is not None:
         begin_early(options.workers, of_workers)
     for module in needs:

@@ -19,8 +19,6 @@ from importlib import import_module
 from multiprocessing import connection, resource_tracker
 from typing import Any, ParamSpec, TypeVar
 
-from ccd_casadi.support.memory import large_arrays_apart
-
 T = TypeVar("T")
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -190,7 +188,6 @@ def _serve(pipe: connection.Connection, module: str) -> None:
 
     threading.Thread(target=leave, daemon=True).start()
     _to_parent.append(pipe)
-    large_arrays_apart()
     import_module(module)
     with suppress(EOFError, OSError):
         while True:

@@ -1,7 +1,6 @@
 """Threads of one process: what they make is freed, whoever lets it go."""
 
 import gc
-import sys
 import threading
 from contextvars import ContextVar
 from pathlib import Path
@@ -11,7 +10,6 @@ import pytest
 from scipy import sparse
 
 from ccd_casadi.plants.eigenpairs import Pencil, build_pencil
-from ccd_casadi.support.memory import large_arrays_apart
 from ccd_casadi.support.threads import OwnThreads, alongside, side_by_side, threads_permitted
 
 PAGE = 4096  # bytes, at least
@@ -75,22 +73,6 @@ def test_factorisations_of_threads_do_not_pile_up() -> None:
             gc.collect()
             held.append(PAGE * resident_pages())
     assert max(held[2:]) - held[2] < 60e6
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="glibc's allocator")
-def test_pages_of_large_arrays_go_back_whatever_small_is_made_after_them() -> None:
-    large_arrays_apart()
-    first = np.ones(3_500_000)
-    del first  # by itself the library takes what is smaller from the heap from here on
-    before, small = PAGE * resident_pages(), []
-    for _ in range(3):
-        large = []
-        for _ in range(30):
-            large.append(np.ones(1_250_000))
-            small.append(np.ones(1_000))
-        assert PAGE * resident_pages() - before > 250e6
-        large.clear()
-    assert PAGE * resident_pages() - before < 30e6
 
 
 def test_what_runs_alongside_holds_nobody_up() -> None:
