@@ -4,8 +4,9 @@ The plants of the set around the best θ so far are known by a reduced basis, or
 first order, within a reach of |Δz| (z is θ in shares of its box). On these θ, the controller and
 ω_b are searched at once (`joint_model`). At the end the plants are made anew, unless a basis stands
 so near that it tells the same, and the controller adapts to them in a few steps; J there tells how
-far such knowledge may reach. Where no more is promised the conditions of optimality hold for the
-true plants too, as values and slopes are exact in the middle.
+far such knowledge may reach. Where little is promised places further away are tried, once. Where no
+more is promised the conditions of optimality hold for the true plants too, as values and slopes are
+exact in the middle.
 """
 
 import gc
