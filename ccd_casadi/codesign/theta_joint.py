@@ -39,7 +39,7 @@ GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 TURNS = 25  # times at most that the plants are made anew
 APART = 200  # looks for worse plants at an end are numbered from it, each elsewhere in the box
 AGAIN = (0, 101)  # looks that a run has at its end, where a return costs finite elements
-LOOSE = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
+UNDERWAY = 1e-3  # ln: by how much a plant of the box may exceed a bound on the way
 ON_THE_WAY = 50  # plants from which the worst are looked for there; at an end from all of a lattice
 CLOSE = 0.02  # of the box: places that are the same; the reach of plants to first order at an end
 STILL, NEARBY = 2e-3, 0.05  # of the box: a basis is that of the place; errs by some 1e-6 of J
@@ -91,7 +91,7 @@ def joint_search(
     bent = plant_of(problem).nearby is not None
     polls, before = bent, np.inf
     for turn in range(TURNS):
-        within = LOOSE if turn else WITHIN
+        within = UNDERWAY if turn else WITHIN
         working, best, J = working.on_worse_plants(
             plants.models, best, (turn,), within, tell, ON_THE_WAY
         )
@@ -111,7 +111,9 @@ def joint_search(
             polls = False
             other = polled(problem, plants.models, best)
             there = Around.of(problem, other)
-            wider, other, worth = working.on_worse_plants(there.models, other, (turn,), LOOSE, tell)
+            wider, other, worth = working.on_worse_plants(
+                there.models, other, (turn,), UNDERWAY, tell
+            )
             if tell is not None:
                 tell(f"J {worth:.6g} at the best place {POLL:g} of the box away along one axis")
             if worth < J - SETTLED * abs(J):

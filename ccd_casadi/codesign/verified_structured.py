@@ -188,20 +188,23 @@ class VerifiedStructured(Verified):
         }
         where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
         share = f"{100.0 + 100.0 * excess:.6g} % of a bound"
-        words = f"within every bound on {where}, the worst that a search found at {share}"
+        kept = "within every bound"
+        if not excess <= 0.0:  # what the judge counts as met
+            kept = f"no bound exceeded by more than {100.0 * kind_of(self.problem).slack:g} %"
+        words = f"{kept} on {where}, the worst that a search found at {share}"
         robust: bool | None = self.set_is_met
         if not self.wide.passed:
             words = f"on {where}: {self.wide.words}"
         elif proof.refuted:
-            words = f"within every bound on {where}, but {proof.words}"
+            words = f"{kept} on {where}, but {proof.words}"
         elif self.checked <= 1:
             robust, words = None, "[robust] names no plant but the model"
         elif not self.all_drawn:
-            words = f"within every bound on {where}, but of the whole box {drawn}"
+            words = f"{kept} on {where}, but of the whole box {drawn}"
         elif robust:
             words = "; ".join(part for part in (words, drawn, proof.words) if part)
         else:
-            words = f"within every bound on {where}, but not all along its common resonance shift"
+            words = f"{kept} on {where}, but not all along its common resonance shift"
         return {"robust": robust, "robust_words": words, "figures": figures}
 
     def gap_words(self) -> str:
