@@ -22,8 +22,8 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.outer_structured import multistart_at
 from ccd_casadi.codesign.outer_theta import SETTLED, pieces_from
+from ccd_casadi.codesign.stored_searches import multistart_at
 from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.move_figures import exact_times, motion_of

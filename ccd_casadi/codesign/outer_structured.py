@@ -4,12 +4,11 @@ A formulation works on v(θ) of the problem's warm starts and plant set, with en
 its end a multi-start search and a search for worse plants ask whether these were good enough at
 that θ; if not, what they find joins, and the outer problem is solved again.
 
-The polish works on the true value: it passes kinks, and keeps its controller. Multi-start searches
-are kept in the store of samples: a run that goes on from its store repeats none.
+The polish works on the true value: it passes kinks, and keeps its controller.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -22,6 +21,12 @@ from ccd_casadi.codesign.outer import End, Place, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
+from ccd_casadi.codesign.stored_searches import (
+    multistart_at,
+    printer,
+    value_with_design,
+    with_initial_search,
+)
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
 from ccd_casadi.codesign.theta_kkt import theta_kkt
@@ -34,102 +39,20 @@ from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import stated_time
 from ccd_casadi.inner_problem.objective import objective, objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import (
-    ProblemAt,
-    StructuredValue,
-    structured_value,
-)
-from ccd_casadi.inner_problem.structured_plant_set import (
-    structure_of,
-    structured_of,
-    uncertain_plant,
-    with_structured,
-)
+from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
+from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.inner_problem.structured_search import (
-    least_from,
-    prepared,
-    race,
-    with_range,
-    with_warm_start,
-)
+from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.neighbours import WORTH, from_controller
-from ccd_casadi.sampling.rows import problem_hash, sample_key
+from ccd_casadi.sampling.neighbours import WORTH
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Workers, results
-from ccd_casadi.support.progress import Progress, Tell
-from ccd_casadi.support.terminal import remark
+from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.threads import alongside
-
-
-@dataclass(frozen=True)
-class InitialSearch:
-    """Warm starts (κ in SI) and plants of the search at the start, as stores name them; `words`:
-    why there are none."""
-
-    anchors: tuple[tuple[float, ...], ...]
-    members: tuple[Scenario, ...]
-    error_anchors: tuple[tuple[float, ...], ...]
-    words: str
-
-
-def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, str]:
-    """Warm starts and plants, from the store where an earlier run has found them.
-
-    Second, in words, why there are no warm starts; empty where there are.
-    """
-    problem = with_range(with_structured(sampler.problem, seed=seed))
-    owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
-
-    def searched() -> InitialSearch:
-        tell = printer("search at the start", sampler.quiet)
-        anchored, made, _ = prepared(problem, tell, sampler.workers)
-        anchored, made, _ = least_from(anchored, problem.start, made, tell)
-        own, start = structured_of(anchored), problem.start
-        words = "" if made.certified else made.words
-        alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
-        if made.certified and alone and problem.figure is BANDWIDTH:
-            # No plant was found worse: this is the search that an end at the start would ask for.
-            make = partial(ProblemAt(anchored, start).value_of, made, 1)
-            sampler.of(anchored).cached("race", start, StructuredValue, make)
-        return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
-
-    key = sample_key(owner, problem.start)
-    found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
-    known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
-    return with_structured(problem, **known, scenarios=found.members), found.words
-
-
-def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
-    """A multi-start search at the θ of a sample, from its controller too, with all its optima,
-    counted; from the store if it is there."""
-    problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
-
-    def multistart() -> StructuredValue:
-        made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
-        found = ProblemAt(problem, theta).value_of(made, 1)
-        return replace(found, design=replace(found.design, local_optima=made.local_optima))
-
-    sampler.count_multistart(sample_key(sampler.hash, theta))
-    return sampler.cached("race", theta, StructuredValue, multistart)
-
-
-def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
-    """A sample with its design and envelope, from the store where it was made before."""
-    problem = from_controller(sampler.problem, best.kappa) if best.kappa else sampler.problem
-    make = partial(structured_value, problem, best.theta)
-    return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
-
-
-def printer(label: str, quiet: bool) -> Tell:
-    """Lines of progress on stderr."""
-    return lambda words: remark(f"{label}: {words}", quiet)
-
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known

@@ -22,8 +22,9 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
-from ccd_casadi.codesign.outer_structured import StructuredOuter, printer
+from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.outer_theta import FAR, SETTLED, pieces_from
+from ccd_casadi.codesign.stored_searches import printer
 from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_structured import VerifiedStructured

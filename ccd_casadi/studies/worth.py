@@ -31,8 +31,8 @@ from scipy.special import ndtr
 from ccd_casadi.cases.case import Case
 from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import OuterFailure, outer_program, solve_program
-from ccd_casadi.codesign.outer_structured import multistart_at, value_with_design
 from ccd_casadi.codesign.run import outer_of
+from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of

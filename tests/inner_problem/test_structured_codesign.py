@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.codesign import outer_structured
+from ccd_casadi.codesign import stored_searches
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
@@ -197,13 +197,13 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
         return with_structured(case, warm_starts=((case.inner.S_max,),)), design, None
 
-    monkeypatch.setattr(outer_structured, "prepared", raced)
+    monkeypatch.setattr(stored_searches, "prepared", raced)
     case = quick(PID)
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
             asked = replace(case, inner=replace(case.inner, S_max=bound))
             of = Sampler(asked, store, Workers(1))
-            found, words = outer_structured.with_initial_search(of, 0)
+            found, words = stored_searches.with_initial_search(of, 0)
             assert (structured_of(found).warm_starts, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip

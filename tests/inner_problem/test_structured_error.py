@@ -17,8 +17,8 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
-from ccd_casadi.codesign.outer_structured import with_initial_search
 from ccd_casadi.codesign.run import solve
+from ccd_casadi.codesign.stored_searches import with_initial_search
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem

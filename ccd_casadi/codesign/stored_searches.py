@@ -1,0 +1,99 @@
+"""Searches of controllers of fixed structure that are kept in the store of samples.
+
+A run that goes on from its store repeats none: the search at the start, multi-start searches at the
+ends, and the values of samples with their designs.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.structured_bandwidth import (
+    ProblemAt,
+    StructuredValue,
+    structured_value,
+)
+from ccd_casadi.inner_problem.structured_plant_set import (
+    structured_of,
+    uncertain_plant,
+    with_structured,
+)
+from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_search import (
+    least_from,
+    prepared,
+    race,
+    with_range,
+    with_warm_start,
+)
+from ccd_casadi.sampling.neighbours import from_controller
+from ccd_casadi.sampling.rows import problem_hash, sample_key
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.support.progress import Tell
+from ccd_casadi.support.terminal import remark
+
+
+@dataclass(frozen=True)
+class InitialSearch:
+    """Warm starts (κ in SI) and plants of the search at the start, as stores name them; `words`:
+    why there are none."""
+
+    anchors: tuple[tuple[float, ...], ...]
+    members: tuple[Scenario, ...]
+    error_anchors: tuple[tuple[float, ...], ...]
+    words: str
+
+
+def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, str]:
+    """Warm starts and plants, from the store where an earlier run has found them.
+
+    Second, in words, why there are no warm starts; empty where there are.
+    """
+    problem = with_range(with_structured(sampler.problem, seed=seed))
+    owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
+
+    def searched() -> InitialSearch:
+        tell = printer("search at the start", sampler.quiet)
+        anchored, made, _ = prepared(problem, tell, sampler.workers)
+        anchored, made, _ = least_from(anchored, problem.start, made, tell)
+        own, start = structured_of(anchored), problem.start
+        words = "" if made.certified else made.words
+        alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
+        if made.certified and alone and problem.figure is BANDWIDTH:
+            # No plant was found worse: this is the search that an end at the start would ask for.
+            make = partial(ProblemAt(anchored, start).value_of, made, 1)
+            sampler.of(anchored).cached("race", start, StructuredValue, make)
+        return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
+
+    key = sample_key(owner, problem.start)
+    found = sampler.store.cached(key, owner, problem.start, InitialSearch, searched)
+    known = {"warm_starts": found.anchors, "error_warm_starts": found.error_anchors}
+    return with_structured(problem, **known, scenarios=found.members), found.words
+
+
+def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
+    """A multi-start search at the θ of a sample, from its controller too, with all its optima,
+    counted; from the store if it is there."""
+    problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
+
+    def multistart() -> StructuredValue:
+        made = race(problem, theta, printer("search at the end", sampler.quiet), sampler.workers)
+        found = ProblemAt(problem, theta).value_of(made, 1)
+        return replace(found, design=replace(found.design, local_optima=made.local_optima))
+
+    sampler.count_multistart(sample_key(sampler.hash, theta))
+    return sampler.cached("race", theta, StructuredValue, multistart)
+
+
+def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
+    """A sample with its design and envelope, from the store where it was made before."""
+    problem = from_controller(sampler.problem, best.kappa) if best.kappa else sampler.problem
+    make = partial(structured_value, problem, best.theta)
+    return sampler.of(problem).cached("value", best.theta, StructuredValue, make)
+
+
+def printer(label: str, quiet: bool) -> Tell:
+    """Lines of progress on stderr."""
+    return lambda words: remark(f"{label}: {words}", quiet)
