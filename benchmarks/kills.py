@@ -149,9 +149,10 @@ def started(words: list[str]) -> subprocess.Popen[str]:
 
 
 def children(pid: int) -> list[int]:
-    """Processes that a process has started and that still run."""
+    """Processes that a process has started, or these, and that still run."""
     path = Path(f"/proc/{pid}/task/{pid}/children")
-    return [int(word) for word in path.read_text().split()] if path.exists() else []
+    own = [int(word) for word in path.read_text().split()] if path.exists() else []
+    return own + [each for child in own for each in children(child)]
 
 
 def killed(process: subprocess.Popen[str], rng: random.Random, tally: Tally, limit: float) -> bool:
@@ -170,7 +171,8 @@ def killed(process: subprocess.Popen[str], rng: random.Random, tally: Tally, lim
 
 def _is_worker(pid: int) -> bool:
     try:
-        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        words = Path(f"/proc/{pid}/cmdline").read_bytes()
+        return b"spawn_main" in words or b"forkserver" in words
     except OSError:
         return False
 

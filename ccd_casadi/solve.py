@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.cases.first_look import module_of_workers
+from ccd_casadi.cases.first_look import modules_of_workers
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
@@ -123,7 +123,7 @@ def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -
     option("--no-report", action="store_true",
            help="write no pages, for jobs that only need result.json"),
     SCHEDULER, needs=["ccd_casadi.codesign.run"],
-    early=lambda options: None if options.scheduler else module_of_workers(options.case),
+    early=lambda options: None if options.scheduler else modules_of_workers(options.case),
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""

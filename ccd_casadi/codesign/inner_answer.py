@@ -133,7 +133,6 @@ def structured_answer(
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
         raise UserError(words)
     begin_at, tell, workers = options.begin_at, options.tell, options.workers
-    workers.begin(prepared.__module__)  # they start while the plants are made
     head = head_of(problem, theta)
     asked = replace(with_range(with_structured(problem, seed=options.seed)), start=theta)
     if begin_at is not None:

@@ -45,8 +45,6 @@ def race(
 
     Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
     """
-    if workers is not None:  # it takes seconds: they start while the starts are drawn
-        workers.begin(__name__)
     here, structured = ProblemAt(problem, theta), structured_of(problem)
     warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
     starts = None if only_warm_starts else structured.starts

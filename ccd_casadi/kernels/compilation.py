@@ -113,16 +113,21 @@ def _compile_rows(curvature: bool) -> None:
         loop_rows.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
 
 
+def is_compiled() -> bool:
+    """Whether the stamp says so."""
+    return _read(_folder(_kernels()) / "compiled.stamp") == _state()
+
+
 def ensure_compiled() -> None:
     """Compile all kernels on two processes unless the stamp says that they are; words on stderr.
 
     What a process leaves undone is compiled where it is needed, in silence.
     """
+    if is_compiled():
+        return
     kernels = _kernels()
     folder = _folder(kernels)
     stamp, state = folder / "compiled.stamp", _state()  # before: sources may change meanwhile
-    if _read(stamp) == state:
-        return
     with _alone(folder / "compiled.lock"):
         if _read(stamp) == state:  # another process has done it
             return

@@ -79,9 +79,6 @@ class Cluster:
     def __exit__(self, *error: object) -> None:
         self._close()
 
-    def begin(self, module: str) -> None:
-        """Nothing: workers of a cluster run already."""
-
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
     ) -> Generator[R, None, None]:

@@ -18,11 +18,10 @@ from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_c
 from ccd_casadi.support.options import DEFAULT_CASE, Option, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import option as option
-from ccd_casadi.support.process_pool import begin_early, end_early
 from ccd_casadi.support.terminal import kept_quiet, say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
-from ccd_casadi.support.worker_process import WorkerLost
+from ccd_casadi.support.worker_process import WorkerLost, import_ahead
 
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
@@ -80,7 +79,7 @@ SCHEDULER = option(
 
 def command(
     name: str, description: str, *options: Option, needs: Sequence[str],
-    early: Callable[[argparse.Namespace], str | None] = lambda options: None, **how: Any,
+    early: Callable[[argparse.Namespace], Sequence[str]] = lambda options: (), **how: Any,
 ) -> Callable[[Body], Callable[..., int]]:  # fmt: skip
     """Makes the entry point of a command, which takes words and gives an exit code, of what it does
     with its options; `how` as in `parser`, which `options` are added to, the others as in `run`."""
@@ -104,13 +103,13 @@ def run(
     argv: Sequence[str] | None = None,
     *,
     needs: Sequence[str] = (),
-    early: Callable[[argparse.Namespace], str | None] = lambda options: None,
+    early: Callable[[argparse.Namespace], Sequence[str]] = lambda options: (),
 ) -> int:
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line.
 
     The modules `needs` are what `main` imports that takes time: they are imported once the options
-    are known to be right, and while a Ctrl-C still finds nothing begun. Meanwhile processes import
-    the module that `early` names, if it does, for the first pool of `main`.
+    are known to be right, and while a Ctrl-C still finds nothing begun. Meanwhile those of `early`
+    are imported for the worker processes of `main`.
     """
     code = ExitCode.INTERRUPTED
     try:
@@ -121,8 +120,8 @@ def run(
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
-    if (of_workers := early(options)) is not None:
-        begin_early(options.workers, of_workers)
+    if (of_workers := early(options)) and options.workers > 1:
+        import_ahead(of_workers)
     for module in needs:
         import_module(module)
     gc.freeze()  # what modules made lasts: a collection without it takes a seventh of the time
@@ -165,7 +164,6 @@ def run(
         say(f"interrupted: {_RESUMABLE}", sys.stderr)
     finally:
         gc.unfreeze()  # cycles that an earlier command had left were frozen too
-        end_early()
     return int(code)
 
 

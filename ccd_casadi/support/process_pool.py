@@ -17,7 +17,6 @@ from ccd_casadi.support.worker_process import R, T, WorkerLost, WorkerProcess, i
 K = TypeVar("K")
 PATIENCE = 2.0  # s of work that is not worth starting processes for
 Running = dict[connection.Connection, tuple[WorkerProcess, int]]  # by pipe, and the task's number
-_early: list[WorkerProcess] = []  # started for the first pool that wants processes
 _SHORT = Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
 
@@ -36,9 +35,6 @@ class Pool(Protocol):
 
     def __exit__(self, *_: object) -> None: ...
 
-    def begin(self, module: str) -> None:
-        """Start what is not running, with a module imported, while this process goes on."""
-
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
     ) -> Generator[R, None, None]:
@@ -49,23 +45,11 @@ class Pool(Protocol):
         """
 
 
-def begin_early(count: int, module: str) -> None:
-    """Start processes, with a module imported, for a pool that is still to come."""
-    with interrupts_held():
-        _early.extend(WorkerProcess(module) for _ in range(count if count > 1 else 0))
-
-
-def end_early() -> None:
-    """End those that no pool wanted."""
-    while _early:
-        _early.pop().end()
-
-
 class Workers(AbstractContextManager["Workers"]):
     """A lazily started process pool; with one worker the tasks run in this process.
 
-    Processes are spawned, never forked, and import NumPy with one BLAS thread. They ignore
-    Ctrl-C, which the parent handles, and end when the parent does, however it ends.
+    Processes import NumPy with one BLAS thread. They ignore Ctrl-C, which the parent handles, and
+    end when the parent does, however it ends.
     """
 
     def __init__(self, count: int, patience: float = 0.0) -> None:
@@ -77,12 +61,6 @@ class Workers(AbstractContextManager["Workers"]):
 
     def __exit__(self, *_: object) -> None:
         self._end(self._workers)
-
-    def begin(self, module: str) -> None:
-        """As `Pool` says; for work that is known to be worth the processes."""
-        missing = self.count - len(self._workers) if self.count > 1 else 0
-        with interrupts_held():
-            self._workers += [_started(module) for _ in range(missing)]
 
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
@@ -151,7 +129,7 @@ class Workers(AbstractContextManager["Workers"]):
             self._end(dead)  # between two tasks: no task is to blame
             if len(idle) == len(dead):
                 with interrupts_held():
-                    self._workers.append(_started())
+                    self._workers.append(WorkerProcess())
                 idle = self._workers[-1:]
             worker, index = next(one for one in idle if one not in dead), waiting[0]
             running[worker.pipe] = (worker, waiting.popleft())
@@ -162,11 +140,6 @@ class Workers(AbstractContextManager["Workers"]):
             for worker in [worker for worker in workers if worker in self._workers]:
                 worker.end()
                 self._workers.remove(worker)
-
-
-def _started(module: str = "ccd_casadi") -> WorkerProcess:
-    """One of the early ones, or a new one."""
-    return _early.pop() if _early else WorkerProcess(module)
 
 
 def results(

@@ -1,4 +1,7 @@
-"""One worker process: spawned, with one BLAS thread, answering tasks through a pipe of its own.
+"""One worker process, with one BLAS thread, answering tasks through a pipe of its own.
+
+A command's are forked from a server that imports what they need while the command does; others are
+spawned, and import for themselves.
 
 Nothing is shared, so a worker may be killed at any moment and its death concerns the one task that
 it held. What goes through the pipe is pickled, which is how Python's processes speak: it comes from
@@ -10,12 +13,12 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from importlib import import_module
 from multiprocessing import connection, resource_tracker
 from typing import Any, ParamSpec, TypeVar
 
@@ -26,7 +29,9 @@ R = TypeVar("R")
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 GRACE = 2.0  # s of processor time beyond the deadline, after which the system ends the process
 STARTING = 60.0  # seconds that the process itself may take to come up
-_SPAWN = multiprocessing.get_context("spawn")  # a fork would copy locks that threads hold
+# The last is how processes are started: spawned, as a fork of this one would copy locks that its
+# threads hold, or forked from a server that has no threads.
+_contexts: list[Any] = [multiprocessing.get_context("spawn")]
 
 
 class WorkerLost(RuntimeError):
@@ -38,13 +43,13 @@ class Overrun(RuntimeError):
 
 
 class WorkerProcess:
-    """One spawned process and the parent's end of its pipe; it imports `module` at once."""
+    """One process and the parent's end of its pipe."""
 
-    def __init__(self, module: str = "ccd_casadi") -> None:
+    def __init__(self) -> None:
         with interrupts_held(), _one_thread_each():
-            self.pipe, theirs = _SPAWN.Pipe()
+            self.pipe, theirs = multiprocessing.Pipe()
             # A daemon: it is ended at exit even where the pool was not left properly.
-            self.process = _SPAWN.Process(target=_serve, args=(theirs, module), daemon=True)
+            self.process = _contexts[-1].Process(target=_serve, args=(theirs,), daemon=True)
             self.process.start()
         theirs.close()  # the process holds it alone: its death is an end of file here
 
@@ -133,6 +138,19 @@ def _apply(task: tuple) -> object:
     return function(*args, **kwargs)
 
 
+def import_ahead(modules: Sequence[str]) -> None:
+    """Let a server import modules, once for all processes that are started from now on, while this
+    process goes on. Elsewhere than on Linux they are spawned and import for themselves."""
+    if not sys.platform.startswith("linux"):
+        return
+    from multiprocessing import forkserver
+
+    with suppress(OSError), interrupts_held(), _one_thread_each():  # no place for its socket
+        forkserver.set_forkserver_preload(list(modules))
+        forkserver.ensure_running()
+        _contexts.append(multiprocessing.get_context("forkserver"))
+
+
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """An environment for processes to inherit: NumPy and Numba read it as they are imported."""
@@ -174,7 +192,7 @@ def tell(words: str) -> None:
         pipe.send_bytes(pickle.dumps((None, words)))
 
 
-def _serve(pipe: connection.Connection, module: str) -> None:
+def _serve(pipe: connection.Connection) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends, even by SIGKILL in mid-task;
     Ctrl-C is the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -188,7 +206,6 @@ def _serve(pipe: connection.Connection, module: str) -> None:
 
     threading.Thread(target=leave, daemon=True).start()
     _to_parent.append(pipe)
-    import_module(module)
     with suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(answer_message(pipe.recv_bytes()))

@@ -14,7 +14,7 @@ from case_documents import DROP, PLANT, TWO_MASS, edited, message
 from ccd_casadi.cases import plant_tables
 from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.first_look import module_of_workers
+from ccd_casadi.cases.first_look import modules_of_workers
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of
@@ -56,14 +56,13 @@ def test_the_contracts_case_is_read_as_it_stands() -> None:
 
 
 def test_a_first_look_says_what_worker_processes_will_need(tmp_path: Path) -> None:
-    module = module_of_workers(TWO_MASS.with_name("two_mass_built.toml"))
-    assert module is not None
-    assert hasattr(importlib.import_module(module), "race")
-    assert module_of_workers(TWO_MASS) is None
+    modules = modules_of_workers(TWO_MASS.with_name("two_mass_built.toml"))
+    assert hasattr(next(map(importlib.import_module, modules)), "race")
+    assert not modules_of_workers(TWO_MASS)
     for words in ("", "controller = 3", "[controller]\nstructure = 'sections'", "]["):
         (tmp_path / "no_case.toml").write_text(words)
-        assert module_of_workers(tmp_path / "no_case.toml") is None
-    assert module_of_workers(tmp_path / "nowhere.toml") is None
+        assert not modules_of_workers(tmp_path / "no_case.toml")
+    assert not modules_of_workers(tmp_path / "nowhere.toml")
 
 
 def test_the_problem_is_in_si() -> None:

@@ -1,6 +1,5 @@
 """The pool of workers: every result once, errors told, no process left behind."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -12,9 +11,10 @@ from pathlib import Path
 import pytest
 from busy import HANGS
 
+from ccd_casadi.support import worker_process
 from ccd_casadi.support.options import usable_cores
-from ccd_casadi.support.process_pool import Workers, begin_early, end_early
-from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost, import_ahead
 
 HERE = Path(__file__).parent
 
@@ -64,6 +64,15 @@ def pid_and_sleep(task: tuple[str, float]) -> None:
     time.sleep(seconds)
 
 
+@pytest.fixture(params=["spawned", "forked"])
+def started(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that import for themselves, and those of a server that has imported."""
+    monkeypatch.setattr(worker_process, "_contexts", worker_process._contexts[:1])
+    if request.param == "forked":
+        import_ahead(["numpy"])
+        assert len(worker_process._contexts) == 1 + sys.platform.startswith("linux")
+
+
 # ---- results -------------------------------------------------------------------------------------
 
 
@@ -76,19 +85,7 @@ def test_every_task_gives_its_result_once(count: int, tasks: int) -> None:
     assert found == again == [i * i for i in range(tasks)]
 
 
-def test_a_pool_takes_the_processes_that_were_started_early() -> None:
-    before = {child.pid for child in multiprocessing.active_children()}
-    begin_early(2, "ccd_casadi")
-    early = {child.pid for child in multiprocessing.active_children()} - before
-    with Workers(2) as workers:
-        used = {found[0] for found in workers.map_unordered(whereabouts, range(8))}
-        assert len(early) == 2
-        assert used <= early
-    begin_early(2, "ccd_casadi")
-    end_early()
-    assert {child.pid for child in multiprocessing.active_children()} == before
-
-
+@pytest.mark.usefixtures("started")
 def test_workers_are_other_processes_with_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
@@ -144,6 +141,7 @@ def test_an_exception_reaches_the_caller(count: int) -> None:
         assert sorted(workers.map_unordered(square, [1, 2])) == [1, 4]
 
 
+@pytest.mark.usefixtures("started")
 def test_the_task_of_a_killed_worker_is_tried_again(tmp_path: Path) -> None:
     mark = str(tmp_path / "died")
     with Workers(2) as workers:
@@ -160,6 +158,7 @@ def test_equal_tasks_are_not_taken_for_the_same(tmp_path: Path) -> None:
         assert list(workers.map_unordered(dies_once, tasks)) == [4] * 4
 
 
+@pytest.mark.usefixtures("started")
 def test_a_task_that_kills_twice_is_told() -> None:
     with Workers(2) as workers, pytest.raises(WorkerLost, match="died twice") as caught:
         list(workers.map_unordered(dies, range(8)))
@@ -167,6 +166,7 @@ def test_a_task_that_kills_twice_is_told() -> None:
     assert workers._workers == []
 
 
+@pytest.mark.usefixtures("started")
 def test_a_call_in_a_process_of_its_own_gives_its_result_or_what_went_wrong() -> None:
     with Runner() as runner:
         assert runner.call(60.0, square, 3) == 9
@@ -217,7 +217,8 @@ import sys
 sys.path[:0] = {[str(HERE), str(HERE.parent / "support")]!r}
 import ccd_casadi.solve  # as the command does: workers import it as they start
 from ccd_casadi.support.command_line import parser, run
-from ccd_casadi.support.process_pool import Workers, begin_early, end_early
+from ccd_casadi.support.interrupts import exit_on_ctrl_c
+from ccd_casadi.support.process_pool import Workers
 from test_parallel import pid_and_sleep
 
 def main(options):
@@ -225,16 +226,19 @@ def main(options):
         list(workers.map_unordered(pid_and_sleep, [(str(options.out), {2.0 * HANGS})] * 8))
 
 if __name__ == "__main__":
-    sys.exit(run(main, parser("parent", "")))
+    exit_on_ctrl_c()
+    ahead = ["ccd_casadi.sampling.samples"] if "--seed" in sys.argv else []
+    sys.exit(run(main, parser("parent", ""), early=lambda options: ahead))
 """
 
 
-def parent(tmp_path: Path) -> subprocess.Popen[str]:
+def parent(tmp_path: Path, forked: bool = False) -> subprocess.Popen[str]:
+    """A command that waits for its workers; those are `forked` or spawned."""
     script, folder = tmp_path / "parent.py", tmp_path / "pids"
     script.write_text(PARENT)
     folder.mkdir()
     return subprocess.Popen(
-        [sys.executable, str(script), "--out", str(folder)],
+        [sys.executable, str(script), "--out", str(folder), *["--seed", "1"] * forked],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
 
@@ -246,10 +250,13 @@ def children(tmp_path: Path) -> set[int]:
     return {int(path.name) for path in folder.iterdir()}
 
 
+@pytest.mark.parametrize("forked", [False, True], ids=["spawned", "forked"])
 @pytest.mark.parametrize("whole_group", [True, False], ids=["terminal", "parent-only"])
-def test_ctrl_c_ends_promptly_and_leaves_no_orphan(tmp_path: Path, whole_group: bool) -> None:
+def test_ctrl_c_ends_promptly_and_leaves_no_orphan(
+    tmp_path: Path, whole_group: bool, forked: bool
+) -> None:
     """A terminal sends SIGINT to every process of the group, `kill -INT` to one."""
-    process = parent(tmp_path)
+    process = parent(tmp_path, forked)
     pids = children(tmp_path)
     assert all(map(alive, pids))
     if whole_group:
@@ -266,8 +273,11 @@ def test_ctrl_c_ends_promptly_and_leaves_no_orphan(tmp_path: Path, whole_group: 
 @pytest.mark.parametrize(
     "delay", [0.0, 0.2, *(pytest.param(d, marks=pytest.mark.slow) for d in (0.1, 0.3, 0.4))]
 )
-def test_ctrl_c_while_the_workers_start_is_quiet(tmp_path: Path, delay: float) -> None:
-    process = parent(tmp_path)
+@pytest.mark.parametrize("forked", [False, True], ids=["spawned", "forked"])
+def test_ctrl_c_while_the_workers_start_is_quiet(
+    tmp_path: Path, delay: float, forked: bool
+) -> None:
+    process = parent(tmp_path, forked)
     # Until `run` is entered Python itself ends the process, with its own words.
     started = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     assert until(lambda: len(started.read_text().split()) >= 2, HANGS)  # tracker and a worker
@@ -281,8 +291,11 @@ def test_ctrl_c_while_the_workers_start_is_quiet(tmp_path: Path, delay: float) -
 @pytest.mark.parametrize(
     "kind", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
-def test_workers_end_with_a_killed_parent(tmp_path: Path, kind: signal.Signals) -> None:
-    process = parent(tmp_path)
+@pytest.mark.parametrize("forked", [False, True], ids=["spawned", "forked"])
+def test_workers_end_with_a_killed_parent(
+    tmp_path: Path, kind: signal.Signals, forked: bool
+) -> None:
+    process = parent(tmp_path, forked)
     pids = children(tmp_path)
     assert all(map(alive, pids))
     process.send_signal(kind)
