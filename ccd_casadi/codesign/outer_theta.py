@@ -59,7 +59,7 @@ class ThetaOuter(Outer, ABC):
     ) -> Place | None:
         problem = self.problem
         first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)
-        best = pieces_from(self.sampler, sample, least, first)
+        best = pieces_from(self.sampler, sample, least, first, known)
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None
@@ -71,14 +71,20 @@ class ThetaOuter(Outer, ABC):
 
 
 def pieces_from(
-    sampler: Sampler, best: InnerSample, settled: float, first: float = FIRST
+    sampler: Sampler,
+    best: InnerSample,
+    settled: float,
+    first: float = FIRST,
+    ends: Sequence[Place] = (),
 ) -> InnerSample:
-    """From a sample to where the pieces of J promise no more, with what is known near by.
+    """From a sample to where the pieces of J promise no more, or near a stationary point of `ends`,
+    with what is known near by.
 
     Again from the best where a better controller was found on the way for what had been known.
     """
     problem, asked = sampler.problem, [best]
     bounds = box(problem)
+    ended = [(bounds.shares(place.x), place.objective) for place in ends if place.stationary]
 
     def at(z: Array) -> Local | None:
         asked.extend(sampler.values(bounds.point(z), "local solve"))
@@ -103,7 +109,9 @@ def pieces_from(
         if start is None:
             break
         steps = STEPS * len(problem.names)
-        descend(at, start, known, constraints, steps=steps, settled=settled, first=first)
+        descend(
+            at, start, known, constraints, steps=steps, settled=settled, first=first, ended=ended
+        )
         best = min(sampler.latest(asked), key=lambda sample: objective_of(problem, sample))
         if sampler.improvements == improvements:
             break

@@ -28,6 +28,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
 from ccd_casadi.fixed_structure.loop_problem import Assessment
 from ccd_casadi.fixed_structure.optimality import Envelope, Optimality, envelope_of, optimality
+from ccd_casadi.fixed_structure.race import at_its_bandwidth
 from ccd_casadi.fixed_structure.sections_design import (
     DesignSearch,
     SectionsDesign,
@@ -44,7 +45,9 @@ from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 
 REWARD = 1e-6  # of ln ω_b in ln v
-SLOWER = 0.1  # of the largest bandwidth: where a search from a given κ begins
+INSIDE = (
+    0.7  # of the bandwidth that its bounds leave a given κ: a search that begins at bounds crawls
+)
 KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
 
 
@@ -162,19 +165,25 @@ def least_value(
     first = float(np.exp(goal.at(design.kappa)[0]))
     best = LeastValue(design, first, first, 0, None)
     steps = 0
-    slower = max(SLOWER * design.bandwidth, least_bandwidth)
-    given = [(slower, tuple(map(float, item))) for item in initial]
+    given = [(np.inf, tuple(map(float, item))) for item in initial]
     for bandwidth, kappa in [*given, own, *others]:
         if only_initial and (bandwidth, kappa) == own and best.design is not design:
             break
         if bandwidth < least_bandwidth:
             continue
         begin = in_problem_units(problem, np.array(kappa))
-        start = model.at(np.append(begin, np.log(bandwidth / w0)))
-        if start is None:
+        tau = float(np.log(bandwidth / w0))
+        if np.isinf(tau):
+            tau = max(at_its_bandwidth(problem, begin).tau + float(np.log(INSIDE)), floor)
+        start = model.at(np.append(begin, tau))
+        if start is None or model.is_known(start.x):
             continue
         end, count = descend(model, start, first_hessian, problem.margin)
         steps += count
+        new = not model.is_known(end.x)
+        model.known += [start.x, end.x]
+        if not new:
+            continue
         made, conditions = _judged(search, end, design, floor)
         value = float(np.exp(end.value + REWARD * end.x[-1]))
         at = f"{goal.shown(value)} at {made.bandwidth / HZ:.2f} Hz"

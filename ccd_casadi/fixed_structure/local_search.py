@@ -23,6 +23,7 @@ PENALTY = 20.0  # above the sum of multipliers: a per cent of a bound is worth s
 RESTORING = 400.0  # that of an end that is to be brought within its bounds
 PENALTIES = (20.0, 200.0, 2000.0)  # of a goal; the next one where a bound is left passed
 LEAST_RADIUS, LEAST_GAIN = 1e-7, 1e-9
+MERGED = 1e-3  # in κ and τ: searches as close as that are one
 MOST = 200  # steps with one penalty
 
 Goal = Callable[[Array], tuple[float, Array]]
@@ -55,7 +56,10 @@ class Ascent:
 
 
 class LoopModel(Model[Assessment]):
-    """The bounds of a set of loops as rows over x = (κ, τ); `goal` gives v(κ) and its gradient."""
+    """The bounds of a set of loops as rows over x = (κ, τ); `goal` gives v(κ) and its gradient.
+
+    `known`: x where searches have been; another one ends when it comes there.
+    """
 
     corrected = True
 
@@ -67,6 +71,7 @@ class LoopModel(Model[Assessment]):
         floor: float = -np.inf,
     ) -> None:
         self.problem, self.goal, self.reward = problem, goal, reward
+        self.known: list[Array] = []
         # A step that fails is followed by one from the same place.
         self.all_rows = lru_cache(2)(
             lambda here: all_rows(problem, here.x[:-1], float(here.x[-1]), here.data)
@@ -115,6 +120,14 @@ class LoopModel(Model[Assessment]):
         if self.goal is None:
             return H
         return symmetric_rank_one(H, there.x - here.x, there.gradient - here.gradient)
+
+    def ended(self, here: Iterate[Assessment], there: Iterate[Assessment]) -> bool:
+        """Where another search has been."""
+        return self.is_known(there.x)
+
+    def is_known(self, x: Array) -> bool:
+        """Whether another search has been there."""
+        return any(np.abs(x - other).max() <= MERGED for other in self.known)
 
 
 def all_rows(problem: LoopProblem, kappa: Array, tau: float, found: Assessment) -> Constraints:

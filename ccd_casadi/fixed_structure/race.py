@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import PENALTY, Ascent, Point, ascend
+from ccd_casadi.fixed_structure.local_search import MERGED, PENALTY, Ascent, Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
@@ -27,7 +27,6 @@ LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
-MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
 NEWTON = 8  # steps at most to the bandwidth of a controller
 WITHIN = 1e-4  # ln: a violation that the end of a search may have

@@ -26,7 +26,9 @@ BENT = 0.5  # of the largest slope, per share of the box: by what a piece is low
 RESTORED = 5  # Newton's steps back to λ <= 0
 INSIDE = 1e-10  # of λ
 HELD = 1e-3  # of the combination of pieces: the share of one that counts
+STRAIGHT = 0.05  # of the change of slope: how far J along one piece may be off the mean slope
 JUMP = 10.0  # times the slopes on both sides: what is steeper is no kink
+BASIN = 1e-2  # of the box: this close to an optimum that is known, and no lower, is its basin
 BESIDE = 1e-3  # of the box: so near by no other piece is as steep
 
 Constraints = Callable[[Array], tuple[Array, Array]]
@@ -57,16 +59,17 @@ def descend(
     steps: int,
     settled: float,
     first: float = FIRST,
+    ended: Sequence[tuple[Array, float]] = (),
 ) -> Local:
-    """The best point after at most `steps` new ones, where the pieces promise no more, or beside a
-    jump of J.
+    """The best point after at most `steps` new ones, where the pieces promise no more, beside a
+    jump of J, or in the basin of an optimum (z, J) where others `ended`.
 
     `at` gives None where J is not known; `constraints` λ (m,) and ∇λ (m, n). `settled` is relative
     to J, `first` the first radius, a share of the box. `known` gives all points that were met, at
     any time, each as it is known by then; `start` keeps λ <= 0.
     """
     n = start.z.size
-    model = _Pieces(at, start, known, constraints)
+    model = _Pieces(at, start, known, constraints, ended)
     end = minimise(
         model, model.iterate(start), np.zeros((n, n)), Radius(first, LEAST, LARGEST), steps=steps,
         penalty=model.size, least_gain=settled * abs(start.value),
@@ -82,8 +85,9 @@ class _Pieces(Model[Local]):
     def __init__(
         self, J: Callable[[Array], Local | None], start: Local,
         known: Callable[[], Sequence[Local]], constraints: Constraints,
+        optima: Sequence[tuple[Array, float]],
     ) -> None:  # fmt: skip
-        self.J, self.known, self.constraints = J, known, constraints
+        self.J, self.known, self.constraints, self.optima = J, known, constraints, optima
         self.low, self.high = np.zeros(start.z.size), np.ones(start.z.size)
         self.size = max(float(np.abs(start.gradient).max()), 1e-300)
 
@@ -119,24 +123,33 @@ class _Pieces(Model[Local]):
     def learnt(
         self, H: Array, here: Iterate[Local], there: Iterate[Local], step: Step, radius: float
     ) -> Array:
-        """That of the pieces' combination."""
-        if there.value >= here.value:
-            return H
-        after = best_step(self, there, H, radius, self.size)
-        if after is None:
-            return H
-        held, holding = (int((self._shares(one) > HELD).sum()) for one in (step, after))
-        if held != holding:
-            return H  # across a kink that has just been met the slopes tell no curvature
-        moved, change = there.x - here.x, self._combined(after) - self._combined(step)
+        """That of the pieces' combination; where a step leads too far along one piece, that of it."""
+        a, b, moved = here.data, there.data, there.x - here.x
+        change = b.gradient - a.gradient
+        if b.value >= a.value:
+            # A kink between would have to lie in the middle for the mean slope to give the rise.
+            bend = b.value - a.value - 0.5 * float((a.gradient + b.gradient) @ moved)
+            kink = abs(bend) > STRAIGHT * abs(float(change @ moved))
+            if kink or H.any() or self._shares(step)[0] < 1.0 - HELD:
+                return H
+        else:
+            after = best_step(self, there, H, radius, self.size)
+            if after is None:
+                return H
+            held, holding = (int((self._shares(one) > HELD).sum()) for one in (step, after))
+            if held != holding:
+                return H  # across a kink that has just been met the slopes tell no curvature
+            change = self._combined(after) - self._combined(step)
         if not H.any():
             seen = abs(float(moved @ change)) / float(moved @ moved)
-            H = max(seen, 1e-3 * float(np.abs(self._combined(after)).max())) * np.eye(len(H))
+            H = max(seen, 1e-3 * float(np.abs(there.data.gradient).max())) * np.eye(len(H))
         return damped_bfgs(H, moved, change) if H.any() else H
 
     def ended(self, here: Iterate[Local], there: Iterate[Local]) -> bool:
-        """Beside a jump."""
-        return there.value > here.value and jumps(here.data, there.data)
+        """Beside a jump, or in the basin of an optimum that is known, and no lower."""
+        if there.value > here.value and jumps(here.data, there.data):
+            return True
+        return any(there.value >= J and np.abs(there.x - z).max() <= BASIN for z, J in self.optima)
 
     def _shares(self, step: Step) -> Array:
         """Of each piece in the combination that holds a step."""
