@@ -28,7 +28,8 @@ class Triangular:
     def __init__(self, systems: Sequence[StateSpace]) -> None:
         forms = [schur(x.A, output="complex") for x in systems]
         self.T = np.array([T for T, _ in forms])
-        self.coupled = np.triu((self.T != 0.0).any(axis=0), 1)  # few states of a modal plant are
+        coupled = np.triu((self.T != 0.0).any(axis=0), 1)
+        self.coupled = [np.flatnonzero(row) for row in coupled]  # few states of a modal plant are
         self.B = np.array([Q.conj().T @ x.B for (_, Q), x in zip(forms, systems, strict=True)])
         self.C = np.array([x.C @ Q for (_, Q), x in zip(forms, systems, strict=True)])
         self.D = np.array([x.D for x in systems])
@@ -49,7 +50,7 @@ class Triangular:
         n, m = B.shape[1:]
         X = np.empty((N, n, k * m), complex)  # (s - T)⁻¹B
         for i in reversed(range(n)):
-            right, j = B[:, i, None, :], np.flatnonzero(self.coupled[i])
+            right, j = B[:, i, None, :], self.coupled[i]
             if len(j):
                 right = right + (T[:, i, j][:, None] @ X[:, j]).reshape(N, k, m)
             X[:, i] = (right / (s - T[:, i, i, None])[..., None]).reshape(N, k * m)

@@ -123,7 +123,7 @@ class _Pieces(Model[Local]):
     def learnt(
         self, H: Array, here: Iterate[Local], there: Iterate[Local], step: Step, radius: float
     ) -> Array:
-        """That of the pieces' combination; where a step leads too far along one piece, that of it."""
+        """That of the pieces' combination; after a step too far along one piece, of that one."""
         a, b, moved = here.data, there.data, there.x - here.x
         change = b.gradient - a.gradient
         if b.value >= a.value:
