@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.cases.first_look import modules_of_workers
+from ccd_casadi.cases.first_look import SEARCH, is_searched
 from ccd_casadi.support.command_line import ExitCode, command, run_folder
 from ccd_casadi.support.options import break_frequencies, break_frequency_options, option
 from ccd_casadi.support.terminal import inform
@@ -25,7 +25,7 @@ PROGRESS = partial(inform, stream=sys.stderr)  # stdout is for the answer
            help="sections: start one search from the controller of this run, not many"),
     *break_frequency_options("of a weight; with both: one synthesis, no search"),
     needs=["ccd_casadi.codesign.result"],
-    early=lambda options: modules_of_workers(options.case),
+    early=lambda options: SEARCH if is_searched(options.case) else (),
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""

@@ -2,11 +2,11 @@
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.cases.first_look import modules_of_workers
+from ccd_casadi.cases.first_look import DRAWING, SAMPLING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
@@ -114,6 +114,13 @@ def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -
     return replace(solution, result=solution.result | {"reason": words})
 
 
+def of_workers(options: argparse.Namespace) -> Sequence[str]:
+    """What worker processes will need, and draw pages with."""
+    if options.scheduler:
+        return ()
+    return SAMPLING if options.no_report else (*SAMPLING, *DRAWING)
+
+
 @command(
     "ccd_casadi.solve", "Design a stage and its controller together.",
     option("--formulation", choices=FORMULATIONS,
@@ -123,7 +130,7 @@ def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -
     option("--no-report", action="store_true",
            help="write no pages, for jobs that only need result.json"),
     SCHEDULER, needs=["ccd_casadi.codesign.run"],
-    early=lambda options: None if options.scheduler else modules_of_workers(options.case),
+    early=of_workers,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
@@ -149,25 +156,23 @@ def main(options: argparse.Namespace) -> ExitCode:
         if slow:
             say(f"warning: {slow}", sys.stderr)
     store = folder / "samples.sqlite"
-    with (
-        pool(options.scheduler, options.workers, PATIENCE) as workers,
-        SampleStore(store) as samples,
-    ):
-        if options.resume:
-            held = counted(samples.count(), "row") if samples.count() else "nothing yet"
-            inform(f"resuming      {store} holds {held}", sys.stderr)
-        sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-        solution = with_units(co_design(sampler, formulation, options.seed), case, problem)
-        write_run(folder, case, solution)
-    code = ExitCode.of(solution.result["status"])
-    inform(summary(solution))
-    inform(f"run folder    {folder}")
-    if not options.no_report:
-        from ccd_casadi.reporting.solve_page import write_report
+    with pool(options.scheduler, options.workers, PATIENCE) as workers:
+        with SampleStore(store) as samples:
+            if options.resume:
+                held = counted(samples.count(), "row") if samples.count() else "nothing yet"
+                inform(f"resuming      {store} holds {held}", sys.stderr)
+            sampler = Sampler(problem, samples, workers, quiet=options.quiet)
+            solution = with_units(co_design(sampler, formulation, options.seed), case, problem)
+            write_run(folder, case, solution)
+        code = ExitCode.of(solution.result["status"])
+        inform(summary(solution))
+        inform(f"run folder    {folder}")
+        if not options.no_report:
+            from ccd_casadi.reporting.solve_page import write_report
 
-        plant_case, solved = resolved(case, solution), solution.problem or problem
-        write_report(folder, plant_case, solved, solution)
-        inform(f"page          {folder / 'index.html'}")
+            plant_case, solved = resolved(case, solution), solution.problem or problem
+            write_report(folder, plant_case, solved, solution, workers)
+            inform(f"page          {folder / 'index.html'}")
     if options.quiet and code is not ExitCode.DONE:
         say(f"{options.case}: {solution.result['reason']}", sys.stderr)
     return code

@@ -21,6 +21,7 @@ from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import SUPERSCRIPT, THEME
 from ccd_casadi.drawing.turntable import data, legend, still
 from ccd_casadi.support.package_text import package_text, printable, template
+from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.units import number
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request, no script but ours
@@ -70,13 +71,14 @@ def _power(found: re.Match[str]) -> str:
     return power if found[1] == "1" else f"{found[1]}·{power}"
 
 
-def page_html(page: c.Page) -> str:
-    """The whole document.
+def page_html(page: c.Page, workers: Pool | None = None) -> str:
+    """The whole document; `workers` draw a chapter each.
 
     Its policy forbids any request; a script that the body needs is allowed by its hash alone.
     """
-    chapters = enumerate(page.chapters, 1)
-    body = Markup("\n").join(block_html(chapter, str(i)) for i, chapter in chapters)
+    chapters = {i: (chapter, str(i)) for i, chapter in enumerate(page.chapters, 1)}
+    drawn = dict(results(workers, block_html, chapters))
+    body = Markup("\n").join(drawn[i] for i in chapters)
     own = [name for name, mark in SCRIPTS.items() if mark in body]
     scripts = [package_text(f"drawing/assets/{name}.js") for name in own]
     css = CSS + "".join(package_text(f"drawing/assets/{n}.css") for n in own if n in STYLED)

@@ -13,13 +13,14 @@ from ccd_casadi.drawing.content import Page
 from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import plain, restored
+from ccd_casadi.support.process_pool import Pool
 from surrogates.files import write_whole
 
 NAME = "report.json"
 FORMAT = 1
 
 
-def write_page(path: Path, page: Page) -> None:
+def write_page(path: Path, page: Page, workers: Pool | None = None) -> None:
     """Draw a page and keep what it shows in report.json beside it, each atomically."""
     try:
         pages = read_pages(path.parent)
@@ -28,10 +29,10 @@ def write_page(path: Path, page: Page) -> None:
     pages[path.name] = plain(page, listed=True)
     content = {"format": FORMAT, "pages": pages}
     write_whole(path.with_name(NAME), json.dumps(content, ensure_ascii=False, allow_nan=False))
-    draw(path, pages[path.name])
+    draw(path, pages[path.name], workers)
 
 
-def draw(path: Path, stored: Any) -> None:
+def draw(path: Path, stored: Any, workers: Pool | None = None) -> None:
     """Draw a page from an entry of report.json, whose chapters may be called sections. Raises
     UserError where it is none."""
     try:
@@ -39,7 +40,7 @@ def draw(path: Path, stored: Any) -> None:
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
         words = f"pages.{path.name}: is not what a page shows; repeat the command that wrote it"
         raise UserError(f"{path.with_name(NAME)}: {words}") from None
-    write_whole(path, page_html(page))
+    write_whole(path, page_html(page, workers))
 
 
 def read_pages(folder: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.drawing.stored import write_page
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.reporting.verdict import run_head, with_verdict_of
+from ccd_casadi.support.process_pool import Pool
 from surrogates.files import write_whole
 
 PAGES = {
@@ -37,9 +38,9 @@ def index_of(folder: Path) -> str:
     return ""
 
 
-def publish(folder: Path, path: Path, page: Page) -> None:
+def publish(folder: Path, path: Path, page: Page, workers: Pool | None = None) -> None:
     """Write a page about the run in `folder` with what it shows, and the run's index anew."""
-    write_page(path, page)
+    write_page(path, page, workers)
     write_index(folder)
 
 

@@ -47,6 +47,7 @@ from ccd_casadi.reporting.structured_page import (
     limits_blocks,
 )
 from ccd_casadi.reporting.verdict import run_head
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
 
 if TYPE_CHECKING:  # solve imports this module
@@ -61,10 +62,13 @@ ORDER = (
 Part = Callable[[], list[c.Chapter]]
 
 
-def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Path:
+def write_report(
+    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution",
+    workers: Pool | None = None,
+) -> Path:  # fmt: skip
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
-    publish(folder, path, solve_page(folder, case, problem, solution))
+    publish(folder, path, solve_page(folder, case, problem, solution), workers)
     return path
 
 

@@ -14,7 +14,7 @@ from case_documents import DROP, PLANT, TWO_MASS, edited, message
 from ccd_casadi.cases import plant_tables
 from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.first_look import modules_of_workers
+from ccd_casadi.cases.first_look import DRAWING, SAMPLING, is_searched
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of
@@ -55,14 +55,15 @@ def test_the_contracts_case_is_read_as_it_stands() -> None:
     assert (case.outer.starts, case.outer.tolerance, case.outer.max_refinements) == (16, 1e-3, 12)
 
 
-def test_a_first_look_says_what_worker_processes_will_need(tmp_path: Path) -> None:
-    modules = modules_of_workers(TWO_MASS.with_name("two_mass_built.toml"))
-    assert hasattr(next(map(importlib.import_module, modules)), "race")
-    assert not modules_of_workers(TWO_MASS)
+def test_a_first_look_says_whether_worker_processes_will_be_needed(tmp_path: Path) -> None:
+    assert is_searched(TWO_MASS.with_name("two_mass_built.toml"))
+    assert not is_searched(TWO_MASS)
     for words in ("", "controller = 3", "[controller]\nstructure = 'sections'", "]["):
         (tmp_path / "no_case.toml").write_text(words)
-        assert not modules_of_workers(tmp_path / "no_case.toml")
-    assert not modules_of_workers(tmp_path / "nowhere.toml")
+        assert not is_searched(tmp_path / "no_case.toml")
+    assert not is_searched(tmp_path / "nowhere.toml")
+    for module in (*SAMPLING, *DRAWING):
+        importlib.import_module(module)
 
 
 def test_the_problem_is_in_si() -> None:

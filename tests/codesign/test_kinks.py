@@ -102,6 +102,55 @@ def test_pieces_that_are_not_convex_lead_to_a_sharp_minimiser(seed: int, n: int)
     assert abs(end.value - J0) <= 1e-7 * abs(J0)  # 9.7e-9 at most on 1500 draws
 
 
+@few(max_examples=20)
+@given(SEEDS, st.floats(0.05, 0.3))
+def test_a_step_too_far_along_a_smooth_piece_shows_its_curvature(seed: int, share: float) -> None:
+    """The tangents at both ends of a bracket meet in its middle: that alone would only halve it."""
+    rng = np.random.default_rng(seed)
+    bend, cubic = rng.uniform(5.0, 50.0), rng.uniform(-3.0, 3.0)
+    met: list[Local] = []
+
+    def at(z: np.ndarray) -> Local:
+        d = float(z[0] - 0.5)
+        value = 8.0 + 0.5 * bend * d**2 + cubic * d**3
+        met.append(Local(z, value, np.array([bend * d + 3.0 * cubic * d**2])))
+        return met[-1]
+
+    def free(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(0), np.zeros((0, 1))
+
+    start = at(np.array([0.5 + share * 1e-2]))  # a first step leads 1e-2 down, which is too far
+    end = descend(at, start, lambda: met, free, steps=30, settled=1e-12)
+    assert end.value - 8.0 <= 1e-11
+    assert len(met) <= 5  # 10 or more by halves
+
+
+def test_a_descent_ends_in_the_basin_of_an_optimum_that_is_known() -> None:
+    met: list[Local] = []
+
+    def at(z: np.ndarray) -> Local:
+        d = z - 0.2
+        met.append(Local(z, 5.0 + float(d @ d + 3.0 * d @ d**2), 2.0 * d + 9.0 * d**2))
+        return met[-1]
+
+    def free(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(0), np.zeros((0, 1))
+
+    def ended(*optima: tuple[np.ndarray, float]) -> float:
+        met.clear()
+        start = at(np.array([0.5]))
+        return descend(
+            at, start, lambda: met, free, steps=30, settled=1e-12, first=0.1, ended=optima
+        ).value
+
+    assert ended() == pytest.approx(5.0, abs=1e-9)
+    alone = len(met)
+    assert ended((np.array([0.2]), 5.0)) <= 5.0 + 1e-4
+    assert len(met) < alone
+    # A worse one does not hold it: this is not its basin.
+    assert ended((np.array([0.2]), 5.5)) == pytest.approx(5.0, abs=1e-9)
+
+
 def test_what_is_known_better_by_now_does_not_hold_a_descent() -> None:
     """The start belongs to a poor branch, which is known to be poor as soon as another is met."""
     met = {0.55: Local(np.array([0.55]), 7.0, np.array([-10.0]))}

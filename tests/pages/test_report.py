@@ -23,6 +23,7 @@ from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.deployment.channels import scalar_channels
 from ccd_casadi.drawing.paint import block_html, page_html
+from ccd_casadi.drawing.stored import draw, read_pages
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
@@ -256,6 +257,15 @@ def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
     text = page_html(solve_page(tmp_path, case, problem, Solution(result, nothing, None)))
     Document(text)
     assert "S_max cannot be met by &lt;0.1&gt;" in text
+
+
+def test_workers_draw_the_same_page(tmp_path: Path) -> None:
+    folder, *_, first = run("one")
+    stored = read_pages(folder)["report.html"]
+    with Workers(2) as workers:
+        draw(tmp_path / "report.html", stored, workers)
+        assert len(workers._workers) == 2
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == first
 
 
 @pytest.mark.parametrize("name", ["one", "two_mass"])

@@ -89,6 +89,12 @@ def test_a_search_at_the_end_climbs_from_its_design_beside_the_warm_start(
     assert more[0] == pytest.approx(known)
     assert more[1:] == [pytest.approx(first.kappa)]
     assert both.value <= alone.value
+    # What another search has gone through is not searched again, and the end is the same.
+    begun.clear()
+    twice = least_value(plants, KEPT, first, goal, sampling=FAST, initial=[known, known],
+                        only_initial=True)  # fmt: skip
+    assert len(begun) == 1
+    assert (twice.value, twice.steps) == (alone.value, alone.steps)
 
 
 @pytest.mark.parametrize(
