@@ -44,8 +44,9 @@ from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import Point, ascend
-from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopCurve, LoopProblem
+from ccd_casadi.fixed_structure.local_search import ascend
+from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopCurve
+from ccd_casadi.fixed_structure.race import at_its_bandwidth
 from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -205,28 +206,16 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     drawn["S_max"] = max(drawn["S_max"], 1.2)
     asked = replace(asked, bounds=replace(asked.bounds, **drawn))
     problem = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
-    first = at_its_bandwidth(problem, Point(starts[0], FIRST, assess(problem, starts[0], FIRST)))
+    first = at_its_bandwidth(problem, starts[0], within=MARGIN)
     end = ascend(problem, first, iterations=CLIMB)
-    point, looked = at_its_bandwidth(problem, end.point), end.evaluations
+    point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, MARGIN)
+    looked = end.evaluations
     if point.assessment.violation > MARGIN:
         end = ascend(problem, point, iterations=RESTORED, restoring=True, radius=0.05)
-        point, looked = at_its_bandwidth(problem, end.point), looked + end.evaluations
+        point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, MARGIN)
+        looked += end.evaluations
     search = DesignSearch(problem, plants, asked.sampling, seed=seed)
     return asked, search.designed(point, (), 1, looked)
-
-
-def at_its_bandwidth(problem: LoopProblem, point: Point) -> Point:
-    """The point with the largest ω_b that the shape and -3 dB leave its controller."""
-    for _ in range(8):
-        peaks = point.assessment.peaks
-        assert peaks is not None
-        rising = peaks.to_tau > 0.0
-        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=1.0))
-        if abs(room) < MARGIN:
-            break
-        tau = point.tau + float(np.clip(room, -1.0, 1.0))
-        point = Point(point.kappa, tau, assess(problem, point.kappa, tau))
-    return point
 
 
 def proved(asked: Case, design: SectionsDesign) -> Proof:

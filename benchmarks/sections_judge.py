@@ -82,7 +82,8 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
     steps = np.concatenate([-np.geomspace(1e-2, 30.0, 25), [0.0], np.geomspace(1e-2, 30.0, 25)])
     omega += [abs(p.imag) + abs(p.real) * steps for p in near]
     bandwidth, bounds = design.bandwidth, asked.bounds
-    w = np.unique(np.concatenate([*omega, [bandwidth, bounds.omega_low]]))
+    rest = [] if asked.structure.integrator else [1e-5 * bounds.omega_low]
+    w = np.unique(np.concatenate([*omega, [bandwidth, bounds.omega_low], rest]))
     w = w[(w > 0.0) & (w <= top)]
     s = 1j * w
     free = (right * left / (s[:, None] - poles)).sum(1)

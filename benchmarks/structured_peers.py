@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from random_sections import at_its_bandwidth, case
+from random_sections import case
 from scipy.optimize import minimize
 from sections_judge import Case
 
@@ -30,8 +30,8 @@ from ccd_casadi.fixed_structure.design import _pool, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
-from ccd_casadi.fixed_structure.race import started
-from ccd_casadi.fixed_structure.sections_design import DesignSearch
+from ccd_casadi.fixed_structure.race import at_its_bandwidth, started
+from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
 from ccd_casadi.plants.scaling import ScaledPlant
 
 STARTS = 12
@@ -95,7 +95,8 @@ def by_slsqp(problem: LoopProblem, start: Point, until: float) -> Point | None:
         pass
     kappa = np.clip(best[:-1], *problem.box)
     end = Point(kappa, float(best[-1]), assess(problem, kappa, float(best[-1])))
-    return at_its_bandwidth(problem, end) if end.assessment.stable else None
+    stable = end.assessment.stable
+    return at_its_bandwidth(problem, kappa, end.tau, MARGIN) if stable else None
 
 
 def peer(

@@ -169,13 +169,14 @@ def judged(
         roots = [poles[i], np.linalg.eigvals(G[i].A), own, free[i].zeros(_size(free[i])), *zeros]
         grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner))
     grid, rows = padded(grids), np.arange(len(good))
+    if not integrator:
+        grid = np.concatenate([REST * grid[:, :1], grid], axis=1)
     table = LoopTable([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
                       integrator)  # fmt: skip
     if len(free[0].C) > 1:
         grid = with_crossings(table, grid)
     values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
-    rest = low if integrator else table.at(rows, REST * grid[:, :1])
     tops = peaks(table, grid, values)
     loops = [loops[i] for i in good]
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"])
@@ -205,7 +206,7 @@ def judged(
             weighted_KS=float(weighted[0][k]),
             weighted_T=float(weighted[1][k]),
             # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
-            static_compliance=0.0 if integrator else float(rest["GS"][k, 0]),
+            static_compliance=0.0 if integrator else float(values["GS"][k, 0]),
             low_compliance=float(low["GS"][k, 0]),
             confirmed=bool(confirmed[k]),
             channels=tuple(channels[k]),

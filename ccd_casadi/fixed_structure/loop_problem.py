@@ -29,6 +29,7 @@ from ccd_casadi.support.arrays import Array
 
 FIRST = float(np.log(0.1))  # τ, ω_b over ω₀
 PER_DECADE = 24
+REST = 1e-3  # of the lowest other frequency: gains are those at 0 Hz but for 1e-9
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class LoopProblem:
 
     @cached_property
     def base(self) -> Array:
-        """v from far below ω_low and every root to far above, logarithmic."""
+        """v from far below ω_low and every root to far above, logarithmic; without an integrator
+        the first is all but rest, where gains may be largest."""
         sizes = np.abs(self.plants.poles[(self.plants.residues != 0.0).any(axis=(2, 3))])
         bottom = 0.03 * min(self.low, float(sizes.min()))
         top = 100.0 * max(1.0, float(sizes.max()))  # of a rigid body ω₀, not its suspension
@@ -64,7 +66,8 @@ class LoopProblem:
             top = max(top, 10.0 * max(w.c_K * w.omega_K, w.omega_T / w.A_u) / self.plants.omega_0)
         if self.plants.period is not None:
             top = 100.0 / self.plants.period
-        return np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
+        v = np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
+        return v if self.structure.integrator else np.append(REST * bottom, v)
 
     @cached_property
     def fixed(self) -> Array:

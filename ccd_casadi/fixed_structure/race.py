@@ -15,7 +15,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import MERGED, PENALTY, Ascent, Point, ascend
-from ccd_casadi.fixed_structure.loop_problem import LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Tell
@@ -28,7 +28,9 @@ BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
 SAME = 2e-3  # relative: bandwidths of one local optimum
-NEWTON = 8  # steps at most to the bandwidth of a controller
+NEWTON = 16  # steps at most to the bandwidth of a controller
+TOUCHES = 1e-3  # slope to τ below which -3 dB is touched from below, and not crossed
+OF_BANDWIDTH = (LoopCurve.SHAPE, LoopCurve.LEVEL, LoopCurve.CROSSING)
 WITHIN = 1e-4  # ln: a violation that the end of a search may have
 
 
@@ -111,23 +113,30 @@ def started(problem: LoopProblem, kappa: Array) -> Point:
     return own if inside else first
 
 
-def at_its_bandwidth(problem: LoopProblem, kappa: Array) -> Point:
-    """A controller at the largest ω_b that the shape and -3 dB leave it.
+def at_its_bandwidth(
+    problem: LoopProblem, kappa: Array, tau: float | None = None, within: float = WITHIN
+) -> Point:
+    """A controller at the largest ω_b that the shape and -3 dB leave it, found from `tau` on.
 
     There a known one begins: from below a climb would first make another controller of it, and end
-    in another optimum.
+    in another optimum. Where |S| falls again beyond a peak below -3 dB Newton's steps may lead away
+    from the crossing, which stays between the ω_b that were met and missed.
     """
-    tau = problem.begin(kappa)
+    tau, met, missed = problem.begin(kappa) if tau is None else tau, -np.inf, np.inf
     for _ in range(NEWTON):
         point = Point(kappa, tau, assess(problem, kappa, tau))
         peaks = point.assessment.peaks
         if peaks is None:
             break
-        rising = peaks.to_tau > 0.0
+        over = bool((peaks.value[np.isin(peaks.curve, OF_BANDWIDTH)] > within).any())
+        rising = peaks.to_tau > TOUCHES
         room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=1.0))
-        if abs(room) < WITHIN:
+        if abs(room) < within and not over:
             break
+        met, missed = (met, tau) if over else (tau, missed)
         tau += float(np.clip(room, -1.0, 1.0))
+        if not met < tau < missed:
+            tau = 0.5 * (max(met, missed - 2.0) + missed) if np.isfinite(missed) else met + 0.1
     return point
 
 

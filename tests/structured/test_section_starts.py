@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-from fixed_structure_loops import BOUNDS, plant
+import pytest
+from fixed_structure_loops import BOUNDS, FAST, plant
 from helpers import HZ, scaled, two_mass
 
 from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.race import WITHIN, distinct, run_race, started
+from ccd_casadi.fixed_structure.race import WITHIN, at_its_bandwidth, distinct, run_race, started
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
 from ccd_casadi.plants.plant import Mechanics
 
@@ -76,3 +78,19 @@ def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
         assert not lowered or point.assessment.violation <= WITHIN
         inside += lowered
     assert inside
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+@pytest.mark.parametrize("shape", [None, 1.5])
+def test_the_bandwidth_of_a_controller_is_the_judges(shape: float | None, sampling) -> None:
+    """Also where |S| falls again below -3 dB: there one of four was given another, up to 180
+    times the judge's."""
+    bounds = replace(BOUNDS, shape=shape, weighted_level=None, weights=None, compliance_max=None)
+    plants, structure = [plant(-0.02), plant(0.02)], Structure(lead=2)
+    problem, rng = problem_for(plants, structure, bounds, sampling), np.random.default_rng(3)
+    unit = problem.plants
+    drawn = at_random(problem, np.exp(rng.uniform(-4.0, 1.5, 600)), rng)
+    for kappa in stabilising(problem, drawn)[:40]:
+        K = structure.state_space(structure.in_units(kappa, unit.omega_0, unit.force))
+        judged = certify(plants, K, bounds, sampling).bandwidth / unit.omega_0
+        assert np.exp(at_its_bandwidth(problem, kappa).tau) == pytest.approx(judged, rel=1e-2)
