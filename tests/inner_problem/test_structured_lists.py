@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from test_structured_codesign import PID, quick
 
-from ccd_casadi.codesign import outer_structured, structured_lists
+from ccd_casadi.codesign import stored_searches, structured_lists
 from ccd_casadi.codesign.catalogue import restricted
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
@@ -39,7 +39,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
     w2: float, beside: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     races = []
-    for module in (outer_structured, structured_search):
+    for module in (stored_searches, structured_search):
         honest = module.race
 
         def counted(*arguments: object, honest: object = honest, **more: object) -> object:
