@@ -13,6 +13,7 @@ import numpy as np
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
 from ccd_casadi.fixed_structure.loop_on_box import Excess
+from ccd_casadi.fixed_structure.optimality import RESIDUAL
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
@@ -95,10 +96,10 @@ def prepared(
 
     made = race(problem, problem.start, tell, workers, only_warm_starts)
     worst: Excess | None = None
-    last = True  # what a search ends with goes to its optimum once no plant is found worse
+    last = True  # a search that ended off its optimum goes on to it once no plant is found worse
     for turn in range(ROUNDS if made.certified else 0):
         worst, wider = _wider(problem, problem.start, made, turn, tell)
-        if wider is None and last:
+        if wider is None and (last or made.kkt_residual <= RESIDUAL):
             break
         last = wider is None
         problem = with_structured(wider or problem, warm_starts=_warm_starts(made))
