@@ -18,6 +18,7 @@ from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopProblem, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope, envelope_of, optimality
 from ccd_casadi.fixed_structure.race import SAME, distinct, run_race
+from ccd_casadi.fixed_structure.reinsertion import reinserted
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
     DesignSearch,
@@ -33,7 +34,7 @@ from ccd_casadi.support.process_pool import Pool, results
 
 LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
-REDRAWS = 2  # searches at most from the best ends, one section of each drawn anew
+REDRAWS = 2  # searches at most from the best ends, one section of each elsewhere or drawn anew
 REDRAWN = 3  # ends
 AT_ONCE = 16  # controllers that a process looks at
 POOL = 12  # random starts tried for stability for each one that is kept
@@ -60,7 +61,8 @@ def problem_for(
 
 def of_one_channel(search: DesignSearch) -> SectionsDesign:
     """The best of searches from its initial controllers and, unless these are all, from others by
-    rules and at random, then from the best ends with one section of each drawn anew."""
+    rules and at random, then from the best ends with one section of each put elsewhere or drawn
+    anew."""
     problem, starts, workers = cast(Problem, search.problem), search.starts, search.workers
     rng, names = np.random.default_rng(search.seed), problem.structure.names
     pool = stabilising(problem, np.reshape(search.inside(search.initial), (-1, len(names))))
@@ -69,17 +71,22 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
         pool = np.concatenate([pool, _pool(problem, starts, rng, workers)])
     if not len(pool):
         return search.failed()
-    last = search.only_initial
+    last, begun = search.only_initial, len(pool)
     runners = run_race(problem, pool, search.tell, workers, known=known, last=last)
+    tried: list[Point] = []
     for _ in range(0 if last else REDRAWS):
-        best = runners[0].merit
+        best, ends = runners[0].merit, distinct(runners, REDRAWN)
+        fresh = [end for end in ends if not any(end is other for other in tried)]
+        tried += fresh
         count = max(starts // 2, 1)
-        fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
-        fresh = _nearest(problem, stabilising(problem, fresh), count, workers)
-        runners = run_race(problem, fresh, search.tell, workers, runners)
+        moved = stabilising(problem, reinserted(problem, fresh))[:count]
+        more, like = count - len(moved), [end.kappa for end in ends]
+        drawn = stabilising(problem, redrawn(problem, like, POOL // 2 * more, rng))
+        pool = np.concatenate([moved, _nearest(problem, drawn, more, workers)])
+        runners = run_race(problem, pool, search.tell, workers, runners, known=len(moved))
         if runners[0].merit < best + SAME:
             break
-    return search.concluded(runners, len(pool))
+    return search.concluded(runners, begun)
 
 
 def _pool(problem: Problem, starts: int, rng: np.random.Generator, workers: Pool | None) -> Array:

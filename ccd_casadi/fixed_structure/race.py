@@ -145,13 +145,13 @@ def finished(runners: Sequence[Runner]) -> list[Runner]:
     return [runner for i, runner in enumerate(runners) if runner.done or i < LAST]
 
 
-def distinct(runners: Sequence[Runner], count: int) -> list[Array]:
-    """κ of the best `count` ends of unequal bandwidth, those outside the bounds last."""
+def distinct(runners: Sequence[Runner], count: int) -> list[Point]:
+    """The best `count` ends of unequal bandwidth, those outside the bounds last."""
     found: list[Runner] = []
     for runner in finished(runners):
         if all(abs(runner.point.tau - other.point.tau) > SAME for other in found):
             found.append(runner)
-    return [runner.point.kappa for runner in found[:count]]
+    return [runner.point for runner in found[:count]]
 
 
 def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOptimum, ...]:

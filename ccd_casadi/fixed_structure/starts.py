@@ -115,7 +115,7 @@ def redrawn(problem: Problem, ends: Sequence[Array], count: int, rng: np.random.
     ]
     sections.append([name.startswith(("lead", "roll-off")) for name in names])
     sections = [section for section in sections if any(section)]
-    if not sections:
+    if not sections or not count:
         return np.zeros((0, len(names)))
     crossovers = np.exp(rng.uniform(np.log(0.05), 0.0, count))
     drawn = at_random(problem, crossovers, rng)

@@ -4,13 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, FAST, plant
+from fixed_structure_loops import BOUNDS, FAST, loop, plant
 from helpers import HZ, scaled, two_mass
 
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.race import WITHIN, at_its_bandwidth, distinct, run_race, started
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import Point, ascend
+from ccd_casadi.fixed_structure.race import (
+    SAME,
+    WITHIN,
+    at_its_bandwidth,
+    distinct,
+    run_race,
+    started,
+)
+from ccd_casadi.fixed_structure.reinsertion import reinserted
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
 from ccd_casadi.plants.plant import Mechanics
 
@@ -59,11 +69,13 @@ def test_what_is_redrawn_never_loses_what_was_found() -> None:
     rng = np.random.default_rng(1)
     pool = stabilising(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]
     first = run_race(problem, pool, lambda words: None)
-    fresh = stabilising(problem, redrawn(problem, distinct(first, 2), 24, rng))[:3]
+    ends = [end.kappa for end in distinct(first, 2)]
+    fresh = stabilising(problem, redrawn(problem, ends, 24, rng))[:3]
     again = run_race(problem, fresh, lambda words: None, before=first)
     assert again[0].merit >= first[0].merit
     assert not any(runner.running for runner in again)
-    assert len(distinct(again, 5)) == len({tuple(kappa) for kappa in distinct(again, 5)})
+    kept = distinct(again, 5)
+    assert len(kept) == len({tuple(end.kappa) for end in kept})
 
 
 def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
@@ -78,6 +90,53 @@ def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
         assert not lowered or point.assessment.violation <= WITHIN
         inside += lowered
     assert inside
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_section_that_is_put_elsewhere_cancels_there(seed: int) -> None:
+    """K is that of the end without the biquad; all of it where the pair has cancelled before."""
+    problem, one = loop(seed, Structure(lead=1, biquads=1))
+    structure = Structure(lead=2, biquads=1)
+    names, at = structure.names, problem.box[0, 1] + 2.0 + seed
+    kappa = np.insert(one, 4, [at, at])
+    if seed % 2:  # the pair's zero is the integrator's
+        kappa[[0, 1, 4]] = kappa[0] + kappa[1] - at, at, kappa[1]
+    problem = problem_for([plant()], structure, BOUNDS)
+    start = Point(kappa, -3.0, assess(problem, kappa, -3.0))
+    s = 1j * np.geomspace(1e-3, 30.0, 60)
+    moved, without = reinserted(problem, [start])
+    whole = structure.response(kappa, s)
+    np.testing.assert_allclose(structure.response(moved, s), whole, rtol=1e-9)
+    assert (moved != kappa).sum() == 2 + seed % 2
+    q = [names.index(f"biquad 1 {root}") for root in ("zeros", "poles")]
+    own = [1.0 + 2.0 * np.exp(kappa[i + 1]) * x + x * x for i in q for x in [s / np.exp(kappa[i])]]
+    np.testing.assert_allclose(structure.response(without, s), whole * own[1] / own[0], rtol=1e-9)
+
+
+def test_a_gain_alone_has_nothing_to_put_elsewhere() -> None:
+    problem, kappa = loop(0, Structure(False, lead=0, biquads=0, roll_off=0))
+    start = Point(kappa, -3.0, assess(problem, kappa, -3.0))
+    assert reinserted(problem, [start]).shape == (0, 1)
+
+
+def test_an_optimum_in_which_a_pair_cancels_is_left() -> None:
+    """Two leads are better than one; with the second where it is of no use one is an optimum too.
+
+    So a search ended at 292 Hz where 307 Hz can be had, with an integrator's zero in a lead's pole.
+    """
+    problem = problem_for([plant()], Structure(lead=1, biquads=0), EASY)
+    pool = stabilising(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))
+    (one, *_) = distinct(run_race(problem, pool, lambda words: None), 1)
+    more = problem_for([plant()], Structure(lead=2, biquads=0), EASY)
+    kappa = np.insert(one.kappa, 4, np.full(2, more.box[0, 1]))
+    end = at_its_bandwidth(more, kappa)
+    assert end.tau == pytest.approx(one.tau, abs=SAME)
+    (moved,) = reinserted(more, [end])
+    start = at_its_bandwidth(more, moved)
+    assert start.tau == pytest.approx(one.tau, abs=SAME)
+    better = ascend(more, start, iterations=40).point
+    assert better.assessment.violation <= WITHIN
+    assert better.tau > one.tau + 5.0 * SAME
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])
