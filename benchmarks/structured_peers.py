@@ -9,14 +9,16 @@ one would write with a general optimiser: max τ over (κ, τ), the largest peak
 plant as a constraint with its exact slopes, SLSQP from one start after the other (those that the
 search draws, half by rules, half at random, then others drawn alike) until it has had `--patience`
 times the processor time. Every end is given the largest ω_b that its controller has and passes the
-gate of every design: the judge. One line of JSON a problem, counts at the end; what `--out` holds
-is not run again. With `--lot` the problems are run in an order by lot, so that a part of them is a
-sample of all.
+gate of every design: the judge. Where neither end is certified a bound on every controller may show
+that none can be. One line of JSON a problem, counts at the end; what `--out` holds is not run
+again. With `--lot` the problems are run in an order by lot, so that a part of them is a sample of
+all.
 """
 
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,8 @@ from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.race import at_its_bandwidth, started
 from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
+from ccd_casadi.limitations.bound import forbids
+from ccd_casadi.limitations.limits import limits_of
 from ccd_casadi.plants.scaling import ScaledPlant
 
 STARTS = 12
@@ -123,6 +127,18 @@ def peer(
     return soon, best, used, time.process_time() - began
 
 
+def impossible(asked: Case, near: float) -> bool:
+    """Whether no controller of any order keeps the bounds on the corners, at any ω_b down to a
+    thousandth of ω_low; `near` (rad/s): where they are tight."""
+    uncertain = asked.uncertain
+    each = [limits_of(uncertain.plant(point).plant_si(), asked.bounds, asked.sampling,
+                      integrator=asked.structure.integrator)
+            for _, point in uncertain.corners()]  # fmt: skip
+    sets = [replace(own, others=tuple(other for other in each if other is not own))
+            for own in each]  # fmt: skip
+    return any(forbids(limits, 1e-3 * asked.bounds.omega_low, near) for limits in sets)
+
+
 def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """How often the search is as good, and better, than the peer at its end."""
     ratio = np.array([(row["hz"] + 1e-9) / (row["slsqp_hz"] + 1e-9) for row in rows])
@@ -130,6 +146,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "problems": len(rows),
         "certified": sum(row["hz"] > 0.0 for row in rows),
         "slsqp_certified": sum(row["slsqp_hz"] > 0.0 for row in rows),
+        "shown_to_be_impossible": sum(row.get("impossible", False) for row in rows),
         "as_good_within_0.1_percent": int((ratio > 0.999).sum()),
         "better_by_5_percent": int((ratio > 1.05).sum()),
         "slsqp_time_over_ours": round(float(np.median(
@@ -166,6 +183,8 @@ def main() -> None:
             "seconds": round(own, 2), "slsqp_hz_in_that_time": soon, "slsqp_hz": theirs,
             "slsqp_starts": used, "slsqp_seconds": round(spent, 2),
         })  # fmt: skip
+        if not made.certified and theirs == 0.0 and made.bandwidth > 0.0:
+            rows[-1]["impossible"] = impossible(asked, made.bandwidth)
         print(json.dumps(rows[-1]), flush=True)
         options.out.write_text(json.dumps({"counts": judged(rows), "rows": rows}, indent=1) + "\n")
     print(json.dumps(judged(rows)))

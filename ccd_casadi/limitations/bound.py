@@ -49,11 +49,15 @@ def upper_bound(limits: Limits, known: float = np.inf) -> float:
     return min(found or _certified(limits, omega_b, most, MANY) or most, known)
 
 
-def forbids(limits: Limits, omega_b: float) -> bool:
-    """Whether one coarse programme and its certificate show that no controller has ω_b (rad/s)."""
-    search = _Search(limits, omega_b, -1, COARSE)
-    g, weight = search.multiplier(omega_b)
-    grid = _grid(limits, omega_b, MANY[1])
+def forbids(limits: Limits, omega_b: float, near: float | None = None) -> bool:
+    """Whether one coarse programme and its certificate show that no controller has ω_b (rad/s).
+
+    `near`: where the bounds are tight, by default at ω_b; that none at all is possible is shown
+    there with an ω_b far below.
+    """
+    search = _Search(limits, near or omega_b, -1, COARSE)
+    g, weight = search.multiplier(omega_b, near)
+    grid = _grid(limits, omega_b, MANY[1], near)
     return bool(1.0 < g < np.inf) and rules_out(limits, search.basis, weight, omega_b, grid)
 
 
@@ -134,15 +138,16 @@ def _roots(limits: Limits, omega_b: float) -> list[complex]:
     return found[:MOST_PAIRS]
 
 
-def _grid(limits: Limits, omega_b: float, per_decade: int) -> Array:
-    """Frequencies v: fine around ω_b and at every lightly damped root, both sides of a step."""
-    v = limits.variable(omega_b)
+def _grid(limits: Limits, omega_b: float, per_decade: int, near: float | None = None) -> Array:
+    """Frequencies v: fine around ω_b, or `near`, and at every lightly damped root, both sides of a
+    step."""
+    v = limits.variable(near or omega_b)
     parts = [
         np.geomspace(0.02 * v, 40.0 * v, int(3.3 * per_decade)),
         np.geomspace(1e-4 * v, 0.02 * v, per_decade),
         np.geomspace(40.0 * v, 1e4 * v, per_decade),
     ]
-    for r in _roots(limits, omega_b):
+    for r in _roots(limits, near or omega_b):
         spread = np.sinh(np.linspace(-5.0, 5.0, max(per_decade // 3, 21)))
         parts.append(r.imag + max(r.real, 1e-4 * abs(r)) * spread)
     for step in (omega_b, limits.ratio * omega_b):
@@ -170,9 +175,9 @@ class _Search:
             constant=turned > 0 and excess == 0,
         )
 
-    def multiplier(self, omega_b: float) -> tuple[float, Array]:
+    def multiplier(self, omega_b: float, near: float | None = None) -> tuple[float, Array]:
         """The scaling that some h shows, on a grid, and the coefficients of h."""
-        v = _grid(self.limits, omega_b, self.grid)
+        v = _grid(self.limits, omega_b, self.grid, near)
         width = np.gradient(v)
         width[0] += v[0]
         values = self.basis.values(v) * np.sqrt(self.unit)

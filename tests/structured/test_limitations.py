@@ -48,6 +48,16 @@ def lag(zero: float) -> StateSpace:
     return StateSpace(A, np.array([[0.0], [1.0]]), np.array([[1.0, -1.0 / zero]]), np.zeros((1, 1)))
 
 
+def test_that_no_bandwidth_at_all_is_possible_is_shown_where_the_bounds_are_tight() -> None:
+    """Of a problem that no search solved, and of none that has a certified design."""
+    study = benchmark("structured_peers")
+    assert study.impossible(SECTIONS.case(1053), 16.3 * HZ)
+    for seed in (21, 36):
+        asked, design = SECTIONS.climbed(SECTIONS.case(seed), seed)
+        assert design.certified
+        assert not study.impossible(asked, design.bandwidth)
+
+
 def test_a_zero_in_the_right_half_plane_gives_poissons_bound() -> None:
     """|S| up to 1/√2 and beyond up to S_max: the integral of ln|S| alone decides, and is met."""
     zero, S_max = 20.0, 1.8
