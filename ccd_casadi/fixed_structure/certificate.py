@@ -174,8 +174,9 @@ def judged(
     table = LoopTable([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
                       integrator)  # fmt: skip
     if len(free[0].C) > 1:
-        grid = with_crossings(table, grid)
-    values = table.at(rows, grid)
+        grid, values = with_crossings(table, grid)
+    else:
+        values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
     tops = peaks(table, grid, values)
     loops = [loops[i] for i in good]

@@ -61,17 +61,54 @@ def padded(grids: Sequence[Array]) -> Array:
     return np.array([np.pad(grid, (0, most - len(grid)), mode="edge") for grid in grids])
 
 
-def with_crossings(table: LoopTable, grid: Array) -> Array:
-    """Grids (P, k), finer where a lesser singular value has a maximum that comes near the largest.
+def with_crossings(table: LoopTable, grid: Array) -> tuple[Array, dict[str, Array]]:
+    """Grids (P, k), finer where a lesser singular value has a maximum that comes near the largest,
+    and every curve there.
 
-    Where it is the larger one between two points only, neither of these shows a maximum.
+    Where it is the larger one between two points only, neither of these shows a maximum. It counts
+    where it may be a peak (weighted or not), pass -3 dB first, or leave the shape least room.
     """
-    more: list[list[Array]] = [[own] for own in grid]
-    for matrix in table.singular(np.arange(len(grid)), grid):
-        for lesser in np.moveaxis(matrix, -1, 0)[1:]:
-            for i, j in zip(*_maxima(grid, lesser, NEAR * matrix[..., 0]), strict=True):
+    rows = np.arange(len(grid))
+    values, sizes = table.with_lesser(rows, grid)
+    weights, more = table.weights(grid), [[grid[:, :0][i]] for i in rows]
+    for name, matrix in sizes.items():
+        largest, floor = matrix[..., -1], np.full_like(grid, np.inf)
+        scales = [np.ones_like(grid), *([weights[name]] if name in weights else [])]
+        if name == "S":
+            scales.append(1.0 / counted(table, grid))
+            past = np.maximum.accumulate(largest > HALF_POWER, axis=1)
+            floor = np.where(past, np.inf, NEAR * HALF_POWER)
+            floor[:, 1:] = np.minimum(floor[:, 1:], floor[:, :-1])  # the bracket of the first too
+        for scale in scales:
+            top = (scale * largest).max(axis=1, keepdims=True)
+            floor = np.minimum(floor, NEAR * top / scale)
+        for lesser in np.moveaxis(matrix, -1, 0)[:-1]:
+            for i, j in zip(*_maxima(grid, lesser, NEAR * np.maximum(largest, floor)), strict=True):
                 more[i].append(np.linspace(grid[i, j - 1], grid[i, j + 1], FINER))
-    return padded([np.unique(np.concatenate(own)) for own in more])
+    new = [_apart(np.concatenate(own), grid[i]) for i, own in enumerate(more)]
+    most = max(map(len, new))
+    if not most:
+        return grid, values
+    fine = np.array([np.append(own, np.full(most - len(own), grid[i, -1]))
+                     for i, own in enumerate(new)])  # fmt: skip
+    joint = np.concatenate([grid, fine], axis=1)
+    order = np.argsort(joint, axis=1, kind="stable")
+    beside = table.at(rows, fine)
+    values = {name: np.take_along_axis(np.concatenate([value, beside[name]], axis=1), order, 1)
+              for name, value in values.items()}  # fmt: skip
+    return np.take_along_axis(joint, order, axis=1), values
+
+
+def _apart(points: Array, known: Array) -> Array:
+    """Those that are not next to each other or to known ones, of which rounding parts them."""
+    joint = np.concatenate([known, np.sort(points)])
+    order = np.argsort(joint, kind="stable")
+    gaps = np.diff(joint[order], prepend=-np.inf, append=np.inf)
+    least = APART * joint[order]
+    new = order >= len(known)
+    old = np.append(~new[1:], False)  # the next one is a known one
+    keep = new & (gaps[:-1] > least) & ~(old & (gaps[1:] <= least))
+    return np.asarray(joint[order][keep])
 
 
 def peaks(
@@ -163,8 +200,7 @@ def _within_shape(
     scale = bounds.shape * HALF_POWER
 
     def room(x: Array, S: Array) -> Array:
-        counted = x if table.integrator else np.maximum(x, bounds.omega_low)
-        return np.asarray(scale * counted / S)
+        return np.asarray(scale * counted(table, x) / S)
 
     short = bounds.shape_ends is ShapeEnd.CROSSING
     ends = crossing if short else grid[:, -1]
@@ -191,6 +227,11 @@ def _within_shape(
             height, x = min(broken)
             found[k] = height if height >= x else x * (1.0 - 1e-9)
     return found
+
+
+def counted(table: LoopTable, omega: Array) -> Array:
+    """The ω at which the shape is taken: without an integrator none below ω_low."""
+    return omega if table.integrator else np.maximum(omega, table.bounds.omega_low)
 
 
 def _sorted(omega: Array, value: Array) -> tuple[Array, Array]:

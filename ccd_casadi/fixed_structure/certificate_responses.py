@@ -26,7 +26,7 @@ class Triangular:
     """State spaces of one shape by their Schur forms; one alone stands for every plant's."""
 
     def __init__(self, systems: Sequence[StateSpace]) -> None:
-        forms = [schur(x.A, output="complex") for x in systems]
+        forms = [_schur(x.A) for x in systems]
         self.T = np.array([T for T, _ in forms])
         coupled = np.triu((self.T != 0.0).any(axis=0), 1)
         self.coupled = [np.flatnonzero(row) for row in coupled]  # few states of a modal plant are
@@ -79,17 +79,35 @@ class LoopTable:
 
     def at(self, which: np.ndarray, omega: Array) -> dict[str, Array]:
         """Every curve (N, k) of the plants `which` (N,) at ω (N, k) in rad/s."""
+        return self._curves(self._matrices(which, omega), omega)
+
+    def with_lesser(
+        self, which: np.ndarray, omega: Array
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Every curve, and all singular values (N, k, p) of S, KS, T and GS, the least first."""
         matrices = self._matrices(which, omega)
-        found = {name: sigma_max(M) for name, M in matrices.items()}
-        weights = self.bounds.weights
-        if weights is not None:
-            _, W_KS, W_T = np.abs(weights.responses(omega.ravel())).reshape(3, *omega.shape)
-            found["weighted KS"], found["weighted T"] = W_KS * found["KS"], W_T * found["T"]
+        sizes = {name: _singular(M) for name, M in matrices.items()}
+        largest = {name: each[..., -1] for name, each in sizes.items()}
+        return self._curves(matrices, omega, largest), sizes
+
+    def weights(self, omega: Array) -> dict[str, Array]:
+        """|W_KS| and |W_T| by what they weigh, where there are any."""
+        if self.bounds.weights is None:
+            return {}
+        sizes = np.abs(self.bounds.weights.responses(omega.ravel())).reshape(3, *omega.shape)
+        return {"KS": sizes[1], "T": sizes[2]}
+
+    def _curves(
+        self, matrices: dict[str, np.ndarray], omega: Array, sizes: dict[str, Array] | None = None
+    ) -> dict[str, Array]:
+        found = sizes or {name: sigma_max(M) for name, M in matrices.items()}
+        weights = self.weights(omega)
+        found |= {f"weighted {name}": W * found[name] for name, W in weights.items()}
         for own in self.bounds.channels:
             if own.given:
                 found[f"S of {own.name}"] = _length(own.output, matrices["S"])
-            if own.M_K is not None and weights is not None:
-                W = weights.M_K / own.M_K * W_KS
+            if own.M_K is not None and self.bounds.weights is not None:
+                W = self.bounds.weights.M_K / own.M_K * weights["KS"]
                 found[f"weighted KS of {own.name}"] = W * _length(own.force, matrices["KS"])
         return found
 
@@ -99,11 +117,6 @@ class LoopTable:
         """σ_max(S), or ‖rᵀS‖ of a row r, as `at`."""
         S = self._loops(which, omega)[0]
         return sigma_max(S) if row is None else _length(row, S)
-
-    def singular(self, which: np.ndarray, omega: Array) -> Array:
-        """(4, N, k, p) all singular values of S, KS, T and GS, the largest first."""
-        return np.stack([np.linalg.svd(M, compute_uv=False)
-                         for M in self._matrices(which, omega).values()])  # fmt: skip
 
     def _matrices(self, which: np.ndarray, omega: Array) -> dict[str, np.ndarray]:
         S, g, k = self._loops(which, omega)
@@ -121,6 +134,28 @@ class LoopTable:
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Of matrices (..., p, q) and (..., q, m)."""
     return np.asarray(a * b if a.shape[-1] == 1 else a @ b)
+
+
+def _schur(A: Array) -> tuple[np.ndarray, np.ndarray]:
+    """T and Q of A = QTQᴴ, each part of A that is coupled to no other by itself: channels of a
+    controller and modes of a plant stay apart in T."""
+    joined = (A != 0.0) | (A.T != 0.0) | np.eye(len(A), dtype=bool)
+    for _ in range(len(A).bit_length()):
+        joined = joined @ joined
+    first = np.array([row.argmax() for row in joined], int)  # of the states each is coupled to
+    T, Q, done = (*np.zeros((2, *A.shape), complex), 0)
+    for part in np.unique(first):
+        own = np.flatnonzero(first == part)
+        place = slice(done, done + len(own))
+        T[place, place], Q[own, place] = schur(A[np.ix_(own, own)], output="complex")
+        done += len(own)
+    return T, Q
+
+
+def _singular(M: np.ndarray) -> Array:
+    """All singular values (..., p) of matrices (..., p, m), the least first, as `sigma_max`."""
+    squared = np.linalg.eigvalsh(M @ M.conj().swapaxes(-1, -2))
+    return np.sqrt(np.maximum(squared, 0.0))
 
 
 def _length(row: Sequence[float], M: np.ndarray) -> Array:
