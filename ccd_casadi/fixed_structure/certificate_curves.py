@@ -21,7 +21,7 @@ FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 
 APART = 1e-9  # relative: grid points that are closer count as one
 NEAR = 0.9  # of the height that counts: local maxima below it lie below it between points too
 FINER = 41  # points in such a maximum's bracket of a lesser singular value
-SECTIONS = 17  # of a bracket in ten: to rounding
+SECTIONS = 15  # of a bracket in ten: to rounding
 
 
 def grid_through(
