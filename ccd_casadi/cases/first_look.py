@@ -3,9 +3,9 @@
 import tomllib
 from pathlib import Path
 
-# What worker processes need, a second to import: least squares need SciPy's optimisation.
-SEARCH = "ccd_casadi.inner_problem.structured_search", "scipy.optimize", "ccd_casadi.kernels.loaded"
-SAMPLING = "ccd_casadi.sampling.units", *SEARCH
+# What worker processes need, most of a second to import.
+SEARCH = "ccd_casadi.inner_problem.structured_search", "ccd_casadi.kernels.loaded"
+SAMPLING = *SEARCH, "ccd_casadi.sampling.units", "scipy.optimize"
 DRAWING = "ccd_casadi.drawing.paint", "matplotlib.backends.backend_svg"
 
 

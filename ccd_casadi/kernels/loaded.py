@@ -1,8 +1,8 @@
-"""Importing this loads the kernels, if they are compiled: 0.4 s of a processor that processes which
-are forked afterwards need not spend."""
+"""Importing this loads the kernels of structured loops, if they are compiled, and what Numba needs
+for any: 0.25 s of a processor that processes which are forked afterwards need not spend."""
 
-from ccd_casadi.kernels.compilation import PARTS, compile_part, is_compiled
+from ccd_casadi.kernels.compilation import compile_part, is_compiled
 
 if is_compiled():
-    for part in PARTS:
+    for part in ("rows", "curvature"):
         compile_part(part)
