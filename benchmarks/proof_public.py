@@ -15,7 +15,7 @@ what is proven.
 import argparse
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import process_time
 
@@ -48,24 +48,24 @@ class DriveModes(ModalSum):
     its answer at rest. The spring that holds the arm, mode 0, does not move.
     """
 
-    ratio: Array
-    vcm: int
+    ratio: Array = field(kw_only=True)
+    vcm: int = field(kw_only=True)
 
     def poles(
-        self, i: int, names: tuple[str, ...], low: Array, high: Array
+        self, i: int, names: tuple[str, ...], low: Array, high: Array, moved: Affine | None = None
     ) -> tuple[list[tuple[Affine, Affine]], np.ndarray]:
         m = low.shape[1]
         one = Affine(np.ones(m), np.zeros((3, m)), np.zeros(m))
         t, g = (variable(low[k], high[k], k + 1, 3) for k in range(2))
         piezo, still = i >= self.vcm, i == 0
         rate = -0.06 if piezo else -0.04
-        moved = one if still else t * rate + 1.0
-        w = moved * self.omega[i]
+        slower = one if still else t * rate + 1.0
+        w = slower * self.omega[i]
         half = w * self.ratio[i] * (one if still else t * 0.2 + 1.0)
         swing = root(w * w - half * half) * 1j
-        gain = moved * moved * (g + 1.0) if piezo else one
+        gain = slower * slower * (g + 1.0) if piezo else one
         residue = gain * inverse(swing * 2.0)
-        return [(swing - half, residue), (-swing - half, -residue)], np.ones(m, bool)
+        return [(swing - half, residue), (-swing - half, -residue)], np.zeros(m)
 
 
 def of_drive(most: int, draws: int) -> None:
@@ -91,7 +91,7 @@ def of_drive(most: int, draws: int) -> None:
         B[vcm:, 1] = kappa_p / static
         modes = DriveModes(
             omega / unit, np.zeros(len(omega), bool), (0.0, 0.0), 0.0 * omega, 0.0, B / unit**2,
-            np.ones((len(omega), 1)), zeta, vcm,
+            np.ones((len(omega), 1)), ratio=zeta, vcm=vcm,
         )  # fmt: skip
         own = structure.in_units(kappa, 1.0 / unit, 1.0)
         d = structure.decoupling

@@ -154,7 +154,8 @@ def divide(
     """Branch and bound of every option's loops, each stable at one point of `box` (2, n): `share`
     boxes of each, or `enough` where many of these are still open then."""
     enough = share if enough is None else enough
-    tasks = {option: (own, box, slack, share, enough) for option, own in enumerate(families)}
+    first = sorted(range(len(families)), key=lambda option: -len(families[option].plant.omega))
+    tasks = {option: (families[option], box, slack, share, enough) for option in first}
     found = dict(results(workers, divided, tasks))
     names, levels = families[0].names, dict[str, float]()
     for option in range(len(families)):

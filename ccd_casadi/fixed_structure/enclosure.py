@@ -6,15 +6,13 @@ with their number and not with that of the boxes' corners. With K = K̂/y and W 
 
     S = yW,  KS = K̂W,  T = W GK̂,  GS = yW G,   M = y + GK̂,  G = Σ_i g_i c_i b_iᵀ.
 
-The mode with the largest disc is taken as it is (`rank_one`), the others at their centres. These,
-y and K̂ differ by Δ in M and by a factor 1 + E of K̂, so that with M₁ = M + Δ
+The largest norms over all discs are those of `largest_norm`: every disc counts along its own
+direction, so that modes which move one channel leave the others alone, and to all orders. What y
+and K̂ differ by are Δ in M and a factor 1 + E of K̂. With M₁ = M + Δ of any M of the discs,
 
-    S₁ - S = T - T₁ = M₁⁻¹(Δ_y T - Δ_GK S),   S₂ = (1 + T₁E)⁻¹S₁,   T₂ = T₁ + T₁E S₂,
-    M₁⁻¹ = W - W Δ W + W Δ W Δ M₁⁻¹,
-    ‖Σ δ_i c_i b_iᵀ‖² <= ‖Σ r_i a_i c_i c_iᵀ‖ ‖Σ r_i/a_i b_i b_iᵀ‖   for all |δ_i| <= r_i, a_i > 0.
+    S₁ - S = T - T₁ = M₁⁻¹(Δ_y T - Δ_GK S),   S₂ = (1 + T₁E)⁻¹S₁,   T₂ = T₁ + T₁E S₂.
 
-To first order every disc counts along its own direction (`norm_with`), so that modes which move
-one channel leave the others alone; what is of higher order counts by its norm.
+A box is divided along what moves M, of several outputs the figure furthest above its bound.
 
 y is that of `boxes`. Where M is regular on the whole axis for all of a connected set of plants, no
 pole crosses it: they are all stable or none is (zero exclusion).
@@ -26,19 +24,13 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.boxes import Axis, Boxes, Chart, axis_of, gain_of
+from ccd_casadi.fixed_structure.largest_norm import GUARD, Terms, norm
 from ccd_casadi.fixed_structure.mode_discs import discs_of
-from ccd_casadi.fixed_structure.rank_one import (
-    Range,
-    Turned,
-    inverses,
-    norm,
-    norm_of_any,
-    norm_with,
-)
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
 
+Range = tuple[Array, Array]  # not below a figure anywhere on a box, and not above it
 FAR = 0.5  # relative: a gain that moves more over a box is bounded, not followed
 ENDLESS = 1e100  # rad/s: where weights are at their ends
 
@@ -92,96 +84,87 @@ class LoopFamily:
         if self._integrator:
             y, moved, most = axis.y.centre, axis.y.reach + axis.y.rest, axis.y.size
         K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
-        c, b = (
-            np.repeat(part[:, None], len(good), axis=1)
-            for part in (self.plant.reading, self.plant.drive)
-        )
-        rows = np.einsum("iNm,Nmp->iNp", b, K)
-        m, r = np.where(good, held.middle, 0.0), np.where(good, held.radius, 0.0)
-        weight, at = _sizes(c, rows), np.arange(len(good))
-        strong = np.argmax(r * weight, axis=0)
-        others = np.arange(len(c))[:, None] != strong
-        unit = np.tile(np.eye(c.shape[2]), (len(good), 1, 1))
+        c, b = self.plant.reading, self.plant.drive
+        rows = b @ K
+        m, r, g, e = (np.where(good, part, 0.0).T
+                      for part in (held.middle, held.radius, free.middle, free.radius))  # fmt: skip
+        weight = _lengths(c) * _lengths(rows)
+        unit = np.tile(np.eye(c.shape[1]), (len(good), 1, 1))
         y_unit = y[:, None, None] * unit
-        M = y_unit + _total(others * m, c, rows)
-        terms = np.abs(y) + (others * np.abs(m) * weight).sum(axis=0)
-        W = inverses(M, terms, c[strong, at], rows[strong, at], m[strong, at], r[strong, at])
-        w, T = W.norms(), W.from_one(y).norms()
-        # what is left: Δ, of which `known` by discs and `faintly` by gains not followed; then E
+        M = y_unit + (c.T * m[:, None]) @ rows
+        sizes = np.abs(y) + ((np.abs(m) + r) * weight).sum(axis=1)
+        good &= np.linalg.det(M) != 0.0
+        W = np.linalg.inv(np.where(good[:, None, None], M, unit))
+        yW, KW = y[:, None, None] * W, K @ W
+        # what is left of Δ besides the discs, with the rounding of M and W; then E
         grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
         apart = (
-            np.linalg.norm(self.plant.reading, axis=1)[:, None]
-            * np.abs(self.plant.drive @ self.inputs)
-            * np.linalg.norm(self.outputs, axis=0)
+            _lengths(c)[:, None] * np.abs(b @ self.inputs) * np.linalg.norm(self.outputs, axis=0)
         )
-        faintly = np.einsum("iN,ic,Nc->N", np.abs(m) + r, apart, faint)
-        known = norm_of_any(c, rows, others * r)
-        off = known + faintly + moved
-        good &= damped & W.good & (w[0] * off < 1.0)
-        after = w[0] / np.where(good, 1.0 - w[0] * off, 1.0)  # ‖M₁⁻¹‖
+        faintly = np.einsum("Ni,ic,Nc->N", np.abs(m) + r, apart, faint)
+        w, k = norm(W), norm(KW)
+        faintly += GUARD * sizes * (1.0 + sizes * w)
+        discs = Terms(c, rows @ W, r)
+        a = discs.largest(W, W, unit)
+        good &= damped & (a * (faintly + moved) < 1.0)
+        a = np.where(good, a, 1.0)
+        after = a / np.where(good, 1.0 - a * (faintly + moved), 1.0)  # ‖M₁⁻¹‖
         loose = loose * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
-        unknown = after * (np.abs(y) * w[0] * faintly + T[0] * moved)  # of S and T
-        apart = unknown + after * np.abs(y) * w[0] * known
-        by = loose * (T[0] + apart)  # of T₁E
+        T_most = discs.largest(unit - yW, -yW, unit) + GUARD * (1.0 + np.abs(y) * w)
+        unknown = after * (np.abs(y) * a * faintly + T_most * moved)  # of S and T
+        by = loose * (T_most + unknown)  # of T₁E
         good &= by < 1.0
         by = np.where(good, by, 0.0)
         over = after / (1.0 - by)
-        unknown, apart = unknown + by * most * over, apart + by * most * over
-        # each disc along its own direction, W c_i and b_iᵀK̂W
-        u, v = np.einsum("Npq,iNq->iNp", W.middle, c), np.einsum("iNp,Npq->iNq", rows, W.middle)
-        radius = others * r
-        radius[strong, at] = W.reach / np.maximum(_sizes(u, v)[strong, at], 1e-300)
-
-        def near(A: Turned, left: np.ndarray, size: Array) -> Array:
-            """‖A - L W D W‖ of the discs' D, and what is of higher order; `size`: of L W."""
-            p = np.einsum("Nkp,iNp->iNk", left, u)
-            aside = (radius * _sizes(p, v))[strong, at]
-            rest = known * (aside * w[0] + size * (W.reach + w[0] * off * after))
-            return norm_with(A.middle, p, v, radius) + A.lost + rest
-
-        upper = near(W.between(y_unit, unit), y_unit, np.abs(y) * w[0]) + unknown
-        upper = np.fmin(upper, np.minimum(most * over, np.abs(y) * w[0] + apart))
-        found = self._of_S(boxes, (upper, np.abs(y) * w[1] - apart), over)
+        unknown += by * most * over
+        aside = (r * _lengths(c) * _lengths(discs.rows)).sum(axis=1)
+        near = np.abs(y) * a * aside + unknown
+        pushes = {"S": (np.abs(y)[:, None] * discs.pushes(W, unit), unknown),
+                  "T": (discs.pushes(yW, unit), unknown)}  # fmt: skip
+        upper = np.fmin(np.abs(y) * a + unknown, most * over)
+        found = self._of_S(boxes, (upper, np.abs(y) * w - near), over)
         if level is not None:
-            KW = W.between(K, unit)
-            k = KW.norms()
-            more = k[0] * after * off
-            turned = loose * over * (norm(K) + (k[0] + more) * (most + faintly))  # of K̂T₁E M₂⁻¹
-            upper = np.fmin(k[0] + more, near(KW, K, k[0]) + k[0] * after * (faintly + moved))
-            upper = (1.0 + loose) * (upper + turned) + grain * over
-            lower = (1.0 - loose) * (k[1] - more - turned) - grain * over
-            T_most = near(W.from_one(y), y_unit, np.abs(y) * w[0]) + unknown
-            T_most = np.fmin(T_most, T[0] + apart)
-            found += self._weighted(boxes, level, (upper, lower), (T_most, T[1] - apart))
+            lost = GUARD * norm(K) * w
+            size = discs.largest(KW, KW, unit) + lost
+            first = size * (1.0 + after * (faintly + moved))
+            turned = loose * over * (norm(K) + first * (most + faintly))  # of K̂T₁E M₂⁻¹
+            lower = (1.0 - loose) * (k - lost - size * aside - first + size - turned) - grain * over
+            upper = (1.0 + loose) * (first + turned) + grain * over
+            T = T_most + unknown, norm(unit - yW) - GUARD * (1.0 + np.abs(y) * w) - near
+            found += self._weighted(boxes, level, (upper, lower), T)
+            pushes["KS"] = discs.pushes(KW, unit), upper - size
         if compliance is not None:
-            g, e = np.where(good, free.middle, 0.0), np.where(good, free.radius, 0.0)
-            WG = W.between(unit, _total(g, c, b))
-            h, apart = WG.norms(), most * after * norm_of_any(c, b, e)
-            apart += (np.abs(y) * after * off + moved * (1.0 + after * off)) * h[0]
-            p, q = (
-                np.concatenate([u, u]),
-                np.concatenate([b, np.einsum("iNp,Npm->iNm", rows, WG.middle)]),
-            )
-            upper = norm_with(WG.middle, p, q, np.concatenate([e, radius])) + WG.lost
-            upper += known * (W.reach * h[0] + w[0] * WG.reach) + w[0] * (faintly + moved) * h[0]
-            along = np.abs(np.einsum("iNp,Np->iN", c, v[strong, at]))
-            aside = (e * along * np.linalg.norm(b, axis=2)).sum(axis=0)  # of W's disc on those of G
-            aside *= (radius * np.linalg.norm(u, axis=2))[strong, at]
-            upper += aside + after * off * (w[0] * off * h[0] + norm_of_any(u, b, e) + aside)
-            upper = np.fmin(most * upper, np.abs(y) * h[0] + apart)
-            lower = np.abs(y) * h[1] - apart
-            inside = compliance * self._inside(boxes)
+            G = (c.T * g[:, None]) @ b
+            WG, by_all = W @ G, _lengths(c) * _lengths(b)
+            lost, other = GUARD * w * (np.abs(g) @ by_all), after * (faintly + moved)
+            both = Terms(
+                np.concatenate([c, c]), np.concatenate([discs.rows, 0.0 * discs.rows], axis=1),
+                np.concatenate([r, e], axis=1), np.concatenate([0.0 * b, b]),
+            )  # fmt: skip
+            h = both.largest(WG, W, G) + lost
+            aside = e @ by_all + (r * _lengths(c) * _lengths(discs.rows @ G)).sum(axis=1)
+            lower = np.abs(y) * (norm(WG) - lost - a * aside) - (moved + most * other) * h
+            upper, inside = most * h * (1.0 + other), compliance * self._inside(boxes)
             found.append(("GS", upper / (1.0 - by) / inside, lower / (1.0 + by) / inside))
-        weight[strong, at] = np.where(
-            W.good, W.reach / (w[0] ** 2 * np.maximum(r[strong, at], 1e-300)), weight[strong, at]
-        )
-        shares = np.where(np.isfinite(held.shares), held.shares, 0.0)
-        spread = np.einsum("iN,ikN->kN", np.where(finite, weight, 1.0), shares)
-        spread[0] += moved + most * loose
+            pushes["GS"] = both.pushes(W, G), (other + by) * h
         names, most_at, least_at = zip(*found, strict=True)
         highest, lowest = np.array(most_at), np.array(least_at)
         highest = np.where(good & ~np.isnan(highest), highest, np.inf)
         lowest = np.where(good & np.isfinite(lowest), lowest, 0.0)
+        # what moves the loop: of several outputs the figure that is furthest above its bound
+        of = np.array([name if name in pushes else "S" for name in names])
+        own = r * np.abs(np.einsum("Nip,ip->Ni", discs.rows, c))  # near 1 a disc moves 1/M less
+        weight = weight * np.where(own < 1.0, (1.0 - own) / (1.0 + own), 1.0)
+        worst, n = of[np.argmax(highest, axis=0)], len(c)
+        weight = np.where(np.tile(finite.T, 2), np.tile(weight, 2), 1.0)
+        weight[:, n:], rest = 0.0, moved + most * loose
+        for name, (by_disc, beside) in (pushes if len(self.outputs) > 1 else {}).items():
+            here, beside = good & (worst == name), np.where(np.isfinite(beside), beside, 0.0)
+            weight[here, : by_disc.shape[1]], rest[here] = by_disc[here], beside[here]
+        spread = np.zeros_like(held.shares[0])
+        for by, own in ((weight[:, :n], held.shares), (weight[:, n:], free.shares)):
+            spread += np.einsum("Ni,ikN->kN", by, np.where(np.isfinite(own), own, 0.0))
+        spread[0] += rest
         return Enclosures(names, highest, lowest, spread, good)
 
     @property
@@ -253,11 +236,6 @@ class LoopFamily:
         return np.inf if b.shape is None else b.S_max * np.sqrt(2.0) / b.shape * self.bandwidth
 
 
-def _total(g: np.ndarray, c: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Σ g_i c_i row_iᵀ (N, p, q) of g (n, N), c (n, N, p) and rows (n, N, q)."""
-    return np.asarray(np.einsum("iN,iNp,iNq->Npq", g, c, rows))
-
-
-def _sizes(p: np.ndarray, q: np.ndarray) -> Array:
-    """Of the matrices p_i q_iᵀ (n, N)."""
-    return np.asarray(np.linalg.norm(p, axis=2) * np.linalg.norm(q, axis=2))
+def _lengths(rows: np.ndarray) -> Array:
+    """|r| of rows r (..., p)."""
+    return np.asarray(np.linalg.norm(rows, axis=-1))

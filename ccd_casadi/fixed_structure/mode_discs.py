@@ -17,6 +17,7 @@ from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
 
 FIRST = 1e30  # share of what is divided before anything else: where modes are not enclosed
+CANCELLED = 1e3  # times what is of first order: there the second says what to divide
 TURNS = np.exp(1j * np.pi * np.arange(-2, 3) / 4)  # half planes that 1/D is looked for in
 
 
@@ -83,7 +84,10 @@ def _fill(
     near = ~(radius <= apart) | np.isinf(radius)
     discs.middle[i] = np.where(near, middle, whole.centre)
     discs.radius[i] = np.where(near, apart, radius) * (1.0 + 1e-12)
-    discs.shares[i, rows] = np.where(near, moves, whole.reaches)
+    # where the first order cancels, as at rest, what is left is due to what moves the poles
+    beyond = whole.rest * moves / np.maximum(moves.sum(axis=0), 1e-300)
+    beyond = np.where(whole.rest > CANCELLED * whole.reach, beyond, 0.0)
+    discs.shares[i, rows] = np.where(near, moves, whole.reaches + beyond)
 
 
 def quotient(

@@ -14,8 +14,8 @@ from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
+from ccd_casadi.fixed_structure.largest_norm import Terms
 from ccd_casadi.fixed_structure.mode_discs import quotient
-from ccd_casadi.fixed_structure.rank_one import norm_with
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.plants.plant import Mechanics
@@ -45,6 +45,7 @@ BOTH = ChannelStructure(
 KAPPA = np.tile(np.log(
     [1e5, 0.5 * HZ, 3.0 * HZ, 60.0 * HZ, 250.0 * HZ, 0.3, 250.0 * HZ, 0.8, 300.0 * HZ, 0.7]
 ), 2)  # fmt: skip
+ANGLES = np.linspace(0.0, 2.0 * np.pi, 400)
 BARE = Bounds(S_max=10.0, S_low=1.0, omega_low=0.5 * HZ)
 
 
@@ -195,29 +196,55 @@ def test_two_actuators_on_one_sensor_are_proven_together(sampling) -> None:
     assert refuted.outcome is ProofOutcome.REFUTED
 
 
-def test_the_norm_with_discs_holds_and_keeps_apart_what_is_apart() -> None:
-    rng, count, n = np.random.default_rng(11), 30, 5
+def wild(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return np.asarray(rng.normal(size=shape) + 1j * rng.normal(size=shape))
 
-    def wild(*shape: int) -> np.ndarray:
-        return np.asarray(rng.normal(size=shape) + 1j * rng.normal(size=shape))
 
-    A, p, q, radius = (
-        wild(count, 3, 2),
-        wild(n, count, 3),
-        wild(n, count, 2),
-        rng.random((n, count)),
-    )
-    most = norm_with(A, p, q, radius)
+def moved(
+    terms: Terms, delta: np.ndarray, A: np.ndarray, B: np.ndarray, Z: np.ndarray
+) -> np.ndarray:
+    """e of f where every w_i is δ_i times what it sees: (1 + Σ δ_i c_i q_iᵀ)u = ..."""
+    delta = terms.radius * delta
+    driven = np.einsum("Ni,ip,Niq->Npq", delta, terms.columns, terms.rows)
+    beside = np.einsum("Ni,ip,iq->Npq", delta, terms.columns, terms.inputs)
+    return A - B @ np.linalg.solve(np.eye(driven.shape[1]) + driven, driven @ Z + beside)
+
+
+@pytest.mark.parametrize("p", [1, 2, 3])
+def test_the_largest_norm_holds_for_all_discs_and_of_one_is_reached(p) -> None:
+    rng, count, n = np.random.default_rng(11), 30, 6
+    A, B, Z = (wild(rng, count, *shape) for shape in ((3, 2), (3, p), (p, 2)))
+    columns, rows, inputs = rng.normal(size=(n, p)), wild(rng, count, n, p), rng.normal(size=(n, 2))
+    rows[:, n // 2 :], inputs[: n // 2] = 0.0, 0.0
+    size = np.linalg.norm(columns, axis=1) * np.linalg.norm(rows, axis=2)
+    radius = 0.6 * rng.dirichlet(np.ones(n), count) / np.where(size > 0.0, size, 1.0)
+    terms = Terms(columns, rows, radius, inputs)
+    most = terms.largest(A, B, Z)
+    assert np.isfinite(most).all()
     for _ in range(300):
-        turned = radius * np.exp(2j * np.pi * rng.random((n, count)))
-        moved = A + np.einsum("iN,iNa,iNb->Nab", turned, p, q)
-        assert (np.linalg.norm(moved, 2, axis=(1, 2)) <= most).all()
-    # two channels: the largest of theirs, each the sum of its sizes
-    two = np.zeros((1, 2, 2), complex)
-    two[0] = np.diag([2.0, 1.0])
-    units = np.eye(2)[:, None, :] + 0j
-    found = norm_with(two, units, units, np.array([[0.3], [0.9]]))
-    assert found == pytest.approx([2.3], rel=1e-9)
+        e = moved(terms, np.exp(2j * np.pi * rng.random((count, n))), A, B, Z)
+        assert (np.linalg.norm(e, 2, axis=(1, 2)) <= most).all()
+    # one disc alone, far from small: what is said is what a point of its edge shows
+    one = Terms(columns[:1], rows[:, :1], 0.9 / size[:, :1], inputs[:1])
+    seen = np.max([np.linalg.norm(moved(one, turn, A, B, Z), 2, axis=(1, 2))
+                   for turn in np.exp(1j * ANGLES)], axis=0)  # fmt: skip
+    most = one.largest(A, B, Z)
+    assert (seen <= most * (1.0 + 1e-12)).all()
+    assert np.median(most / seen) < 1.1  # 1.04 of two and three
+
+
+def test_where_a_disc_makes_the_loop_singular_no_norm_is_found() -> None:
+    for n in (1, 2):
+        eye, radii = np.tile(np.eye(n), (3, 1, 1)), np.array([[0.99], [1.0], [1.01]])
+        found = Terms(np.eye(n), -eye, np.tile(radii, n)).largest(eye, eye, eye)
+        assert 100.0 * (1.0 - 1e-9) <= found[0] <= 115.0  # 112.8 of two, which are not one disc
+        assert np.isinf(found[1:]).all()
+
+
+def test_channels_that_are_apart_count_apart() -> None:
+    A, one = np.diag([2.0, 1.0])[None] + 0j, np.eye(2)[None]
+    terms = Terms(np.eye(2), 0.0 * one, np.array([[0.3, 0.9]]), np.eye(2))
+    assert terms.largest(A, one, one) == pytest.approx([2.3], rel=1e-2)
 
 
 def test_every_figure_of_several_channels_is_proven_where_the_boxes_suffice() -> None:
