@@ -45,9 +45,7 @@ from ccd_casadi.support.progress import Tell, silent
 from ccd_casadi.support.units import HZ
 
 REWARD = 1e-6  # of ln ω_b in ln v
-INSIDE = (
-    0.7  # of the bandwidth that its bounds leave a given κ: a search that begins at bounds crawls
-)
+INSIDE = 0.7  # of the ω_b that its bounds leave a given κ: a search that begins at bounds crawls
 KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
 
 
