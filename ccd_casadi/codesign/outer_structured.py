@@ -77,13 +77,14 @@ class StructuredEnd(End):
 
 
 class StructuredOuter(ThetaOuter):
-    """See the module; `words` say why the search at the start found no warm starts."""
+    """See the module; `words` say why the search at the start found no warm starts, and where one
+    `ended` before, no places far from there are tried again."""
 
     kkt_level = VerifiedStructured.kkt_level
 
-    def __init__(self, sampler: Sampler, words: str = "") -> None:
+    def __init__(self, sampler: Sampler, words: str = "", ended: bool = False) -> None:
         super().__init__(sampler)
-        self.words = words
+        self.words, self.ended = words, ended
 
     @property
     def retries_pay(self) -> bool:
@@ -137,9 +138,9 @@ class StructuredOuter(ThetaOuter):
 
     def polished(self, x: Array) -> StructuredEnd:
         sampler, theta = self.sampler, self.theta_of(x)
-        for _ in range(TAKEN):
+        for attempt in range(TAKEN):
             with sampler.spent.on("polish"):
-                sampler, best = polish_structured(sampler, theta)
+                sampler, best = polish_structured(sampler, theta, self.ended or attempt > 0)
             problem, found = sampler.problem, value_with_design(sampler, best)
             worst, scenarios = _worst_plants(sampler, best, found.design)
             multistart = None if scenarios else multistart_at(sampler, best)
@@ -161,7 +162,7 @@ class StructuredOuter(ThetaOuter):
         if not end.scenarios:
             return None
         anchored = with_warm_start(end.sampler.problem, end.inner.design.kappa)
-        return StructuredOuter(with_scenarios(end.sampler.of(anchored), end.scenarios))
+        return StructuredOuter(with_scenarios(end.sampler.of(anchored), end.scenarios), ended=True)
 
     def verified(self, end: End, rounds: int) -> VerifiedStructured:
         end = cast(StructuredEnd, end)
@@ -252,16 +253,20 @@ def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValu
     return problem.figure.gain(multistart.value, best.value) if multistart.feasible else 0.0
 
 
-def polish_structured(sampler: Sampler, theta: Array) -> tuple[Sampler, InnerSample]:
+def polish_structured(
+    sampler: Sampler, theta: Array, ended: bool = False
+) -> tuple[Sampler, InnerSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more plants, where worse ones were found.
 
-    By the joint search where J counts the bandwidth; from there, where J is not stationary, by
-    pieces (`pieces`), which know kinks, unless each θ is a finite-element model.
+    By the joint search where J counts the bandwidth, which tries no places far from where one has
+    `ended`; from there, where J is not stationary, by pieces (`pieces`), which know kinks, unless
+    each θ is a finite-element model.
     """
     problem = sampler.problem
     if problem.figure is BANDWIDTH:
-        sampler, best, _ = joint_search(sampler, theta, printer("on the way", sampler.quiet))
+        tell = printer("on the way", sampler.quiet)
+        sampler, best, _ = joint_search(sampler, theta, tell, polls=not ended)
         problem = sampler.problem
         if best.feasible and is_expensive(problem):
             return sampler, best

@@ -75,13 +75,14 @@ def joint_search(
     theta: Array,
     tell: Callable[[str], None] | None = None,
     ends: Sequence[tuple[Array, float]] | None = None,
+    polls: bool = True,
 ) -> tuple[Sampler, InnerSample, bool]:
     """From θ towards where the joint search promises no more on the worst plants: the sampler of
     the problem that has these and the controller there as its warm start, its true sample, and
     whether no more is promised.
 
     With `ends` of other searches (θ, J) it ends near one that it does not improve on, and leaves
-    the last digits to a polish."""
+    the last digits to a polish. Places further away are tried once, if it `polls`."""
     problem, first = sampler.problem, sampler.values(theta, "polishing")[0]
     if not np.isfinite(objective_of(problem, first)):
         return sampler, first, True
@@ -89,7 +90,7 @@ def joint_search(
     plants = Around.of(problem, best)
     reach, settled, working = REACH, False, WorkingSet(sampler)
     bent = plant_of(problem).nearby is not None
-    polls, before = bent, np.inf
+    polls, before = polls and bent, np.inf
     for turn in range(TURNS):
         within = UNDERWAY if turn else WITHIN
         working, best, J = working.on_worse_plants(
