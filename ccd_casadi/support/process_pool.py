@@ -12,10 +12,18 @@ from reprlib import Repr
 from typing import Any, Protocol, Self, TypeVar
 
 from ccd_casadi.support.interrupts import raise_dropped
-from ccd_casadi.support.worker_process import R, T, WorkerLost, WorkerProcess, interrupts_held
+from ccd_casadi.support.worker_process import (
+    R,
+    T,
+    WorkerLost,
+    WorkerProcess,
+    imported_ahead,
+    interrupts_held,
+)
 
 K = TypeVar("K")
 PATIENCE = 2.0  # s of work that is not worth starting processes for
+FORKED = 0.3  # s of such work where processes are forked
 Running = dict[connection.Connection, tuple[WorkerProcess, int]]  # by pipe, and the task's number
 _SHORT = Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
@@ -53,7 +61,7 @@ class Workers(AbstractContextManager["Workers"]):
     """
 
     def __init__(self, count: int, patience: float = 0.0) -> None:
-        """`patience`: seconds of work below which starting processes does not pay."""
+        """`patience`: seconds of work below which processes that import do not pay."""
         self.count = max(1, count)
         self.patience = patience
         self._workers: list[WorkerProcess] = []
@@ -72,11 +80,12 @@ class Workers(AbstractContextManager["Workers"]):
         """
         began, done_here = time.monotonic(), 0
         alone = self.count == 1 or len(tasks) <= 1
+        patience = min(self.patience, FORKED) if imported_ahead() else self.patience
         while done_here < len(tasks) and (alone or not self._workers):
             raise_dropped()
             each = (time.monotonic() - began) / done_here if done_here else 0.0
             left = each * (len(tasks) - done_here)
-            if not alone and (self.patience == 0.0 or left > self.patience):
+            if not alone and (patience == 0.0 or left > patience):
                 break
             yield function(tasks[done_here])
             done_here += 1

@@ -151,6 +151,11 @@ def import_ahead(modules: Sequence[str]) -> None:
         _contexts.append(multiprocessing.get_context("forkserver"))
 
 
+def imported_ahead() -> bool:
+    """Whether processes are forked from a server that has imported for them."""
+    return len(_contexts) > 1
+
+
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
     """An environment for processes to inherit: NumPy and Numba read it as they are imported."""
