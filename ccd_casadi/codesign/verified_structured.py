@@ -187,11 +187,11 @@ class VerifiedStructured(Verified):
             "proven": proof.levels,
         }
         where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
-        share = f"{100.0 + 100.0 * excess:.6g} % of a bound"
+        share = f"{100.0 + 100.0 * excess:.6g}"
         kept = "within every bound"
-        if not excess <= 0.0:  # what the judge counts as met
+        if not float(share) <= 100.0:  # what the judge counts as met
             kept = f"no bound exceeded by more than {100.0 * kind_of(self.problem).slack:g} %"
-        words = f"{kept} on {where}, the worst that a search found at {share}"
+        words = f"{kept} on {where}, the worst that a search found at {share} % of a bound"
         robust: bool | None = self.set_is_met
         if not self.wide.passed:
             words = f"on {where}: {self.wide.words}"
