@@ -5,7 +5,7 @@
 
 The design is that of benchmarks/rib_stage_design. `prove` is required to show stability and |S|,
 |KS|, |T| and |GS| within 1.05 of their bounds (`--bare`: |S| alone) on the box of every option:
-each flexible mode ±2 % by itself, damping × 0.5 to 2, up to 21 parameters. Then NumPy alone (its
+each flexible mode ±2 % by itself, damping × 0.5 to 2, up to 25 parameters. Then NumPy alone (its
 own hold and delay of each mode, K by Tustin's rule) looks for the largest figures in random
 plants, half of them corners, and climbs from the worst ones parameter by parameter. `--mutants`:
 plants that are not those of the proof, none of which may be proven: a twentieth of the damping,
