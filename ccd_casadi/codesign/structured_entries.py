@@ -10,12 +10,14 @@ from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
-from ccd_casadi.support.units import HZ
+from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.support.units import HZ, counted
 
 BINDS = {
     "S_MAX": "S_max",
@@ -26,7 +28,7 @@ BINDS = {
     "T": "weighted_level of T",
     "GS": "compliance_max",
 }
-WORST = 1.0 + 1e-5  # figure over bound up to which the judge counts a bound as met
+WORST = 1.0 + TOLERANCE  # figure over bound up to which the judge counts a bound as met
 
 
 def design_dict(
@@ -128,12 +130,20 @@ def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
     return {"channel_bounds": found} if found else {}
 
 
+def kept_words(worst: Excess) -> str:
+    """Which bounds hold on a box whose judge allows `LOOSE`, by its worst plant to six digits."""
+    if float(f"{100.0 + 100.0 * np.expm1(worst.value):.6g}") <= 100.0:
+        return "within every bound"
+    return f"no bound exceeded by more than {100.0 * LOOSE:g} %"
+
+
 def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, Any]:
     """`robust`: the judge on so many plants of the box, and the worst that was searched."""
+    words = f"stable, {kept_words(worst)} on {counted(plants, 'plant')}"
     return {
         "plants": plants,
         "passed": wide.passed,
-        "words": wide.words,
+        "words": words if wide.passed else wide.words,
         "bandwidth_hz": wide.bandwidth / HZ,
         "worst_excess": float(np.expm1(worst.value)),
     }

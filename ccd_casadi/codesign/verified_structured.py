@@ -10,6 +10,7 @@ from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
+    kept_words,
     proof_dict,
     robust_dict,
     sections_controller,
@@ -187,11 +188,8 @@ class VerifiedStructured(Verified):
             "proven": proof.levels,
         }
         where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
-        share = f"{100.0 + 100.0 * excess:.6g}"
-        kept = "within every bound"
-        if not float(share) <= 100.0:  # what the judge counts as met
-            kept = f"no bound exceeded by more than {100.0 * kind_of(self.problem).slack:g} %"
-        words = f"{kept} on {where}, the worst that a search found at {share} % of a bound"
+        share, kept = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(self.worst)
+        words = f"{kept} on {where}, the worst that a search found at {share}"
         robust: bool | None = self.set_is_met
         if not self.wide.passed:
             words = f"on {where}: {self.wide.words}"

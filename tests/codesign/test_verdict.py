@@ -25,10 +25,13 @@ from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
+from ccd_casadi.codesign.structured_entries import kept_words, robust_dict
 from ccd_casadi.codesign.survival import REACH, Survival, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
+from ccd_casadi.fixed_structure import SetCertificate
+from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
@@ -119,6 +122,17 @@ def test_its_own_set_or_an_unstable_closer_model_fails() -> None:
     lost = v.survives(SOUND, S_max=2.0, closer=[("20 modes", False, math.inf)])
     assert lost.state is v.State.FAILED
     assert "20 modes" in lost.words
+
+
+@given(st.floats(-1e-4, 1e-4))
+def test_within_every_bound_is_said_of_what_is_shown_so(value: float) -> None:
+    """Of the judge's words too, which allow more."""
+    worst = Excess(0, np.zeros(1), value)
+    shown = f"{100.0 + 100.0 * math.expm1(value):.6g}"
+    wide = SetCertificate(True, 1.0, (), {}, "as the judge allows")
+    for words in (kept_words(worst), robust_dict(wide, 9, worst)["words"]):
+        assert ("within every bound" in words) == (float(shown) <= 100.0)
+        assert ("exceeded by more than 0.02 %" in words) == (float(shown) > 100.0)
 
 
 def test_a_differentiator_is_said_to_be_one() -> None:
