@@ -56,7 +56,7 @@ def two_mass(theta: tuple[float, float]) -> Mechanics:
 
 def box(shift: float, damping: tuple[float, float] = (1.0, 1.0)) -> UncertainPlant:
     """Case study 1 at (55, 55) kg, its resonance off by ± `shift`."""
-    return UncertainPlant((two_mass((55.0, 55.0)),), Suspension(), M_K, resonance_shift=shift,
+    return UncertainPlant((two_mass((55.0, 55.0)),), M_K, resonance_shift=shift,
                           damping=damping)  # fmt: skip
 
 
@@ -237,7 +237,7 @@ def stage(seed: int) -> dict[str, dict[str, object]]:
     for rib, level in itertools.product((19.0, 17.0), (16.12, 8.426)):
         bounds = Bounds(S_max=2.0, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=level,
                         weights=weights if level else None)  # fmt: skip
-        uncertain = UncertainPlant((carriage((rib, 6.0)),), Suspension(), 2e6,
+        uncertain = UncertainPlant((carriage((rib, 6.0)),), 2e6,
                                    resonance_shift=0.05)  # fmt: skip
         made = synthesise_robustly(uncertain, Structure(least_damping=0.05), bounds, seed=seed,
                                    starts=8)  # fmt: skip

@@ -50,7 +50,6 @@ from ccd_casadi.fixed_structure.race import at_its_bandwidth
 from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner
@@ -101,7 +100,7 @@ def case(seed: int) -> Case:
     count = min(int(rng.choice([0, 1, 2], p=[0.3, 0.45, 0.25])), len(names))
     chosen = set(rng.choice(names, count, replace=False).tolist())
     system = mechanics(build_plant(chain, ("a",), {}), (1.0,))
-    uncertain = UncertainPlant((system,), Suspension(), M_K,
+    uncertain = UncertainPlant((system,), M_K,
                                **{name: box[name] for name in box if name in chosen})  # fmt: skip
     structure = Structure(
         bool(rng.random() < 0.8),

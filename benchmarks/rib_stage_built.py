@@ -34,7 +34,6 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.robust.sampled import sampled_figures
 
@@ -77,7 +76,7 @@ def plants(
     options |= {"modes": modes} if modes else {}
     options |= {"mesh": "fine"} if group % 4 == 3 else {"point_masses": (payload,)}
     system = mechanics(rib_stage(NAMES, **options), theta, derivatives=False)
-    box = UncertainPlant((system,), Suspension(), M_K, mode_shift=0.02, damping=(0.5, 2.0))
+    box = UncertainPlant((system,), M_K, mode_shift=0.02, damping=(0.5, 2.0))
     found = []
     for _ in range(GROUP):
         point = box.box[0] + rng.random(len(box.names)) * (box.box[1] - box.box[0])

@@ -66,7 +66,7 @@ def plants_at(problem: CoDesignProblem, theta: tuple[float, ...]) -> list[Scaled
     u = structured_of(problem).uncertainty
     loaded = with_options(problem, u.options[PAYLOAD])
     systems = tuple(mechanics(plant_of(p), theta, derivatives=False) for p in (problem, loaded))
-    box = UncertainPlant(systems, problem.suspension, problem.weights.M_K, u.resonance_shift,
+    box = UncertainPlant(systems, problem.weights.M_K, u.resonance_shift,
                          u.mode_shift, u.damping, u.gain)  # fmt: skip
     plants = box.plants(box.corners()[len(systems) :])
     return [in_units_of(plant, plants[0]) for plant in plants]

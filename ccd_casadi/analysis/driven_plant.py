@@ -15,7 +15,7 @@ import numpy as np
 from ccd_casadi.analysis.motor import UNLIMITED, Motion, MotionAt, motion_at
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.fixed import reparametrised
-from ccd_casadi.plants.modal import FREE, modal_plant
+from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.arrays import Array
@@ -55,8 +55,9 @@ class DrivenMechanics:
 
     def at(self, theta: Sequence[float], sampling: Sampling | None = None) -> MotionAt:
         """The move at θ. Raises UserError where a spring holds the output."""
-        free = scale_plant(modal_plant(self(theta), FREE), 1.0, bare=True)
-        return motion_at(self.motion, free, self.mass(theta), self.place, sampling)
+        free = without_hidden_rigid_modes(modal_plant(self(theta), FREE))
+        bare = scale_plant(free, 1.0, bare=True)
+        return motion_at(self.motion, bare, self.mass(theta), self.place, sampling)
 
 
 def with_motion(

@@ -35,7 +35,7 @@ class Move:
     """Time (k,) in s, setpoint (k,), its acceleration (k,), error and forces (k, m).
 
     The error is of the moving output (k,), or of all (k, p). The setpoint ends at `duration`.
-    `free`: on the plant without its suspension. `saturated`: share of the instants at a limit.
+    `saturated`: share of the instants at a limit.
     """
 
     time: Array
@@ -46,7 +46,6 @@ class Move:
     feedforward: bool
     duration: float
     window: float
-    free: bool = False
     saturated: float = 0.0
 
     @property
@@ -98,8 +97,7 @@ class Move:
     @property
     def words(self) -> str:
         """What takes part in it."""
-        ahead = "with mass feedforward" if self.feedforward else "without feedforward"
-        return f"{ahead}, {'its rigid bodies free' if self.free else 'on its soft suspension'}"
+        return "with mass feedforward" if self.feedforward else "without feedforward"
 
     def until(self, seconds: float) -> "Move":
         """Its first part."""
@@ -128,8 +126,7 @@ def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
 
 
 def moves(
-    suspended: Sequence[Loop],
-    free: Sequence[Loop],
+    loops: Sequence[Loop],
     ways: Sequence[Array | None],
     profile: Setpoint,
     *,
@@ -138,16 +135,12 @@ def moves(
     bandwidth_hz: float,
     doublings: int = DOUBLINGS,
 ) -> list[list[Move]]:
-    """A move of each loop (inner lists) in each way (forces of `mass_feedforward`, or None).
-
-    Of the loops with free rigid bodies, or of the suspended ones where not all of those are stable.
-    """
-    released = all(loop.stable for loop in free)
+    """A move of each loop (inner lists) in each way (forces of `mass_feedforward`, or None)."""
     return [
         [
-            replace(simulate(loop, profile, axis=axis, forces=forces, window=window,
-                             bandwidth_hz=bandwidth_hz, doublings=doublings), free=released)
-            for loop in (free if released else suspended)
+            simulate(loop, profile, axis=axis, forces=forces, window=window,
+                     bandwidth_hz=bandwidth_hz, doublings=doublings)
+            for loop in loops
         ]
         for forces in ways
     ]  # fmt: skip

@@ -88,7 +88,9 @@ def problem_of(case: Case) -> CoDesignProblem:
             # a fixed structure bounds it on every plant of its set
             compliance_max=None if structured else inner.compliance_max,
         ),
-        suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
+        suspension=Suspension(
+            case.suspension.frequency_hz, case.suspension.damping_ratio, case.suspension.rigid_modes
+        ),
         method=inner.method,
         robust=None if structured else _robust(case.robust),
         controller=structured_problem(case, tuple(map(_options, case.robust.plants)))

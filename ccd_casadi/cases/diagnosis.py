@@ -22,7 +22,13 @@ from ccd_casadi.cases.findings import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
-from ccd_casadi.plants.modal import FREE, ModalPlant, Suspension, modal_plant, require_damping
+from ccd_casadi.plants.modal import (
+    ModalPlant,
+    Suspension,
+    modal_plant,
+    require_damping,
+    without_hidden_rigid_modes,
+)
 from ccd_casadi.plants.plant import Plant, mechanics, named_values
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
@@ -70,15 +76,14 @@ def diagnose(
             place = f"at theta = {named_values(plant.names, theta)}" if index else "at the start"
             try:
                 system = mechanics(plant, theta, derivatives=index == 0)
-                modal = modal_plant(system, problem.suspension)
+                modal = modal_plant(system, problem.suspension.free)
                 require_damping(modal)
-                scaled = scale_plant(modal, problem.weights.M_K)
-                free = scale_plant(modal_plant(system, FREE), problem.weights.M_K)
+                scaled = scale_plant(without_hidden_rigid_modes(modal), problem.weights.M_K)
             except PlantError as error:
                 words = str(error) if "at theta" in str(error) else f"{error} {place}"
                 findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
                 continue
-            found = facts_of(theta, modal, scaled, free)
+            found = facts_of(theta, modal, scaled)
             doubt = plant.doubt(theta) if index < CHECKED else ""
             here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
             here += _rigid(modal, problem.suspension, rigid_modes, place)
@@ -148,8 +153,9 @@ def _hidden(modal: ModalPlant, place: str) -> list[Finding]:
         missing = "not " + " and not ".join(lacks)
         if rigid[group[0]]:
             words = (
-                f"of {len(group)} rigid-body motions {place} one or more are {missing}: the "
-                "suspension alone holds them; add an input or output, or take them out of the model"
+                f"of {len(group)} rigid-body motions {place} one or more are {missing}: no "
+                "controller holds them, and they are left out of the loop; something else in the "
+                "machine has to"
             )
         else:
             formal = {"driven": "uncontrollable", "measured": "unobservable"}

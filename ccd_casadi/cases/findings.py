@@ -68,17 +68,8 @@ def zero_findings(facts: PlantFacts, S_max: float, place: str) -> list[Finding]:
     """The right half-plane zero that limits most, and the dips; `place` names the θ."""
     found = []
     right = [zero for zero in facts.zeros if zero.damping_ratio < -1e-9]
-    true = [zero for zero in right if not zero.artefact]
-    if true:
-        found.append(_right(min(true, key=lambda z: z.frequency_hz), facts, S_max, place))
-    elif right:
-        z = right[0].frequency_hz
-        words = (
-            f"a transmission zero in the right half-plane at {z:.4g} Hz {place} is the "
-            "suspension's: without it the plant has none there; a softer suspension "
-            "(suspension.frequency_hz) moves it away"
-        )
-        found.append(Finding(Severity.NOTE, Topic.ZERO, words))
+    if right:
+        found.append(_right(min(right, key=lambda z: z.frequency_hz), facts, S_max, place))
     return found + [_dip(zero) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT]
 
 

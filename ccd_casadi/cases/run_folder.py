@@ -19,7 +19,7 @@ from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     structured_of,
@@ -31,7 +31,7 @@ from ccd_casadi.inner_problem.structured_search import with_range, with_warm_sta
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
+from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -76,8 +76,8 @@ class FinishedRun(NotebookHtml):
         return mechanics(plant_of(self.problem), self.theta, derivatives=False)
 
     def modal(self, *off: Perturbation) -> ModalPlant:
-        """The plant in its modes, as the model has it or off that."""
-        return modal_plant(self.system, self.problem.suspension, *off)
+        """The plant in its modes, as the model has it or off that; rigid bodies are free."""
+        return free_modal(self.problem, self.system, *off)
 
     def loop_on(self, plant: StateSpace) -> Loop:
         """The loop on a plant in SI, as it runs."""

@@ -1,7 +1,7 @@
 """A synthesis, its controller and its error budget as values of result.json and controller.json."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 from ccd_casadi.analysis.loop_figures import loop_entry
@@ -11,7 +11,6 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.move_figures import exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import FREE
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import compliance_words, statics
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
@@ -87,8 +86,8 @@ def move_entry(
     """`move` as the one key of a mapping, SI; nothing where the problem has none."""
     if problem.source.motion is None:
         return {}
-    motion, free = motion_of(problem, theta), replace(problem, suspension=FREE)
-    times = exact_times(problem, motion, kind_of(free).plants(theta), controller)
+    motion = motion_of(problem, theta)
+    times = exact_times(problem, motion, kind_of(problem).plants(theta), controller)
     cycle, own = motion.cycle, problem.source.motion
     of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
     return {"move": {

@@ -11,7 +11,14 @@ import numpy as np
 from ccd_casadi.lti.hold import Sampling, tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import ModalPlant, Perturbation, Suspension, modal_plant
+from ccd_casadi.plants.modal import (
+    FREE,
+    ModalPlant,
+    Perturbation,
+    Suspension,
+    modal_plant,
+    without_hidden_rigid_modes,
+)
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 
@@ -94,16 +101,19 @@ class LoopsOffModel:
 
 def loops_off_model(
     system: Mechanics,
-    suspension: Suspension,
     controller: StateSpace,
     sampling: Sampling | None = None,
+    free: Suspension = FREE,
 ) -> LoopsOffModel:
-    """Of a plant's matrices at one θ."""
+    """Of a plant's matrices at one θ, its bodies `free`."""
+
+    def modal(off: Perturbation) -> ModalPlant:
+        return without_hidden_rigid_modes(modal_plant(system, free, off))
 
     def D(off: Perturbation) -> Array:
-        return modal_plant(system, suspension, off).D
+        return modal(off).D
 
-    plant = modal_plant(system, suspension)
+    plant = modal(Perturbation())
     matrix = D(Perturbation(damping=2.0)) - plant.D
     grows = (D(Perturbation(shift=0.5)) - plant.D) / 0.5
     given = system.damping_ratio is None

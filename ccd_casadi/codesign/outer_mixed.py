@@ -23,15 +23,13 @@ from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
+from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.optim.box import Box
-from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design
 from surrogates import design
 
@@ -121,11 +119,6 @@ class MixedOuter(Outer):
         figures = here.design.figures
         make = partial(final_design, problem, theta, (figures.omega_S, figures.omega_T))
         final = sampler.cached("final", tuple(x), Design, make)
-        free = replace(problem, suspension=FREE)
-        unsuspended = measure(
-            scaled_plant(free, theta), final.controller, final.weights,
-            omega_low=problem.inner.omega_low,
-        )  # fmt: skip
         loops = loops_of(problem, theta, final.controller)
         found, robust = survived(problem, loops, final.figures)
         return VerifiedDesign(
@@ -139,7 +132,6 @@ class MixedOuter(Outer):
             kkt=kkt_certificate(here, second=True),
             inner_gap=end.gap,
             feasible=final.figures.certified and here.acceptable,
-            unsuspended=unsuspended,
             references=check_references(problem, theta, final, sampler.workers, sampler.quiet),
             robust=robust,
             damping=other_damping(problem, loops),

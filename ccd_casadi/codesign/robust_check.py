@@ -22,8 +22,8 @@ from ccd_casadi.codesign.loops_off_model import LoopsOffModel
 from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
+from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.process_pool import Pool, results
@@ -217,7 +217,7 @@ def check_on(
     problem: CoDesignProblem, system: Mechanics, design: Design, name: str
 ) -> ReferenceCheck:
     """The design's controller on one plant, given by its matrices."""
-    closer = scale_plant(modal_plant(system, problem.suspension), problem.weights.M_K)
+    closer = scale_plant(free_modal(problem, system), problem.weights.M_K)
     at = partial(measure, closer, design.controller, design.weights,
                  omega_low=problem.inner.omega_low)  # fmt: skip
     figures = at(gamma=design.figures.certificate.norm_bound)

@@ -72,7 +72,7 @@ def loops_of(
     """The loops of a controller in SI (e in, u out) of whatever kind on plants off the model at θ,
     sampled where the problem's loop is."""
     system = mechanics(plant_of(problem), theta)
-    return loops_off_model(system, problem.suspension, controller, problem.sampling)
+    return loops_off_model(system, controller, problem.sampling, problem.suspension.free)
 
 
 def growth_of(loop: Loop) -> float:

@@ -12,20 +12,18 @@ from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.synthesis import Design, DesignFigures
+from ccd_casadi.synthesis.synthesis import Design
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerifiedDesign(Verified):
     """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
 
-    `unsuspended`: the same controller on the plant with its rigid-body modes free; `references`:
-    on closer models of the plant; `robust`: all along the case's own set.
+    `references`: on closer models of the plant; `robust`: all along the case's own set.
     """
 
     x: Array
     design: Design
-    unsuspended: DesignFigures
     references: tuple[ReferenceCheck, ...] = ()
     robust: RobustCheck | None = None
 
@@ -54,7 +52,7 @@ class VerifiedDesign(Verified):
         return mixed_dict(self.problem, self.theta, self.design)
 
     def evidence(self, predicted: float) -> dict[str, Any]:
-        free = self.unsuspended
+        free = self.design.figures
         found: dict[str, Any] = {
             "surrogate_bandwidth_hz": predicted / HZ,
             "without_suspension": {

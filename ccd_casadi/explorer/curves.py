@@ -18,7 +18,6 @@ from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.arrays import Array
@@ -98,11 +97,9 @@ def curves_of(look: Look) -> Curves | None:
 
 
 def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
-    """The default one of robustness, its rigid bodies free where that loop is stable."""
-    modal = modal_plant(look.elements.system, FREE)
-    free = replace(loop, plant=modal.state_space)
+    """The default one of robustness."""
     ((made,),) = moves(
-        [loop], [free], [mass_feedforward(modal, 0)], setpoint(LIMITS), axis=0, window=WINDOW,
+        [loop], [mass_feedforward(look.modal, 0)], setpoint(LIMITS), axis=0, window=WINDOW,
         bandwidth_hz=bandwidth_hz, doublings=1,
     )  # fmt: skip
     return made.until(WATCHED * made.duration)

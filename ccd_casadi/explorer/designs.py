@@ -14,13 +14,14 @@ from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
     design_choices,
+    free_modal,
     plant_of,
     scaled_system,
 )
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds
 from ccd_casadi.kernels.design import failed_row
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import ModalPlant, modal_plant
+from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -191,7 +192,7 @@ def without_controller(
         knobs=knobs,
         problem=problem,
         elements=elements,
-        modal=modal_plant(elements.system, problem.suspension),
+        modal=free_modal(problem, elements.system),
         plant=scaled_system(problem, elements.system),
         weights=problem.weights,
         figures=figures_from_row(failed_row(), problem.weights.at(0.0, 0.0), 1.0),

@@ -1,7 +1,8 @@
 """Boxes of frequency and uncertain parameters, and what a loop is made of as forms on them.
 
 s = y/x, so that frequencies from 0 to infinity are no special case: x = 1, y = jω below a unit,
-x = 1/ω, y = j above it; sampled x = cos(ωT/2), y = (2j/T) sin(ωT/2), z = e^{jωT}.
+x = 1/ω, y = j above it; sampled x = cos(ωT/2), y = (2j/T) sin(ωT/2), z = e^{jωT}. A free body is
+infinite at 0 Hz: on boxes that touch it it is enclosed times y².
 """
 
 from dataclasses import dataclass
@@ -58,7 +59,8 @@ class Boxes:
 
 @dataclass(frozen=True)
 class Axis:
-    """Frequencies as forms of variable 0: s = y/x, e^{-sT}; period (None: continuous) and delay."""
+    """Frequencies as forms of variable 0: s = y/x, e^{-sT}; period (None: continuous) and delay.
+    `touches`: which boxes touch 0 Hz."""
 
     x: Affine
     y: Affine
@@ -66,6 +68,7 @@ class Axis:
     turn: Affine
     period: float | None
     delay: float
+    touches: np.ndarray
 
     def factor(self, p: Affine, residue: Affine) -> Pair:
         """D and N of a pole, both times x; they vanish together nowhere."""
@@ -81,19 +84,57 @@ class Axis:
         # both times 1/z, of size one on the axis
         return -(all_of * turn) + 1.0, residue * N * inverse(p) * turn
 
+    @property
+    def free_body(self) -> Affine:
+        """1/s², or y²/s² = x² where boxes touch 0 Hz; sampled y² times what hold and delay make of
+        1/s² (`kernels.modes`):
+
+        z⁻ᵈ ((h² + (T² - h²)/z)(1 - 1/z)/2 + T (h + (T - h)/z)/z)/T²
+        """
+        if self.period is None:
+            return self._per_y_squared(self.x * self.x)
+        T, turn = self.period, self.turn
+        whole, rest = delay_parts(T, self.delay)
+        h = T - rest
+        first = (turn * (T * T - h * h) + h * h) * (turn * -1.0 + 1.0) * 0.5
+        found = (first + (turn * (T - h) + h) * turn * T) * (1.0 / T**2)
+        for _ in range(whole):
+            found = found * turn
+        return self._per_y_squared(found)
+
+    @property
+    def free_body_unheld(self) -> Affine:
+        """The same without hold and delay: sampled y²/s² = sinc²(ωT/2), |sinc''| <= 1/3."""
+        if self.period is None:
+            return self._per_y_squared(self.x * self.x)
+        half = self.s.centre.imag * 0.5 * self.period
+        slope, width = self.s.slope.imag * 0.5 * self.period, np.abs(self.s.slope).sum(0)
+        small = np.abs(half) < 1e-3  # there the series holds to rounding
+        over = np.where(small, 1.0, half)
+        value = np.where(small, 1.0 - half**2 / 6.0, np.sin(over) / over)
+        steep = np.where(small, -half / 3.0, (np.cos(over) - np.sin(over) / over) / over)
+        rest = (0.5 * self.period * width) ** 2 / 6.0 + 1e-12
+        sinc = Affine(value, steep * slope, rest)
+        return self._per_y_squared(sinc * sinc)
+
+    def _per_y_squared(self, form: Affine) -> Affine:
+        """The form itself where boxes touch 0 Hz, else over y²."""
+        return _either(self.touches, form, form * inverse(self.y * self.y))
+
 
 def axis_of(boxes: Boxes, period: float | None, delay: float) -> Axis:
     """The frequencies of boxes."""
     f = variable(boxes.low[0], boxes.high[0], 0, 1)
+    touches = (boxes.low[0] == 0.0) & (boxes.chart != Chart.HIGH)
     if period is None:
         upper = boxes.chart == Chart.HIGH
         one = Affine(np.ones(len(f.centre)), np.zeros_like(f.slope), np.zeros(len(f.centre)))
         x, y = _either(upper, f, one), _either(upper, one, f) * 1j
-        return Axis(x, y, y, one, None, 0.0)
+        return Axis(x, y, y, one, None, 0.0, touches)
     half = exponential(f * 0.5j)
     back = exponential(f * -0.5j)
     x, y = (half + back) * 0.5, (half - back) * (1.0 / period)
-    return Axis(x, y, f * (1j / period), back * back, period, delay)
+    return Axis(x, y, f * (1j / period), back * back, period, delay, touches)
 
 
 def gain_of(structure: Structure, kappa: Array, axis: Axis, integrator: bool) -> Affine:

@@ -76,7 +76,7 @@ class SetCertificate:
 
 
 def certify(
-    plants: Sequence[ScaledPlant],
+    plants: Sequence[ScaledPlant | StateSpace],
     controller: StateSpace,
     bounds: Bounds,
     sampling: Sampling | None = None,
@@ -88,8 +88,8 @@ def certify(
 
     Parameters
     ----------
-    plants, controller : sequence of ScaledPlant, StateSpace
-        All of the set; e in, u out.
+    plants, controller : sequence of ScaledPlant or StateSpace, StateSpace
+        All of the set, force to displacement, SI; e in, u out.
     bounds, integrator : Bounds, bool
         With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
@@ -100,17 +100,18 @@ def certify(
     Certificate
         Stability, figures over bounds, and ω_b in rad/s, the least of all plants.
     """
-    sizes = [(plant.A.shape, plant.B.shape, plant.C.shape) for plant in plants]
+    systems = [own if isinstance(own, StateSpace) else own.plant_si() for own in plants]
+    sizes = [(G.A.shape, G.B.shape, G.C.shape) for G in systems]
     alike = [[i for i, own in enumerate(sizes) if own == size] for size in dict.fromkeys(sizes)]
     parts = [same[i : i + AT_ONCE] for same in alike for i in range(0, len(same), AT_ONCE)]
     tasks = {
-        tuple(part): ([plants[i] for i in part], controller, bounds, sampling, integrator)
+        tuple(part): ([systems[i] for i in part], controller, bounds, sampling, integrator)
         for part in parts
     }
     each: dict[int, PlantFigures] = {}
     for part, figures_of in results(workers, judged, tasks):
         each |= zip(part, figures_of, strict=True)
-    found = [each[i] for i in range(len(plants))]
+    found = [each[i] for i in range(len(systems))]
     unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]
     if unstable:
         words = f"unstable on plant {unstable[0]} of {len(found)}"
@@ -137,14 +138,14 @@ def certify(
 
 
 def judged(
-    plants: Sequence[ScaledPlant],
+    plants: Sequence[StateSpace],
     controller: StateSpace,
     bounds: Bounds,
     sampling: Sampling | None,
     integrator: bool,
 ) -> list[PlantFigures]:
     """The figures of every plant's loop; the plants have matrices of one size."""
-    free = [_balanced(plant.plant_si()) for plant in plants]
+    free = [_balanced(plant) for plant in plants]
     K = _balanced(controller)
     G, held = free, K
     if sampling is not None:

@@ -6,6 +6,8 @@ with their number and not with that of the boxes' corners. With K = K̂/y and W 
 
     S = yW,  KS = K̂W,  T = W GK̂,  GS = yW G,   M = y + GK̂,  G = Σ_i g_i c_i b_iᵀ.
 
+Free bodies are infinite at 0 Hz: boxes that touch it are of `_at_rest`.
+
 The largest norms over all discs are those of `largest_norm`: every disc counts along its own
 direction, so that modes which move one channel leave the others alone, and to all orders. What y
 and K̂ differ by are Δ in M and a factor 1 + E of K̂. With M₁ = M + Δ of any M of the discs,
@@ -31,6 +33,7 @@ from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
 
 Range = tuple[Array, Array]  # not below a figure anywhere on a box, and not above it
+RANK = 1e-9  # relative: directions of the outputs that free bodies move by less are not moved
 FAR = 0.5  # relative: a gain that moves more over a box is bounded, not followed
 ENDLESS = 1e100  # rad/s: where weights are at their ends
 
@@ -72,6 +75,93 @@ class LoopFamily:
     def enclose(self, boxes: Boxes) -> Enclosures:
         """All bounds on all boxes."""
         axis = axis_of(boxes, self.period, self.delay)
+        resting = axis.touches & self.plant.rigid.any()
+        if not resting.any():
+            return self._on_the_way(boxes, axis)
+        parts = [
+            (
+                chosen,
+                enclose(boxes.only(chosen), axis_of(boxes.only(chosen), self.period, self.delay)),
+            )
+            for chosen, enclose in ((resting, self._at_rest), (~resting, self._on_the_way))
+            if chosen.any()
+        ]
+        order = np.argsort(np.concatenate([np.flatnonzero(chosen) for chosen, _ in parts]))
+        joint = (np.concatenate([getattr(found, key) for _, found in parts], axis=-1)[..., order]
+                 for key in ("highest", "lowest", "spread", "bounded"))  # fmt: skip
+        return Enclosures(parts[0][1].names, *joint)
+
+    def _at_rest(self, boxes: Boxes, axis: Axis) -> Enclosures:
+        """The same, upper bounds alone, on boxes that touch 0 Hz, of a plant with free bodies.
+
+        G = G_r + F, G_r = R/s². With P the projection on what free bodies do not move, P R = 0, and
+        q = y², N = q(1 - P) + P, so that N G_r = q G_r is finite, M is taken times N:
+
+            M = y N + q G_r K̂ + N F K̂,   |M - y P - (q G_r + P F) K̂| <= |q| (|y| + |F K̂|)
+
+        S = y M⁻¹N,  KS = K̂ M⁻¹N,  T = 1 - S,  GS = y M⁻¹N G;   |N| <= max(|q|, |P|)
+        """
+        compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
+        held, free, damped = discs_of(
+            self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
+        )
+        gains, loose, faint = self._gains(axis)
+        finite = np.isfinite(held.middle + held.radius + free.middle + free.radius).all(axis=0)
+        good = finite & np.isfinite(gains).all(axis=1) & damped
+        m, r, g, e = (np.where(good, part, 0.0).T
+                      for part in (held.middle, held.radius, free.middle, free.radius))  # fmt: skip
+        K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
+        c, b, rigid = self.plant.reading, self.plant.drive, self.plant.rigid
+        U, s, _ = np.linalg.svd(c[rigid].T, full_matrices=False)
+        U = U[:, s > RANK * s[0]]
+        unit = np.eye(c.shape[1])
+        P = unit - U @ U.T
+        held_too = float(U.shape[1] < len(unit))  # |P|
+        n = np.maximum(axis.y.size**2, held_too)
+        columns = np.where(rigid[:, None], c, c @ P)
+        rows, one = b @ K, np.ones(len(good))
+        y, most, moved = one, one, 0.0 * one
+        if self._integrator:
+            y, most, moved = axis.y.centre, axis.y.size, axis.y.reach + axis.y.rest
+        M = y[:, None, None] * P + (columns.T * m[:, None]) @ rows
+        good &= np.linalg.det(M) != 0.0
+        W = np.linalg.inv(np.where(good[:, None, None], M, unit))
+        sizes = (np.abs(m) + r) * _lengths(c) * _lengths(rows)
+        unknown = axis.y.size**2 * (most + sizes[:, ~rigid].sum(axis=1)) + held_too * moved
+        grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
+        unknown += grain * ((np.abs(m) + r) * _lengths(c) * _lengths(b)).sum(axis=1)
+        total = sizes.sum(axis=1) + held_too * np.abs(y)
+        unknown += GUARD * total * (1.0 + total * norm(W))
+        ones = np.tile(unit, (len(good), 1, 1))
+        a = Terms(columns, rows @ W, r, None).largest(W, W, ones)
+        good &= a * unknown < 1.0
+        after = np.where(good, a, 1.0) / np.where(good, 1.0 - a * unknown, 1.0)
+        loose = loose * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
+        by = loose * (1.0 + most * n * after)  # of T₁E
+        good &= by < 1.0
+        over = n * after / np.where(good, 1.0 - by, 1.0)  # ‖M⁻¹N‖
+        S, none = most * over, 0.0 * one
+        found = self._of_S(boxes, (S, none), over)
+        if level is not None:
+            KS = ((1.0 + loose) * norm(K) + grain) * over
+            found += self._weighted(boxes, level, (KS, none), (1.0 + S, none))
+        if compliance is not None:
+            # N G: q g of the free bodies
+            G = ((np.abs(g) + e) * _lengths(c) * _lengths(b)).sum(axis=1)
+            inside = compliance * self._inside(boxes)
+            GS = most * over / n * np.maximum(n, 1.0) * G
+            found.append(("GS", GS / inside, none))
+        most_at = np.array([most_of for _, most_of, _ in found])
+        highest = np.where(good & np.isfinite(most_at), most_at, np.inf)
+        weight = np.where(finite[:, None], _lengths(c) * _lengths(rows), 1.0)
+        shares = np.where(np.isfinite(held.shares), held.shares, 0.0)
+        spread = np.einsum("Ni,ikN->kN", weight, shares)
+        spread[0] += unknown + most * loose
+        names = tuple(name for name, *_ in found)
+        return Enclosures(names, highest, np.zeros_like(highest), spread, good)
+
+    def _on_the_way(self, boxes: Boxes, axis: Axis) -> Enclosures:
+        """The same on boxes on which every mode is finite."""
         compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
         held, free, damped = discs_of(
             self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None

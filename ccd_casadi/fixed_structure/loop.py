@@ -11,11 +11,14 @@ u = -K y with K = V diag(K_i) Uᵀ; where U and V are orthogonal the plants are 
 coordinates of the channels first. There may be more inputs than outputs: two actuators on one
 sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2 K_2. One channel has U = V = 1.
 
+Free bodies stay free: their poles are exactly 0, of a body that nothing damps twice, q̇ = s v and
+v̇ = b u. Such a pair of states is one of N, A = V diag(poles) W + N, N² = 0.
+
 Time is counted in 1/ω₀ of the first plant, force in its unit (`scaling`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,14 +27,16 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels, in_units_of
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes, plant_slopes
-from ccd_casadi.lti.hold import Sampling, delayed, in_w, moment_slopes, moments
+from ccd_casadi.lti.hold import Sampling, delay_parts, delayed, in_w, moment_slopes, moments
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.plants.rigid_modes import driven_and_measured, placed
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 PROBES = 1j * np.geomspace(1e-2, 1e2, 7)  # s over ω₀
 FAITHFUL = 1e-7  # relative error of the modal response, above which a plant has no such form
+AT_REST = 1e-9  # of the fastest pole: as slow as rounding makes a pole at 0
 CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
 
 
@@ -41,7 +46,8 @@ class LoopPlant:
 
     `system` is the continuous plant, `poles` are its, with `drive` = V⁻¹B (n, m) and `reading` =
     CV (p, n) in its eigenvectors V (n, n), W = V⁻¹; `dA` = W ∂A V, `dB` = W ∂B, `dC` = ∂C V,
-    leading axis θ.
+    leading axis θ. `chains` (k, 2) are the states q, v of free bodies, whose columns of V are those
+    of the identity.
     """
 
     system: StateSpace
@@ -53,18 +59,36 @@ class LoopPlant:
     dA: np.ndarray
     dB: np.ndarray
     dC: np.ndarray
+    chains: np.ndarray
+
+    @property
+    def nilpotent(self) -> Array:
+        """N (n, n): s from v to q."""
+        q, v = self.chains.T
+        N = np.zeros_like(self.system.A)
+        N[q, v] = self.system.A[q, v]
+        return N
+
+    @property
+    def free_bodies(self) -> np.ndarray:
+        """Of 1/s², (p, m)."""
+        return self.system.C @ self.nilpotent @ self.system.B
 
     def in_w(self, period: float | None, delay: float) -> StateSpace:
         """With hold and delay, as a rational function of w; itself where nothing is sampled.
 
         x_{k+1} = V e^{pT} W x_k + V late W B u_{k-d} + V early W B u_{k-d-1}
+                  + N (T x_k + h²/2 B u_{k-d} + (T² - h²)/2 B u_{k-d-1})
         """
         if period is None:
             return self.system
         d, *shares = moments(self.poles, period, delay)
-        gains = [((self.V * share) @ self.drive).real for share in shares]
+        h, N = period - delay_parts(period, delay)[1], self.nilpotent
+        coasted = 0.5 * h**2, 0.5 * (period**2 - h**2)
+        gains = [((self.V * share) @ self.drive).real + N @ self.system.B * moved
+                 for share, moved in zip(shares, coasted, strict=True)]  # fmt: skip
         gains = [np.zeros_like(self.system.B)] * int(d) + gains[: 1 + bool(np.any(shares[1]))]
-        step = ((self.V * np.exp(self.poles * period)) @ self.W).real
+        step = ((self.V * np.exp(self.poles * period)) @ self.W).real + N * period
         return in_w(delayed(step, gains, self.system.C, period))
 
 
@@ -74,8 +98,8 @@ class PlantSet:
     in 1/ω₀.
 
     `poles` (P, n) and `residues` (P, n, p, m) are those of the continuous plants, the shorter ones
-    with zeros. `out` = Uᵀ (c, p) and `into` = V (m, c) in the coordinates of the plants: identities
-    where they are turned.
+    with zeros. At a pole 0 the residue's imaginary part is that of 1/s². `out` = Uᵀ (c, p) and
+    `into` = V (m, c) in the coordinates of the plants: identities where they are turned.
     """
 
     plants: tuple[LoopPlant, ...]
@@ -110,14 +134,16 @@ class PlantSet:
     @cached_property
     def modes(self) -> modes.Plants:
         """Conjugate poles in pairs, as the kernels have them."""
-        upper = self.poles.imag >= 0.0
+        answers = (self.poles != 0.0) | (self.residues != 0.0).any(axis=(2, 3))
+        upper = (self.poles.imag >= 0.0) & answers
         order = np.argsort(~upper, axis=1, kind="stable")[:, : int(upper.sum(axis=1).max())]
         kept = np.take_along_axis(upper, order, axis=1)
         p = np.take_along_axis(self.poles, order, axis=1)
         p.imag = np.abs(p.imag)  # those past the last of a plant have no residue
         r = np.take_along_axis(self.residues, order[..., None, None], axis=1)
         share = np.where(kept, np.where(p.imag == 0.0, 0.5, 1.0), 0.0)[..., None, None]
-        residues = np.stack([share * r.real, np.where(share == 1.0, r.imag, 0.0)], axis=2)
+        both = (share == 1.0) | (p == 0.0)[..., None, None]
+        residues = np.stack([share * r.real, np.where(both, r.imag, 0.0)], axis=2)
         if self.period is None:
             return modes.Plants(np.stack([p] * 4, axis=-1), residues, 0.0, 0.0)
         d, late, early = moments(p, self.period, self.delay)
@@ -154,6 +180,13 @@ class PlantSet:
         """What the kernels need for derivatives to θ; the shorter plants with zeros."""
         C, B, *parts = (padded([getattr(plant, name) for plant in self.plants], dtype=complex)
                         for name in ("reading", "drive", "dA", "dB", "dC"))  # fmt: skip
+        kinds = np.full(self.poles.shape, plant_slopes.SIMPLE, np.int8)
+        for i, plant in enumerate(self.plants):
+            q, v = plant.chains.T
+            kinds[i, q], kinds[i, v] = plant_slopes.POSITION, plant_slopes.VELOCITY
+            s = plant.system.A[q, v]
+            C[i, :, v], C[i, :, q] = s[:, None] * C[i, :, q], 0.0
+            B[i, q] = s[:, None] * B[i, v]
         dA, dB, dC = (np.ascontiguousarray(np.moveaxis(part, 1, -1)) for part in parts)
         gap, size = self.poles[:, :, None] - self.poles[:, None, :], np.abs(self.poles)
         near = np.abs(gap) <= CLOSE * np.maximum(size[:, :, None], size[:, None, :])
@@ -164,7 +197,9 @@ class PlantSet:
             steeper = moment_slopes(self.poles, T, self.delay)
             terms[..., 1:] = np.stack([late, early, np.exp(self.poles * T), *steeper], axis=-1)
         both = np.stack([dA.real, dA.imag], axis=3)
-        return plant_slopes.PlantSlopes(terms, C, B, gaps, both, dB, dC, self.period or 0.0, d)
+        return plant_slopes.PlantSlopes(
+            terms, C, B, gaps, both, dB, dC, self.period or 0.0, d, kinds
+        )
 
 
 def plant_set(
@@ -177,8 +212,8 @@ def plant_set(
 
     Without a decoupling for one channel. `alike`: they are next to plants of a set, so that their
     poles may be trusted. Raises PlantError for a plant whose inputs or outputs are
-    not those of the channels, that has more outputs than inputs, is not stable, or not
-    diagonalisable.
+    not those of the channels, that has more outputs than inputs, is not stable but for free bodies,
+    or not diagonalisable.
     """
     out = into = np.eye(1)
     if decoupling is not None:
@@ -207,6 +242,9 @@ def plant_set(
     poles = padded([one.poles for one in found], -1.0, complex)
     residues = padded([np.einsum("pn,nm->npm", one.reading, one.drive) for one in found],
                       dtype=complex)  # fmt: skip
+    for own, one in zip(residues, found, strict=True):
+        if len(one.chains):
+            own[one.chains[0, 0]] += 1j * one.free_bodies
     out, into = (np.ascontiguousarray(M, float) for M in (out, into))
     return PlantSet(found, omega_0, force, period, delay, poles, residues, out, into)
 
@@ -252,17 +290,63 @@ def all_stable(poles: np.ndarray) -> np.ndarray:
 
 
 def _loop_plant(plant: ScaledPlant, name: str, trusted: bool) -> LoopPlant:
-    poles, V = np.linalg.eig(plant.A)
-    if not (poles.real < 0.0).all():
-        words = "is not stable; a suspension has to hold its rigid-body modes"
-        raise PlantError(f"{name} {words}")
+    plant, chains = _with_bodies_seen(plant)
+    rest = np.setdiff1d(np.arange(len(plant.A)), chains)
+    poles, V = np.zeros(len(plant.A), complex), np.eye(len(plant.A), dtype=complex)
+    poles[rest], V[np.ix_(rest, rest)] = np.linalg.eig(plant.A[np.ix_(rest, rest)])
+    resting = len(rest) and int((~plant.A[:, rest].any(axis=0)).sum())  # free bodies that D brakes
+    slowest = rest[np.argsort(np.abs(poles[rest]))[:resting]]
+    if (np.abs(poles[slowest]) <= AT_REST * np.abs(poles).max(initial=0.0)).all():
+        poles[slowest] = 0.0
+    if not ((poles.real < 0.0) | (poles == 0.0)).all():
+        raise PlantError(f"{name} is not stable; a fixed structure is searched on stable plants")
     W = np.linalg.inv(V)
     b, c = W @ plant.B, plant.C @ V
     system = strictly_proper(plant.A, plant.B, plant.C)
     if not trusted:
         direct = system.at(PROBES)
         modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (PROBES[:, None] - poles), b)
+        q, v = chains.T
+        bodies = (plant.C[:, q] * plant.A[q, v]) @ plant.B[v]
+        modal += bodies / PROBES[:, None, None] ** 2
         if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
             words = "has poles that coincide and are coupled; move a damping ratio away from 1"
             raise PlantError(f"{name} {words}")
-    return LoopPlant(system, V, W, poles, b, c, W @ plant.dA @ V, W @ plant.dB, plant.dC @ V)
+    return LoopPlant(
+        system, V, W, poles, b, c, W @ plant.dA @ V, W @ plant.dB, plant.dC @ V, chains
+    )
+
+
+def _with_bodies_seen(plant: ScaledPlant) -> tuple[ScaledPlant, np.ndarray]:
+    """The plant without free bodies that it neither drives nor measures, and its chains.
+
+    One channel of several sees one motion of all bodies.
+    """
+    chains = free_chains(plant.A)
+    q, v = chains.T
+    sizes = np.abs(plant.B).max(), np.abs(plant.C).max()
+    if not len(chains) or not all(sizes):
+        return plant, chains
+    T, back = driven_and_measured(plant.B[v] / sizes[0], plant.C[:, q] / sizes[1])
+    count = T.shape[1]
+    if count == len(chains):
+        return plant, chains
+    kept = np.setdiff1d(np.arange(len(plant.A)), chains[count:])
+    own, both = np.concatenate([q, v]), np.eye(2)
+    into, out = (placed(np.asarray(np.kron(both, M)), own, kept) for M in (T, back.T))
+    out = out.T
+    A, left = out @ plant.A @ into, np.searchsorted(kept, chains[:count])
+    A[left.ravel()] = A[:, left.ravel()] = 0.0  # but for rounding, as these states are free
+    A[left[:, 0], left[:, 1]] = plant.A[q[0], v[0]]  # one s for all
+    moved = replace(plant, A=A, B=out @ plant.B, C=plant.C @ into,
+                    dA=out @ plant.dA @ into, dB=out @ plant.dB, dC=plant.dC @ into)  # fmt: skip
+    return moved, left
+
+
+def free_chains(A: Array) -> np.ndarray:
+    """States q, v (k, 2) of free bodies: q̇ = s v alone, v̇ from no state, read by no other."""
+    moved = A != 0.0
+    v = np.flatnonzero(~moved.any(axis=1) & (moved.sum(axis=0) == 1))
+    q = moved[:, v].argmax(axis=0)
+    alone = (moved[q].sum(axis=1) == 1) & ~moved[:, q].any(axis=0)
+    return np.stack([q[alone], v[alone]], axis=1)

@@ -59,8 +59,9 @@ class LoopProblem:
         """v from far below ω_low and every root to far above, logarithmic; without an integrator
         the first is all but rest, where gains may be largest."""
         sizes = np.abs(self.plants.poles[(self.plants.residues != 0.0).any(axis=(2, 3))])
+        sizes = np.append(sizes[sizes > 0.0], 1.0)  # of a free body ω₀
         bottom = 0.03 * min(self.low, float(sizes.min()))
-        top = 100.0 * max(1.0, float(sizes.max()))  # of a rigid body ω₀, not its suspension
+        top = 100.0 * float(sizes.max())
         if self.bounds.weighted_level is not None and self.bounds.weights is not None:
             w = self.bounds.weights  # a K without enough roll-off has its largest W_KS KS there
             top = max(top, 10.0 * max(w.c_K * w.omega_K, w.omega_T / w.A_u) / self.plants.omega_0)

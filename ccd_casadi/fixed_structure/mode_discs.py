@@ -2,8 +2,9 @@
 
     g = 1/(s² + g s + k) = N/D + M/E,   D = s - p, E = s - q;   g ∈ middle + radius {|e| <= 1}
 
-With hold and delay D = 1 - e^{(p-s)T}, N the answer of the pole to them. (Discs of modes in the
-Nyquist plane: Delissen, van Keulen and Langelaar 2023.)
+With hold and delay D = 1 - e^{(p-s)T}, N the answer of the pole to them. A free body is
+that of `boxes`. (Discs of modes in the Nyquist plane: Delissen,
+van Keulen and Langelaar 2023.)
 """
 
 from collections.abc import Sequence
@@ -34,8 +35,8 @@ class Discs:
 def discs_of(
     plant: ModalSum, names: tuple[str, ...], low: Array, high: Array, axis: Axis, free: bool
 ) -> tuple[Discs, Discs, np.ndarray]:
-    """Of all modes as the loop has them, and where `free` without hold and delay; where all modes
-    stay damped (N,)."""
+    """Of all modes as the loop has them, and where `free` without hold and delay; where all
+    flexible modes stay damped (N,)."""
     free &= axis.period is not None
     count = (len(plant.omega), 1 + len(names), low.shape[1])
     held, bare = (
@@ -52,6 +53,13 @@ def discs_of(
                if name == plant.shift_of(i) or not name.startswith("mode_shift")]  # fmt: skip
         rows = [0, *(1 + k for k in own)]
         w, strength = (f and f.of(len(rows), len(rows) - q) for f in moved[i])
+        if plant.rigid[i]:
+            gain = plant.strength(tuple(names[k] for k in own), low[own], high[own])
+            gain = gain if strength is None else gain * strength
+            _fill_free(held, i, rows, axis.free_body.of(len(rows)) * gain)
+            if free:
+                _fill_free(bare, i, rows, axis.free_body_unheld.of(len(rows)) * gain)
+            continue
         poles, decay = plant.poles(i, tuple(names[k] for k in own), low[own], high[own], w)
         damped = damped & (decay >= 0.0)
         T = axis.period  # of Re D, what it is not below
@@ -63,6 +71,12 @@ def discs_of(
     if q:
         held.shares[:, -q:] = np.where(known, held.shares[:, -q:], FIRST * (high - low)[-q:])
     return held, bare if free else held, damped
+
+
+def _fill_free(discs: Discs, i: int, rows: list[int], form: Affine) -> None:
+    """A free body's disc."""
+    discs.middle[i], discs.radius[i] = form.centre, (form.reach + form.rest) * (1.0 + 1e-12)
+    discs.shares[i, rows] = form.reaches
 
 
 def _fill(

@@ -15,9 +15,9 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.fixed_structure.affine import Affine, inverse, outputs, product, root, variable
-from ccd_casadi.plants.modal import RIGID_RATIO
 from ccd_casadi.support.arrays import Array
 
+RIGID = 1e-10  # λ over the largest: what the model's rigid modes are enclosed to, of no stiffness
 STEPS = 12  # of the search for discs that are mapped into themselves
 WIDER = 1.1  # than what the step before gave
 SINGULAR = 1e-14  # relative: a mass matrix with such an eigenvalue is not inverted
@@ -25,12 +25,12 @@ SINGULAR = 1e-14  # relative: a mass matrix with such an eigenvalue is not inver
 
 @np.errstate(all="ignore")  # of pieces that are too wide
 def moving_modes(
-    graph: ca.Function, rigid: int, slowest: float, unit: float, low: Array, high: Array
+    graph: ca.Function, rigid: int, unit: float, low: Array, high: Array
 ) -> tuple[list[list[Affine]], np.ndarray]:
     """ω and b c of every mode over boxes (q, N) of x, time in 1/`unit`; where they are enclosed.
 
     `graph`: x to M, D, K, b (n, 1), c (1, n), SI. That the first modes are `rigid` and the others
-    are not, and faster than `slowest` rad/s, is part of it.
+    are not, and apart from these, is part of it; a rigid mode stays one, with ω = 0.
     """
     pieces, back = np.unique(np.vstack([low, high]), axis=1, return_inverse=True)
     ends = zip(*np.split(pieces, 2), strict=True)
@@ -70,8 +70,8 @@ def moving_modes(
     length = product("Nki,Nki->Ni", vectors, product("Njk,Nki->Nji", M, vectors))
     value = Affine(lam, A.slope[..., own, own], second[:, own, own])
     least, most = 2.0 * size - value.size, value.size
-    lowest = np.maximum(RIGID_RATIO**2 * most[:, -1:], slowest**2)
-    apart = np.where(own < rigid, most <= RIGID_RATIO**2 * least[:, -1:], least > lowest)
+    lowest = most[:, :rigid].max(axis=1, initial=0.0, keepdims=True)
+    apart = np.where(own < rigid, most <= RIGID * least[:, -1:], least > lowest)
     forms = root(value) * (1.0 / unit), read * drive * inverse(length) * unit**-2
     of_mode = [[Affine(f.centre[back, i], f.slope[:, back, i], f.rest[back, i]) for f in forms]
                for i in range(n)]  # fmt: skip

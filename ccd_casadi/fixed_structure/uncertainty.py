@@ -2,11 +2,13 @@
 
 A point p of the box is a vector; with the option sets of the plant it makes one scaled plant.
 Frequencies of flexible modes are multiplied by (1 + p_common)(1 + p_mode), modal damping ratios by
-the damping factor, the whole plant by 1 + p_gain. Mode shapes stay, and so does the suspension.
+the damping factor, the whole plant by 1 + p_gain. Mode shapes stay, and free bodies stay free.
 
 For a proof it is a sum of modes, poles and residues as affine forms of what is uncertain:
 
     G(s) = Σ b_i c_i/(s² + g_i s + k_i) = Σ r_i/(s - p_i) - r_i/(s - q_i),   r = b c/(p - q)
+
+and b_i c_i/s² of free bodies.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +21,16 @@ import numpy as np
 from ccd_casadi.fixed_structure.affine import Affine, inverse, root, variable
 from ccd_casadi.fixed_structure.boxes import Pair
 from ccd_casadi.fixed_structure.moving_modes import moving_modes
-from ccd_casadi.plants.modal import ModalPlant, Perturbation, Suspension, modal_plant
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.as_written import as_written
+from ccd_casadi.plants.modal import (
+    FREE,
+    ModalPlant,
+    Perturbation,
+    Suspension,
+    modal_plant,
+    without_hidden_rigid_modes,
+)
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
@@ -36,11 +47,10 @@ class UncertainPlant:
     `damping` are the least and the largest factor. M_K in N/m scales all of them alike. `ranges`
     are parameters of the model itself, least, the model's, largest; `along` gives an option at
     their values, with derivatives to θ and, last, to these; `graph` its matrices as expressions of
-    these, where there are any.
+    these, where there are any. `rigid_modes`: how many, where that is stated.
     """
 
     options: tuple[Mechanics, ...]
-    suspension: Suspension
     M_K: float
     resonance_shift: float = 0.0
     mode_shift: float = 0.0
@@ -49,12 +59,17 @@ class UncertainPlant:
     ranges: tuple[tuple[str, float, float, float], ...] = ()
     along: Callable[[int, Array], Mechanics] | None = None
     graph: Callable[[int], ca.Function | None] = lambda option: None
+    rigid_modes: int | None = None
 
     @cached_property
     def modes(self) -> int:
         """The largest number of flexible modes of any option."""
-        plants = [modal_plant(option, self.suspension) for option in self.options]
+        plants = [modal_plant(option, self._free) for option in self.options]
         return max(int((~plant.rigid).sum()) for plant in plants)
+
+    @property
+    def _free(self) -> Suspension:
+        return replace(FREE, rigid_modes=self.rigid_modes)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -130,15 +145,22 @@ class UncertainPlant:
         moved = replace(modal, dM=dM, dK=dK, dD=dD, dB=dB, dC=dC)
         return scale_plant(moved, self.M_K, bare=True)
 
-    def _modal(self, point: Array, option: int) -> ModalPlant:
+    def _off(self, point: Array, option: int) -> tuple[dict[str, float], Mechanics, Perturbation]:
+        """A point's values by name, the matrices of its option there, and how modes are off."""
         values = dict(zip(self.names, np.asarray(point, float).tolist(), strict=True))
         shift, factor = values.get("resonance_shift", 0.0), values.get("damping", 1.0)
         system = self.options[option]
         if self.along is not None and self.ranges:
             system = self.along(option, np.asarray(point, float)[-len(self.ranges) :])
-        own = tuple(values.get(f"mode_shift {i}", 0.0) for i in range(1, self.modes + 1))
-        own = own if any(own) else ()
-        modal = modal_plant(system, self.suspension, Perturbation(shift, factor, own))
+        own: tuple[float, ...] = ()
+        if self.mode_shift:
+            own = tuple(values.get(f"mode_shift {i}", 0.0) for i in range(1, self.modes + 1))
+        return values, system, Perturbation(shift, factor, own if any(own) else ())
+
+    def _modal(self, point: Array, option: int) -> ModalPlant:
+        values, system, off = self._off(point, option)
+        modal = modal_plant(system, self._free, off)
+        modal = without_hidden_rigid_modes(modal)
         gain = 1.0 + values.get("gain", 0.0)
         if gain != 1.0:
             modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
@@ -148,10 +170,21 @@ class UncertainPlant:
         """The plants of (option, point) pairs."""
         return [self.plant(point, option) for option, point in points]
 
-    def drawn(self, rng: np.random.Generator, count: int) -> list[ScaledPlant]:
-        """So many plants, uniformly from the box, the options alike often."""
+    def as_written(self, points: Sequence[tuple[int, Array]]) -> list[StateSpace]:
+        """The plants of (option, point) pairs from the matrices as their function returned them."""
+        found = []
+        for option, point in points:
+            values, system, off = self._off(point, option)
+            found.append(as_written(
+                system, shift=off.shift, modes=off.modes, damping=off.damping,
+                gain=values.get("gain", 0.0), rigid_modes=self.rigid_modes,
+            ))  # fmt: skip
+        return found
+
+    def drawn(self, rng: np.random.Generator, count: int) -> list[tuple[int, Array]]:
+        """(option, point) pairs, uniformly from the box, the options alike often."""
         option, (low, high) = rng.integers(len(self.options), size=count).tolist(), self.box
-        return self.plants([*zip(option, rng.uniform(low, high, (count, len(low))), strict=True)])
+        return [*zip(option, rng.uniform(low, high, (count, len(low))), strict=True)]
 
     def corners(self) -> list[tuple[int, Array]]:
         """The model of every option, then the corners of its box.
@@ -178,14 +211,13 @@ class ModalSum:
     """One option of an uncertain plant as Σ c_i b_iᵀ/(s² + g_i s + k_i), time in 1/`unit`, SI else.
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
-    `rigid` ones have their suspension's instead, and stand first; the others are in the order of
+    `rigid` ones are free, k = g = 0, and stand first; the others are in the order of
     their numbers. `drive` (n, m), `reading` (n, p) are b_i and c_i. `moving` has ω and b_i c_i
     over boxes of the parameters that modes move with, the last ones; see `moving_modes`.
     """
 
     omega: Array
     rigid: np.ndarray
-    suspended: tuple[float, float]
     given: Array
     zeta: float
     drive: Array
@@ -196,58 +228,60 @@ class ModalSum:
         """The parameter that shifts mode i alone; none shifts a rigid one."""
         return "" if self.rigid[i] else f"mode_shift {int((~self.rigid[: i + 1]).sum())}"
 
+    def strength(self, names: tuple[str, ...], low: Array, high: Array) -> Affine:
+        """1 + p_gain over boxes (n_p, N) of `names`, with the variables of `poles`."""
+        n, m = len(low) + 1, low.shape[1]
+        one = Affine(np.ones(m), np.zeros((n, m)), np.zeros(m))
+        if "gain" not in names:
+            return one
+        k = names.index("gain")
+        return variable(low[k], high[k], k + 1, n) + 1.0
+
     def poles(
         self, i: int, names: tuple[str, ...], low: Array, high: Array, moved: Affine | None = None
     ) -> tuple[list[Pair], Array]:
-        """(p, residue) of mode i's two poles over boxes (n_p, N) of the parameters `names`, of unit
-        strength; not above the rate (N,) at which they decay, 0 where none is known and below it
-        where they may not. Variable 0 of the forms is left to the frequency; `moved` is its ω.
+        """(p, residue) of flexible mode i's two poles over boxes (n_p, N) of the parameters
+        `names`, of unit strength; not above the rate (N,) at which they decay, 0 where none is
+        known and below it where they may not. Variable 0 of the forms is left to the frequency;
+        `moved` is its ω.
         """
         n, m = len(low) + 1, low.shape[1]
         one = Affine(np.ones(m), np.zeros((n, m)), np.zeros(m))
         w = one * self.omega[i] if moved is None else moved
         values = {name: variable(low[k], high[k], k + 1, n) for k, name in enumerate(names)}
         factor = values.get("damping", one)
-        if self.rigid[i]:
-            w_r, ratio = self.suspended
-            k, g = one * w_r**2, one * (2.0 * ratio * w_r) + factor * self.given[i]
-            damped = _least(g) > 0.0
-        else:
-            for name in ("resonance_shift", self.shift_of(i)):
-                w = w * (values[name] + 1.0) if name in values else w
-            own = w * (2.0 * self.zeta) + self.given[i]
-            k, g = w * w, factor * own
-            damped = (_least(w) > 0.0) & (_least(own) > 0.0) & (_least(factor) > 0.0)
+        for name in ("resonance_shift", self.shift_of(i)):
+            w = w * (values[name] + 1.0) if name in values else w
+        own = w * (2.0 * self.zeta) + self.given[i]
+        k, g = w * w, factor * own
+        damped = (_least(w) > 0.0) & (_least(own) > 0.0) & (_least(factor) > 0.0)
         half = g * 0.5
         under = k - half * half
         light = under.centre.real > 0.0
         swing = root(under * np.where(light, 1.0, -1.0)) * np.where(light, 1j, 1.0)
-        gain = values["gain"] + 1.0 if "gain" in values else one
-        residue = gain * inverse(swing * 2.0)
+        residue = self.strength(names, low, high) * inverse(swing * 2.0)
         known = np.where(light & np.isfinite(swing.rest), _least(half), 0.0) * (1.0 - 1e-12)
         poles = [(swing - half, residue), (-swing - half, -residue)]
         return poles, np.where(damped, known, -1.0)
 
 
 def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum | None:
-    """None where a given damping matrix couples the modes. Modes that move need a graph, a damping
-    ratio, one force, one sensor, and to be apart at the model."""
+    """None where a given damping matrix couples the modes or brakes a free body. Modes that move
+    need a graph, a damping ratio, one force, one sensor, and to be apart at the model."""
     system = uncertain.options[option]
-    modal = modal_plant(system, uncertain.suspension)
+    modal = uncertain.modal(option)
     zeta = float(system.damping_ratio or 0.0)
-    w_r = 2.0 * np.pi * uncertain.suspension.frequency_hz
-    own = np.where(modal.rigid, 2.0 * uncertain.suspension.damping_ratio * w_r,
-                   2.0 * zeta * modal.natural)  # fmt: skip
-    given = modal.D - np.diag(own)
+    given = modal.D - np.diag(2.0 * zeta * modal.natural)
     size = np.abs(np.diag(modal.D)).max()
     if np.abs(given - np.diag(np.diag(given))).max() > UNCOUPLED * size:
+        return None
+    if given[modal.rigid].any():
         return None
     diagonal = np.diag(given)
     diagonal = np.where(np.abs(diagonal) > UNCOUPLED * size, diagonal, 0.0)
     order = np.append(np.flatnonzero(modal.rigid), modal.numbered)
     found = ModalSum(
-        modal.natural[order] / unit, modal.rigid[order],
-        (w_r / unit, uncertain.suspension.damping_ratio), diagonal[order] / unit, zeta,
+        modal.natural[order] / unit, modal.rigid[order], diagonal[order] / unit, zeta,
         modal.B[order] / unit**2, modal.C.T[order],
     )  # fmt: skip
     if not uncertain.ranges:
@@ -255,7 +289,7 @@ def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum |
     graph, one = uncertain.graph(option), np.ones((len(order), 1))
     if graph is None or not zeta or not found.drive.shape == found.reading.shape == one.shape:
         return None
-    moving = partial(moving_modes, graph, int(modal.rigid.sum()), w_r, unit)
+    moving = partial(moving_modes, graph, int(modal.rigid.sum()), unit)
     model = uncertain.nominal[-len(uncertain.ranges) :, None]
     known = moving(model, model)[1].all()
     return replace(found, drive=one, reading=one, moving=moving) if known else None

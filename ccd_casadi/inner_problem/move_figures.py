@@ -6,7 +6,6 @@ that.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import plants_of, structured_of, uncertain_plant
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -65,7 +63,7 @@ def latest_plant(
     problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, seed: int
 ) -> tuple[float, int, Array]:
     """The exact time on the latest plant of a lattice of the box, its option and its point."""
-    uncertain = uncertain_plant(replace(problem, suspension=FREE), theta)
+    uncertain = uncertain_plant(problem, theta)
     points = lattice(uncertain, CHECKED, seed)
     times = exact_times(problem, motion_of(problem, theta), uncertain.plants(points), K)
     return float(times.max()), *points[int(times.argmax())]
@@ -76,12 +74,12 @@ def stated_time(
 ) -> tuple[float, Yield | None]:
     """The time that a design is told to need (s), whose smooth time on the set is `value`, and how
     many fresh plants need no longer."""
-    free, seed = replace(problem, suspension=FREE), structured_of(problem).seed
-    uncertain, motion = uncertain_plant(free, theta), motion_of(problem, theta)
-    on_set = exact_times(problem, motion, plants_of(free, theta), K)
+    seed = structured_of(problem).seed
+    uncertain, motion = uncertain_plant(problem, theta), motion_of(problem, theta)
+    on_set = exact_times(problem, motion, plants_of(problem, theta), K)
     told = max(value, float(on_set.max()), latest_plant(problem, theta, K, seed + FRESH_SEED)[0])
     if not uncertain.names:
         return told, None
     fresh = uncertain.drawn(np.random.default_rng((seed, FRESH_SEED)), FRESH)
-    times = exact_times(problem, motion, fresh, K)
+    times = exact_times(problem, motion, uncertain.plants(fresh), K)
     return told, Yield(int((times <= told).sum()), FRESH)

@@ -21,7 +21,15 @@ from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, sweep_inner
 from ccd_casadi.optim.box import Box
-from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
+from ccd_casadi.plants.modal import (
+    NOMINAL,
+    ModalPlant,
+    Perturbation,
+    Suspension,
+    modal_plant,
+    require_damping,
+    without_hidden_rigid_modes,
+)
 from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import UserError
@@ -29,7 +37,7 @@ from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
-NUMERICS = 11  # raised whenever a change of ours moves the numbers that a sample holds
+NUMERICS = 12  # raised whenever a change of ours moves the numbers that a sample holds
 
 
 @dataclass(frozen=True)
@@ -107,7 +115,11 @@ class CoDesignProblem(NotebookHtml):
             "numerics": NUMERICS,
             "plant": self.source.identity(),
             "theta": list(self.names),
-            "suspension": [self.suspension.frequency_hz, self.suspension.damping_ratio],
+            "suspension": [
+                self.suspension.frequency_hz,
+                self.suspension.damping_ratio,
+                self.suspension.rigid_modes,
+            ],
             "weights": [w.M_S, w.A_S, w.c_K, w.omega_K, w.M_K, w.A_l, w.A_u, *with_disturbance],
             "omega_low": self.inner.omega_low,
             "gamma_backoff": self.inner.gamma_backoff,
@@ -178,20 +190,33 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
     return scaled_system(problem, mechanics(plant_of(problem), theta))
 
 
-def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
-    """The same of given matrices, whatever they are of: the plant's own, or close to them."""
+def free_modal(
+    problem: CoDesignProblem, system: Mechanics, off: Perturbation = NOMINAL
+) -> ModalPlant:
+    """Matrices of the plant, on or off the model, as every loop has them: free bodies are free."""
+    return without_hidden_rigid_modes(modal_plant(system, problem.suspension.free, off))
 
-    def scaled(*perturbation: Perturbation) -> ScaledPlant:
-        modal = modal_plant(system, problem.suspension, *perturbation)
+
+def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
+    """The same of given matrices, whatever they are of: the plant's own, or close to them.
+
+    Free bodies are free on every plant but the one that controllers are made on.
+    """
+    suspension, robust = problem.suspension, problem.robust
+
+    def scaled(off: Perturbation, held: Suspension = suspension.free) -> ScaledPlant:
+        modal = without_hidden_rigid_modes(modal_plant(system, held, off))
         require_damping(modal)
         return scale_plant(modal, problem.weights.M_K)
 
-    nominal, robust = scaled(), problem.robust
-    if robust is None:
+    nominal = scaled(NOMINAL)
+    if robust is None and not nominal.free:
         return nominal
-    design = scaled(Perturbation(robust.design_shift)) if robust.design_shift else nominal
-    others = (p for p in robust.perturbations() if p != Perturbation())
-    return replace(nominal, family=(design, *map(scaled, others)))
+    shift, others = 0.0, list[ScaledPlant]()
+    if robust is not None:
+        shift = robust.design_shift or 0.0
+        others = [scaled(off) for off in robust.perturbations() if off != NOMINAL]
+    return replace(nominal, family=(scaled(Perturbation(shift), suspension), *others))
 
 
 def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:

@@ -31,7 +31,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     warm_starts_at,
     with_structured,
 )
-from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -93,8 +92,7 @@ class ProblemAt:
             assert problem.budget is not None
             return RmsError(tuple(self.plants), structure, problem.budget, sampling)
         assert sampling is not None
-        free = plants_of(replace(problem, suspension=FREE), self.theta)
-        return MoveTime(tuple(free), structure, sampling, motion_of(problem, self.theta))
+        return MoveTime(tuple(self.plants), structure, sampling, motion_of(problem, self.theta))
 
     def least(
         self, design: SectionsDesign, only_initial: bool = False, tell: Tell = silent

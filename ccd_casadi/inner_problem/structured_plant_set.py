@@ -136,8 +136,9 @@ def uncertain_plant(
 
     return UncertainPlant(
         tuple(known) or tuple(mechanics(plant_of(option), theta) for option in options),
-        problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
+        problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
         tuple((name, low, held[name], high) for name, low, high in u.ranges), along, graph,
+        problem.suspension.rigid_modes,
     )  # fmt: skip
 
 

@@ -30,7 +30,6 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Tell, silent
@@ -104,9 +103,10 @@ class DesignOnBox:
         points = [*lattice(uncertain, CHECKED, structured.seed + 1000), (worst.option, worst.point)]
         if not uncertain.names:
             points = uncertain.corners()[: 1 + len(structured.uncertainty.options)]
-        plants, K = uncertain.plants(points), self.design.controller
+        points += [(option, np.array(point)) for option, point in structured.scenarios]
+        K = self.design.controller
         assert K is not None
-        return _judged(self.problem, plants, K, workers), len(points)
+        return _judged(self.problem, uncertain.as_written(points), K, workers), len(points)
 
     def fresh_yield(self, workers: Pool | None = None) -> Yield | None:
         """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
@@ -117,7 +117,8 @@ class DesignOnBox:
         if not uncertain.names or self.design.controller is None:
             return None
         count = FRESH if plant_of(self.problem).outputs == 1 else FRESH_OF_SEVERAL
-        plants = uncertain.drawn(np.random.default_rng((structured.seed, FRESH_SEED)), count)
+        points = uncertain.drawn(np.random.default_rng((structured.seed, FRESH_SEED)), count)
+        plants = uncertain.as_written(points)
         found = _judged(self.problem, plants, self.design.controller, workers).plants
         bounds = bounds_of(self.problem).looser(LOOSE)
         least = self.design.bandwidth * (1.0 - LOOSE)
@@ -208,12 +209,12 @@ def certify_corners(
 ) -> SetCertificate:
     """The judge on the model of every option and the corners of the box."""
     uncertain = uncertain_plant(problem, theta)
-    return _judged(problem, uncertain.plants(uncertain.corners()), controller)
+    return _judged(problem, uncertain.as_written(uncertain.corners()), controller)
 
 
 def _judged(
     problem: CoDesignProblem,
-    plants: Sequence[ScaledPlant],
+    plants: Sequence[StateSpace],
     controller: StateSpace,
     workers: Pool | None = None,
 ) -> SetCertificate:

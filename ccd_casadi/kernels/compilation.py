@@ -102,7 +102,10 @@ def _compile_rows(curvature: bool) -> None:
         loop_curvature.second(first, first, first, one, loop)
         side, four = np.ones((1, 1, 1), complex), np.ones((1, 1, 1, 1), complex)
         terms, apart = plants.terms[..., [0] * 6], four.real[..., None]
-        slopes = plant_slopes.PlantSlopes(terms, side, side, side, apart, four, four, 0.0, 0.0)
+        kinds = np.zeros((1, 1), np.int8)
+        slopes = plant_slopes.PlantSlopes(
+            terms, side, side, side, apart, four, four, 0.0, 0.0, kinds
+        )
         plant_slopes.form_slopes(slopes, first, one, side[0], side[0], False)
     else:
         loop_rows.levels(first[None], first, square, loop, 0.0, loop_grid.NONE)

@@ -23,6 +23,8 @@ from ccd_casadi.kernels.synthesis import central_controller, synthesise
 
 _COUNT, _CODE, _GAMMA_OPT = int(Column.COUNT), int(Column.CODE), int(Column.GAMMA_OPT)
 _BALANCED = int(Column.BALANCED)
+FREED = 0.01  # relative: what free bodies in the place of suspended ones may add to the norm
+LEVEL = 1e-6  # relative: how far above the largest gain found a norm is certified
 
 
 @inlined
@@ -125,8 +127,14 @@ def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
 # compiled kernels together: 2 % slower in Python, and half the time to compile.
 
 
-def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0):
+def design(
+    A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0, judged_on=()
+):
     """Synthesise at backoff·γ_opt, certify and measure. Returns the row, A_K, B_K, C_K.
+
+    `judged_on`: A, B and C of the plant that the loop is closed on, where it is another one: with
+    free bodies in the place of suspended ones. Its norm may be above γ by `FREED`; where it is by
+    more it is certified at what it is.
 
     With `channels` the synthesis is done on these blocks; the certificate is the whole loop's.
     δ > 0 makes it the four-block problem of `disturbance`, which is solved whole. What fails is
@@ -143,8 +151,11 @@ def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delt
             row[_BALANCED] = balanced
             if row[_CODE] == 0.0:
                 Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
-                gamma = backoff * row[_GAMMA_OPT]
-                judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
+                gamma = backoff * row[_GAMMA_OPT] * (1.0 + FREED if judged_on else 1.0)
+                loop = (*(judged_on or (A, B, C)), Ak, Bk, Ck, Dk, w, delta)
+                judge(*loop, gamma, omega_low, row)
+                if judged_on and row[_CODE] == Code.NORM_EXCEEDED:
+                    judge(*loop, (1.0 + LEVEL) * row[Column.NORM], omega_low, row)
         except np.linalg.LinAlgError:  # an infinite or undefined number on the way
             made = failed_row(), *[np.full((1, 1), nan)] * 3
         if made[0][_CODE] in _PASSED:
@@ -194,7 +205,10 @@ def _synthesise_channels(A, B, C, w, channels, backoff, guess):
     return row, Ag + B2 @ F - B1 @ C2, B1, F
 
 
-def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channels=(), delta=0.0):
+def sweep(
+    A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channels=(), delta=0.0,
+    judged_on=(),
+):  # fmt: skip
     """Rows (n_S, n_T, figures) over the frequencies of W1 and W3, each warm-started.
 
     Boustrophedon order: γ_opt is guessed from the certified neighbours already done.
@@ -210,7 +224,7 @@ def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channel
             i = step if side == 1 else omega_S.size - 1 - step
             weights[2] = omega_S[i]
             guess = _guess(found, x, y, i, j, side, step)
-            numbers = (grid, sigma, backoff, omega_low, guess, channels, delta)
+            numbers = (grid, sigma, backoff, omega_low, guess, channels, delta, judged_on)
             row = design(A, B, C, weights, *numbers)[0]
             rows[i, j] = row
             found[i, j] = log(row[_GAMMA_OPT]) if row[_CODE] == 0.0 else nan

@@ -7,6 +7,11 @@
 Conjugate poles go together: with f̃ of the conjugate of p
 
     R f + R̄ f̃ = Re R (f + f̃) + Im R j(f - f̃)
+
+A pole at p = 0 is exact: f = 1/s, and a free body adds Im R f₂ with f₂ = 1/s². Behind hold and
+delay, with late = h and early = T - h of f,
+
+    f₂ = z⁻ᵈ ((h² + (T² - h²)/z)/2/(z - 1) + T (h + (T - h)/z)/(z - 1)²)
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +27,8 @@ CANCELLING = 1e-4  # |z - e^{pT}| below which the difference loses digits, and e
 
 class Plants(NamedTuple):
     """`terms` (P, n, 4): poles with Im p >= 0, late, early and e^{pT}; `residues` (P, n, 2, p, m),
-    real and imaginary, of a real pole half of it; the period T (0: continuous) and d.
+    real and imaginary, of a real pole half of it, at p = 0 half of that of 1/s and all of that of
+    1/s²; the period T (0: continuous) and d.
     """
 
     terms: Any
@@ -48,6 +54,17 @@ def response(terms, residues, T, d, i, ω, chain, sloped, at, place):
             at[place, a, b] = at[place + 1, a, b] = 0.0
     for k in range(count):
         p = terms[i, k, 0]
+        if p == 0.0:
+            f, df, g, dg = _free(s, z, terms[i, k, 1].real, T, d)
+            for a in range(rows):
+                for b in range(columns):
+                    at[place, a, b] += residues[i, k, 0, a, b] * (f + f)
+                    at[place, a, b] += residues[i, k, 1, a, b] * g
+                    if sloped:
+                        at[place + 1, a, b] += (
+                            residues[i, k, 0, a, b] * (df + df) + residues[i, k, 1, a, b] * dg
+                        )
+            continue
         if T > 0.0:
             late, early, grown = terms[i, k, 1], terms[i, k, 2], terms[i, k, 3]
             f, df = _held(s, z, p, late, early, grown, T, d)
@@ -87,6 +104,25 @@ def _held(s, z, p, late, early, grown, T, d):
     under, back = inverse(gap), z.conjugate()
     value = (late + early * back) * under
     return value, early * back * under + value * z * under + d * value
+
+
+@compiled
+def _free(s, z, h, T, d):
+    """z^d f and its slope as `_held` has it, both of 1/s, then of 1/s²."""
+    if T == 0.0:
+        f = inverse(s)
+        return f, f * f, f * f, 2.0 * f * f * f
+    f, df = _held(s, z, complex(0.0, 0.0), complex(h, 0.0), complex(T - h, 0.0), 1.0 + 0.0j, T, d)
+    gap, back = z - 1.0, z.conjugate()
+    if gap.real * gap.real + gap.imag * gap.imag < CANCELLING * CANCELLING:
+        gap = _expm1(s * T)
+    under = inverse(gap)
+    first, rest = 0.5 * h * h + 0.5 * (T * T - h * h) * back, 0.5 * (T * T - h * h) * back
+    ahead = T * under
+    value = (first + ahead * (h + (T - h) * back)) * under
+    slope = (rest + ahead * (T - h) * back) * under
+    slope += (first + 2.0 * ahead * (h + (T - h) * back)) * z * under * under
+    return f, df, value, slope + d * value
 
 
 @compiled

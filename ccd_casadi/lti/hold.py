@@ -63,9 +63,10 @@ def transfer(p: np.ndarray, omega: Array, period: float, delay: float) -> np.nda
 def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, np.ndarray]:
     """Whole periods d of delay, and what u_{k-d} and u_{k-d-1} give a mode in one period."""
     d, rest = delay_parts(T, delay)
-    h = T - rest
-    late = np.expm1(p * h) / p
-    early = np.exp(p * h) * np.expm1(p * rest) / p
+    h, free = T - rest, p == 0.0
+    over = np.where(free, 1.0, p)
+    late = np.where(free, h, np.expm1(p * h) / over)
+    early = np.where(free, rest, np.exp(p * h) * np.expm1(p * rest) / over)
     return float(d), late, early
 
 
@@ -73,9 +74,11 @@ def moment_slopes(p: np.ndarray, T: float, delay: float) -> tuple[np.ndarray, np
     """Derivatives of `moments` to p."""
     _, late, early = moments(p, T, delay)
     rest = delay_parts(T, delay)[1]
-    h = T - rest
-    d_late = (h * np.exp(p * h) - late) / p
-    d_early = h * early + np.exp(p * h) * (rest * np.exp(p * rest) - np.expm1(p * rest) / p) / p
+    h, free = T - rest, p == 0.0
+    over = np.where(free, 1.0, p)
+    d_late = np.where(free, 0.5 * h**2, (h * np.exp(p * h) - late) / over)
+    first = (rest * np.exp(p * rest) - np.expm1(p * rest) / over) / over
+    d_early = h * early + np.exp(p * h) * np.where(free, 0.5 * rest**2, first)
     return d_late, d_early
 
 

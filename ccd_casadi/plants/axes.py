@@ -15,9 +15,8 @@ f are the least forces that do the work of the loads u on every motion V.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import eigh
 
-from ccd_casadi.plants.modal import RIGID_RATIO
+from ccd_casadi.plants.rigid_modes import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -71,8 +70,8 @@ def followed_modes(
 
     φ' = Σ_j φ_j φ_jᵀ(K' - λ M')φ/(λ - λ_j) - φ φᵀM'φ/2,   j over all other modes
     """
-    lam, modes = eigh(K, M)
-    flexible = np.flatnonzero(lam > RIGID_RATIO**2 * lam[-1])
+    lam, modes, rigid = natural_modes(K, M)
+    flexible = np.flatnonzero(~rigid)
     if max(numbers, default=0) > len(flexible):
         raise PlantError(f"places: mode {max(numbers)} is beyond the {len(flexible)} flexible ones")
     at = flexible[[number - 1 for number in numbers]]

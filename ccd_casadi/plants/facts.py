@@ -19,8 +19,6 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 
-ALIKE = 0.3  # relative: a zero with and without suspension is the same within this
-
 
 @dataclass(frozen=True)
 class PlantMode:
@@ -38,13 +36,11 @@ class Zero:
     """A transmission zero: |z| in Hz, its damping ratio (negative: right half-plane), and its dip.
 
     `dip`: the plant's least gain at |z| over its geometric mean at 0.7 and 1.4 times |z|.
-    `artefact`: in the right half-plane, and not so without the rigid bodies' suspension.
     """
 
     frequency_hz: float
     damping_ratio: float
     dip: float
-    artefact: bool = False
 
 
 @dataclass(frozen=True)
@@ -65,27 +61,20 @@ class PlantFacts:
     inertia: float = float("inf")
 
 
-def facts_of(
-    theta: tuple[float, ...],
-    modal: ModalPlant,
-    scaled: ScaledPlant,
-    free: ScaledPlant | None = None,
-) -> PlantFacts:
-    """The facts of a plant at one θ, from its modes and its scaled state space.
-
-    `free` is the plant without its suspension: what tells that one's zeros from its own.
-    """
+def facts_of(theta: tuple[float, ...], modal: ModalPlant, scaled: ScaledPlant) -> PlantFacts:
+    """The facts of a plant at one θ, from its modes and its scaled state space."""
     effort = _effort_hz(modal, scaled)
     driven = float((modal.B[modal.rigid] ** 2).sum(axis=0).max(initial=0.0))
     inertia = 1.0 / driven if driven > 0.0 else float("inf")
-    return PlantFacts(theta, modes_of(modal), _zeros(scaled, effort, free), effort, inertia)
+    return PlantFacts(theta, modes_of(modal), _zeros(scaled, effort), effort, inertia)
 
 
 def modes_of(modal: ModalPlant) -> tuple[PlantMode, ...]:
     """Every mode in the order of the plant."""
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
-    zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.diag(modal.K)))
+    zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.where(modal.rigid, 1.0, np.diag(modal.K))))
+    zeta = np.where(modal.rigid, 0.0, zeta)
     columns = (modal.natural / HZ, zeta, modal.rigid, b / b.max(), c / c.max())
     return tuple(map(PlantMode, *(column.tolist() for column in columns)))
 
@@ -105,9 +94,8 @@ def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
     return float(np.exp(x[0] - y[0] * (x[1] - x[0]) / (y[1] - y[0])) * plant.omega_0 / HZ)
 
 
-def _zeros(plant: ScaledPlant, effort_hz: float, free: ScaledPlant | None) -> tuple[Zero, ...]:
+def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
     """Zeros up to three times the frequency at which effort ends, one of each conjugate pair."""
-    own = None if free is None else free.system.zeros() * (free.omega_0 / plant.omega_0)
     limit = 3.0 * effort_hz * HZ / plant.omega_0
     x, y = np.log(plant.grid), np.log(np.maximum(plant.gain, 1e-300))
     found = []
@@ -118,13 +106,8 @@ def _zeros(plant: ScaledPlant, effort_hz: float, free: ScaledPlant | None) -> tu
         gain = np.exp(np.interp(np.log(size * np.array([0.7, 1.0, 1.4])), x, y))
         dip = gain[1] / np.sqrt(gain[0] * gain[2])
         damping = -zero.real / size
-        artefact = bool(
-            own is not None
-            and damping < 0.0
-            and not (np.abs(own[own.real > 0.0] - zero) < ALIKE * size).any()
-        )
         hz = float(size * plant.omega_0 / HZ)
-        found.append(Zero(hz, float(damping), float(dip), artefact))
+        found.append(Zero(hz, float(damping), float(dip)))
     return tuple(sorted(found, key=lambda zero: zero.frequency_hz))
 
 

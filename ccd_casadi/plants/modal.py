@@ -5,32 +5,42 @@ on the eigenvalues λ = ω². Their derivatives follow from divided differences,
 
     dh(Λ)_ij = h[λ_i, λ_j] dΛ_ij    (Daleckii and Krein),
 
-which is exact at double eigenvalues too. Rigid-body poles on the axis would make the
-mixed-sensitivity problem singular; the suspension puts them at (ω_r, ζ_r).
+which is exact at double eigenvalues too. Rigid is what K does not resist (`rigid_modes`): poles at
+zero. On the axis they would make the mixed-sensitivity problem singular, so that a synthesis has a
+suspension that puts them at (ω_r, ζ_r). Nothing is judged with it: every loop has them `free`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import eigh
 
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered, placed
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 UNDAMPED = 1e-12  # of the largest modal damping: what is below is rounding of none
 ALIKE = 1e-9  # relative: singular values of outputs
-RIGID_RATIO = 1e-5  # a mode below this fraction of the highest frequency counts as rigid
+NONE = 1e-12  # relative: what is below is rounding of no force, no reading or no damping
 
 
 @dataclass(frozen=True)
 class Suspension:
-    """Where the rigid-body poles are put: frequency in Hz and damping ratio."""
+    """Where a synthesis puts the rigid-body poles: frequency in Hz and damping ratio.
+
+    `rigid_modes`: how many there are, where the case states it; see `rigid_modes.natural_modes`.
+    """
 
     frequency_hz: float = 0.1
     damping_ratio: float = 0.7
+    rigid_modes: int | None = None
+
+    @property
+    def free(self) -> "Suspension":
+        """None: rigid-body poles stay at zero, as the machine has them."""
+        return replace(self, frequency_hz=0.0, damping_ratio=0.0)
 
 
 FREE = Suspension(0.0, 0.0)
@@ -97,15 +107,11 @@ def modal_plant(
 ) -> ModalPlant:
     """Mass-normalised modal coordinates, with suspension and modal damping.
 
-    Raises PlantError where a stiffness is negative: the plant must be stable once suspended.
+    Raises PlantError where a stiffness is negative, and where it is not known whether K resists a
+    motion.
     """
-    lam, modes = eigh(system.K, system.M)
+    lam, modes, rigid = natural_modes(system.K, system.M, suspension.rigid_modes)
     w_r = 2.0 * np.pi * suspension.frequency_hz
-    threshold = max((RIGID_RATIO**2) * lam[-1], (1e-3 * w_r) ** 2)
-    if lam[0] < -threshold:
-        raise PlantError("the stiffness matrix has a negative eigenvalue; the plant is not stable")
-    rigid = np.abs(lam) <= threshold
-    lam = np.where(rigid, 0.0, lam)
     modes = _aligned(modes, lam, system.C)
     root = np.sqrt(lam)
     own = np.zeros(rigid.size)
@@ -121,6 +127,9 @@ def modal_plant(
         return modes.T @ matrix @ modes
 
     D_given = perturbation.damping * to_modal(system.D)
+    size = np.abs(modes).T @ np.abs(system.D) @ np.abs(modes)
+    undamped = (rigid[:, None] | rigid) & (np.abs(D_given) <= NONE * perturbation.damping * size)
+    D_given[undamped] = 0.0
     dM, dD, dK, dB, dC = system.derivatives
     dM, dK = to_modal(dM), to_modal(dK)
     dA = dK - dM * lam  # M⁻¹K moves by dK - dM Λ where M = I
@@ -129,7 +138,7 @@ def modal_plant(
     dg = dM * g + _divided_differences(lam, g, rigid, slope_g) * dA
     C = system.C @ modes
     seen = np.linalg.norm(C, axis=0)
-    C[:, seen <= 1e-12 * seen.max()] = 0.0
+    C[:, seen <= NONE * seen.max()] = 0.0
     return ModalPlant(
         K=np.diag(h),
         D=D_given + np.diag(g),
@@ -146,6 +155,26 @@ def modal_plant(
     )
 
 
+def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
+    """The plant without rigid-body motions that are neither driven nor measured; see
+    `rigid_modes.driven_and_measured`. Derivatives of the plant's response stay what they are."""
+    own = np.flatnonzero(modal.rigid)
+    sizes = np.linalg.norm(modal.B, 2), np.linalg.norm(modal.C, 2)
+    if not own.size or not all(sizes):
+        return modal
+    T, back = driven_and_measured(modal.B[own] / sizes[0], modal.C[:, own] / sizes[1])
+    count = T.shape[1]
+    if count == own.size:
+        return modal
+    kept = np.setdiff1d(np.arange(len(modal.K)), own[count:])
+    T, back = placed(T, own, kept), placed(back.T, own, kept).T
+    both = {name: back @ getattr(modal, name) @ T for name in ("K", "D", "dM", "dK", "dD")}
+    drive = {name: back @ getattr(modal, name) for name in ("B", "dB")}
+    shown = {name: getattr(modal, name) @ T for name in ("C", "dC", "modes")}
+    left = {name: getattr(modal, name)[kept] for name in ("natural", "rigid")}
+    return replace(modal, **both, **drive, **shown, **left)
+
+
 def require_damping(modal: ModalPlant) -> None:
     """Raise PlantError where a flexible mode is not damped: its gain would be infinite."""
     damping, natural, rigid = np.diag(modal.D), modal.natural, modal.rigid
@@ -159,20 +188,6 @@ def require_damping(modal: ModalPlant) -> None:
         f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: no synthesis holds an infinite "
         "resonance; return a damping matrix that reaches it, or damping_ratio, such as 0.005"
     )
-
-
-def numbered(modes: Array, rigid: np.ndarray) -> np.ndarray:
-    """The flexible ones of modes (n, n), lowest first, in the order of their numbers.
-
-    Where each coordinate of the model is a mode the model's order counts: what shifts a mode alone
-    then shifts the same one at every θ, also past a crossing of frequencies. Else the lowest is
-    the first. Each branch of eigenvalues has a function of its own, of which the divided
-    differences hold as they do for one, where eigenvalues are apart.
-    """
-    flexible = np.flatnonzero(~rigid)
-    if np.count_nonzero(modes[:, flexible]) == len(flexible):
-        flexible = flexible[np.argsort(np.abs(modes).argmax(0)[flexible])]
-    return flexible
 
 
 def _aligned(modes: Array, lam: Array, C: Array) -> Array:

@@ -13,16 +13,15 @@ from itertools import combinations
 import casadi as ca
 import numpy as np
 import scipy
-from scipy.linalg import eigh
 
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
 from ccd_casadi.plants.axes import at_reference, followed_modes, in_axes
 from ccd_casadi.plants.fixed import reparametrised
-from ccd_casadi.plants.modal import RIGID_RATIO
 from ccd_casadi.plants.nodes import NodeInterpolation, Position, Positions, names_in
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
+from ccd_casadi.plants.rigid_modes import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
@@ -242,9 +241,8 @@ class PlacedMechanics:
 
 def _flexible(system: Mechanics) -> tuple[Array, Array]:
     """ω in rad/s and shapes, as columns, of the flexible modes."""
-    lam, modes = eigh(system.K, system.M)
-    flexible = lam > RIGID_RATIO**2 * lam[-1]
-    return np.sqrt(lam[flexible]), modes[:, flexible]
+    lam, modes, rigid = natural_modes(system.K, system.M)
+    return np.sqrt(lam[~rigid]), modes[:, ~rigid]
 
 
 def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:

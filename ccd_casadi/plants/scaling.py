@@ -45,8 +45,9 @@ class ScaledPlant:
     the least singular value of the scaled plant there. `dA`, `dB`, `dC` are derivatives to θ
     with ω₀ and the coordinates frozen. `channels` are the blocks of an exactly block-diagonal
     plant (see `channels`), empty where it is not. With a `family`, the plant that a controller is
-    designed on and those that it has to hold on, all with the ω₀, the force and the drive of this
-    one, a synthesis is one for all, and the peak of S the largest on any of these and this one.
+    designed on (of free bodies, on their suspension) and those that it has to hold on, all with the
+    ω₀, the force and the drive of this one, a synthesis is one for all, and the peak of S the
+    largest on any of these and this one.
     """
 
     A: Array
@@ -62,6 +63,11 @@ class ScaledPlant:
     dC: Array
     channels: tuple[ScaledChannel, ...] = ()
     family: "tuple[ScaledPlant, ...]" = ()
+
+    @property
+    def free(self) -> bool:
+        """Whether some of its bodies are free: a state that no state reads but as a rate."""
+        return bool((~self.A.any(axis=0)).any())
 
     @property
     def design_plant(self) -> "ScaledPlant":

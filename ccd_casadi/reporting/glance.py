@@ -53,4 +53,4 @@ def machine(problem: CoDesignProblem, theta: Sequence[float]) -> Modes | Picture
     if plant.shapes is not None:
         return Modes(plant.shapes(theta, SHOWN_MODES))
     system = mechanics(plant, theta)
-    return lumped_machine(system, modal_plant(system, problem.suspension))
+    return lumped_machine(system, modal_plant(system, problem.suspension.free))

@@ -16,10 +16,8 @@ from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
-from ccd_casadi.inner_problem.design_loops import design_loops
 from ccd_casadi.inner_problem.move_figures import motion_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.modal import FREE, modal_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants
@@ -53,16 +51,15 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
         ahead: Array | None = motion.forward
     else:
         profile, window = setpoint(LIMITS), WINDOW
-        modal = modal_plant(mechanics(plant_of(problem), theta), FREE)
+        modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
         other = " (another: [move] in the case, or the options of robustness)"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
-    free = design_loops(replace(problem, suspension=FREE), theta, view.loop.controller)
-    found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
+    found = moves(loops, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=view.bandwidth_hz)  # fmt: skip
-    end, model = profile.duration, found[0][0]
+    end = profile.duration
     mm = 1e3 * float(profile.at(np.array([end]))[0, 0])
-    made = (mm, 1e3 * end, other, model.free, loops[0].sampling is not None, len(loops) > 1)
+    made = (mm, 1e3 * end, other, loops[0].sampling is not None, len(loops) > 1)
     words = paragraph("report.move", *made)
     return ways_figure(dict(zip(ways, found, strict=True)), words)
 
@@ -125,7 +122,7 @@ def force_step(view: LoopView) -> c.Figure:
 def move_blocks(found: OnHardware) -> tuple[c.Figure, c.Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     ways = {words: [move] for words, move in found.ways.items()}
-    words = "The plant has its soft suspension. Hold and delay are exact."
+    words = "Free bodies are free. Hold and delay are exact."
     peak = max(float(move.peak_force.max()) for move in list(found.ways.values())[:2])
     limit = c.Words(paragraph("report.least_force", found, peak))
     return ways_figure(ways, words), limit

@@ -6,8 +6,7 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.inner_problem.problem import free_modal, plant_of
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.robust.perturbed import PerturbedLoop, judge, search
 from ccd_casadi.support.arrays import Array
@@ -85,6 +84,6 @@ def _hardware(run: FinishedRun, theta: tuple[float, ...]) -> PerturbedLoop | Non
     """The controller on the hardware θ; None where the model makes no plant of it."""
     try:
         system = mechanics(plant_of(run.problem), theta, derivatives=False)
-        return judge(run, modal_plant(system, run.problem.suspension), theta)
+        return judge(run, free_modal(run.problem, system), theta)
     except PlantError:
         return None

@@ -88,7 +88,7 @@ def _line(
 ) -> Line:  # fmt: skip
     """The plants at these places, and between what the loop is stable, and within S_max, by the
     search that the verdict of a solve makes; `model`: its place, where not even there."""
-    loops = loops_off_model(run.system, run.problem.suspension, run.controller, run.sampling)
+    loops = loops_off_model(run.system, run.controller, run.sampling, run.problem.suspension.free)
     nominal, stable, within = loops.at(Perturbation()), (model, model), (model, model)
     excess = partial(excess_of, level=run.problem.inner.S_max * (1.0 + kind_of(run.problem).slack))
     if nominal.stable:

@@ -1,6 +1,6 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.plants.modal import FREE, ModalPlant, modal_plant
+from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
@@ -98,7 +98,7 @@ def robustness(
 def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Study:
     loop = run.loop_on(run.plant.plant_si())  # as it runs
     sampled, modal = loop.sampling is not None, run.modal()
-    free, profile = modal_plant(run.system, FREE), setpoint(d.limits)
+    profile = setpoint(d.limits)
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
     view = loop_view([loop], bounded, bandwidth_hz=omega_b / HZ)
@@ -122,18 +122,16 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
         tolerances=tolerances(run, d.tolerance, d.samples, seed, workers),
         structured=None if sampled else structured_bound(run.plant, modal, run.controller, hz),
         setpoint=profile,
-        moves=_moves(loop, free, profile, d, omega_b / HZ),
+        moves=_moves(loop, modal, profile, d, omega_b / HZ),
     )
 
 
 def _moves(
-    loop: Loop, free: ModalPlant, profile: Setpoint, demands: Demands, bandwidth_hz: float
+    loop: Loop, modal: ModalPlant, profile: Setpoint, demands: Demands, bandwidth_hz: float
 ) -> tuple[Move, ...]:
-    """On the plant with free rigid bodies, or on the suspended one where that is not stable."""
-    ahead = mass_feedforward(free, demands.axis)
+    ahead = mass_feedforward(modal, demands.axis)
     found = moves(
-        [loop], [replace(loop, plant=free.state_space)],
-        (None,) if ahead is None else (None, ahead), profile, axis=demands.axis,
+        [loop], (None,) if ahead is None else (None, ahead), profile, axis=demands.axis,
         window=demands.window, bandwidth_hz=bandwidth_hz,
     )  # fmt: skip
     return tuple(made for (made,) in found)
@@ -194,7 +192,7 @@ def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:
             "reached": {
                 key: getattr(study.setpoint, key) for key in ("velocity", "acceleration", "jerk")
             },
-            "without_suspension": study.moves[0].free,
+            "without_suspension": True,  # moves, as all loops, have free bodies free
             "runs": [_move(move) for move in study.moves],
         },
     }

@@ -41,7 +41,7 @@ def first_resonance(
 ) -> tuple[float, Array]:
     """ω_1 of the first flexible mode, rad/s, and its gradient to θ; NaN where all is rigid."""
     system = (evaluate or partial(mechanics, plant_of(problem)))(tuple(theta))
-    modal = modal_plant(system, problem.suspension)
+    modal = modal_plant(system, problem.suspension.free)
     flexible = np.flatnonzero(~modal.rigid)
     if flexible.size == 0:
         return np.nan, np.full(len(theta), np.nan)

@@ -71,9 +71,10 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
     m, p = plant.B.shape[1], plant.C.shape[0]
     if not p <= count <= m:
         raise UserError(f"{count} of {m} inputs for {p} outputs: give a number from {p} to {m}")
-    if weights.delta or plant.family:
+    if weights.delta or len(plant.members) > 1:
         words = "of the model alone, without an input disturbance"
         raise UserError(f"inputs are chosen by the mixed sensitivity {words}; leave these out")
+    plant = plant.design_plant
     squared: dict[tuple[int, ...], float] = {}
     rules = [LinearConstraint(np.append(np.ones(m), 0.0), count, count)]  # on (z, γ²)
     z, least = np.full(m, count / m), np.inf  # in equal parts, for a first bound

@@ -14,7 +14,13 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.statics import compliance_over_family
-from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, figures_from_row, over_family
+from ccd_casadi.synthesis.synthesis import (
+    DesignFigures,
+    Outcome,
+    figures_from_row,
+    judged_on,
+    over_family,
+)
 from ccd_casadi.synthesis.weights import Weights
 
 MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple
@@ -86,7 +92,7 @@ def sensitivities(
         for channels in (made_on.channels, ()) if made_on.channels else ((),):
             row, Ak, Bk, Ck = design(
                 made_on.A, made_on.B, made_on.C, made_for.w, made_on.grid, made_on.gain,
-                gamma_backoff, omega_low / w0, 0.0, channels, weights.delta,
+                gamma_backoff, omega_low / w0, 0.0, channels, weights.delta, judged_on(plant),
             )  # fmt: skip
             K = Ak, Bk, Ck
             figures, worst = over_family(plant, weights, row, K, omega_low)

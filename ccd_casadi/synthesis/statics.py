@@ -22,6 +22,8 @@ DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at re
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
 INTEGRATOR = 1e-6
 
+RESTING = 1e-6  # of ω_low: where a plant with a pole at 0 is at rest
+
 
 @dataclass(frozen=True)
 class Statics:
@@ -62,7 +64,7 @@ class Statics:
 def statics(
     plant: StateSpace, controller: StateSpace, *, bandwidth: float, omega_low: float
 ) -> Statics:
-    """Of a continuous plant without a pole at 0 and a controller in SI; ω_b, ω_low in rad/s.
+    """Of a continuous plant, at rest close to 0, and a controller in SI; ω_b, ω_low in rad/s.
 
     Of a controller in discrete time the rest is z = 1; hold and delay, which turn nothing at
     ω_low, are left out there.
@@ -72,7 +74,7 @@ def statics(
         return controller.response(np.array([omega]))[0]
 
     def compliance(omega: float, K: np.ndarray) -> float:
-        G = plant.response(np.array([omega]))[0]
+        G = plant.response(np.array([max(omega, RESTING * omega_low)]))[0]
         return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))
 
     low = compliance(omega_low, at(omega_low))

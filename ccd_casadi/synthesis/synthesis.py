@@ -22,7 +22,6 @@ from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
 
 UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
-LEVEL = 1e-6  # relative: how far above the largest gain found a norm is certified
 
 
 class Outcome(StrEnum):
@@ -141,7 +140,8 @@ def synthesise(
     w0 = plant.omega_0
     on = plant.design_plant
     row, Ak, Bk, Ck = design(on.A, on.B, on.C, weights.scaled(w0), on.grid, on.gain, gamma_backoff,
-                     omega_low / w0, guess, on.channels, weights.delta)  # fmt: skip
+                     omega_low / w0, guess, on.channels, weights.delta,
+                     judged_on(plant))  # fmt: skip
     figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
     controller = plant.controller_si(Ak, Bk, Ck)
     if compliance and figures.certified:
@@ -163,15 +163,21 @@ def sweep(
     w0 = plant.omega_0
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     points = [weights.at(float(s), float(t)) for s in S for t in T]
-    if plant.family or compliance:
+    on = plant.design_plant
+    if len(plant.members) > 1 or compliance:
         made = (synthesise(plant, point, omega_low=omega_low, gamma_backoff=gamma_backoff,
                            compliance=compliance) for point in points)  # fmt: skip
         return [design.figures for design in made]
-    rows = _sweep(plant.A, plant.B, plant.C, weights.scaled(w0), S / w0, T / w0, plant.grid,
-                  plant.gain, gamma_backoff, omega_low / w0, plant.channels,
-                  weights.delta)  # fmt: skip
+    rows = _sweep(on.A, on.B, on.C, weights.scaled(w0), S / w0, T / w0, on.grid, on.gain,
+                  gamma_backoff, omega_low / w0, on.channels, weights.delta,
+                  judged_on(plant))  # fmt: skip
     rows = rows.reshape(len(points), -1)
     return [figures_from_row(row, point, w0) for row, point in zip(rows, points, strict=True)]
+
+
+def judged_on(plant: ScaledPlant) -> tuple[Array, ...]:
+    """A, B, C of the plant that a design's loop is judged on, () where that is its design plant."""
+    return (plant.A, plant.B, plant.C) if plant.family else ()
 
 
 def over_family(
@@ -184,11 +190,11 @@ def over_family(
     """Figures of a scaled controller (A_K, B_K, C_K) on a plant and its perturbed siblings.
 
     ω_b and σ_max(S(jω_low)) are the plant's own, ‖S‖∞ is the largest of all; second comes the
-    plant that has it. `row` is that of the synthesis on the family's design plant. γ_opt
-    is of that one; the certified norm is of the plant itself, and no optimal one there.
+    plant that has it. `row`: of the synthesis on the family's design plant, judged on this one.
+    γ_opt is of the design plant; the certified norm is of the plant itself, not optimal there.
     """
     w0 = plant.omega_0
-    if row[Column.CODE] != Code.CERTIFIED or not plant.family:
+    if row[Column.CODE] != Code.CERTIFIED or len(plant.members) == 1:
         return figures_from_row(row, weights, w0), plant
     w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
@@ -198,19 +204,15 @@ def over_family(
         judge(*loop, w, weights.delta, gamma, omega_low / w0, own)
         return own
 
-    own = assessed(plant, UNBOUNDED)
-    if own[Column.CODE] == Code.CERTIFIED:
-        own = assessed(plant, max(row[Column.GAMMA], (1.0 + LEVEL) * own[Column.NORM]))
-    worst = plant
-    if own[Column.CODE] == Code.CERTIFIED:
-        for member in plant.members[1:]:
-            other = assessed(member, UNBOUNDED)
-            if other[Column.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
-                figures = figures_from_row(own, weights, w0)
-                return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member
-            if other[Column.PEAK] > own[Column.PEAK]:
-                worst, of_peak = member, [Column.PEAK, Column.PEAK_FREQUENCY]
-                own[of_peak] = other[of_peak]
+    own, worst = row.copy(), plant
+    for member in plant.members[1:]:
+        other = assessed(member, UNBOUNDED)
+        if other[Column.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
+            figures = figures_from_row(own, weights, w0)
+            return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member
+        if other[Column.PEAK] > own[Column.PEAK]:
+            worst, of_peak = member, [Column.PEAK, Column.PEAK_FREQUENCY]
+            own[of_peak] = other[of_peak]
     return figures_from_row(own, weights, w0), worst
 
 

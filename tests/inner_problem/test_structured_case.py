@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from case_documents import TWO_MASS
-from helpers import SUSPENSION, random_plant
+from helpers import random_plant
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -199,7 +199,7 @@ def test_derivatives_of_plants_with_single_modes_shifted(modal: bool) -> None:
 
     def shifted(at: np.ndarray) -> ScaledPlant:
         systems = (mechanics(plant, tuple(at)),)
-        uncertain = UncertainPlant(systems, SUSPENSION, 1e6, 0.03, 0.1, (0.5, 2.0), 0.2)
+        uncertain = UncertainPlant(systems, 1e6, 0.03, 0.1, (0.5, 2.0), 0.2)
         return uncertain.plant(np.array([0.02, 0.1, -0.05, 0.07, 1.5, 0.1]))
 
     def response(at: np.ndarray) -> complex:
@@ -220,7 +220,7 @@ def test_derivatives_of_a_plant_to_what_is_uncertain(modal: bool) -> None:
     """Of the transfer function, at a point of the box, against differences."""
     plant = random_plant(7, rigid=1, flexible=3, inputs=1, outputs=1, modal=modal)
     system = mechanics(plant, (0.4, 0.6))
-    box = UncertainPlant((system,), SUSPENSION, 1e6, 0.03, 0.1, (0.5, 2.0), 0.2)
+    box = UncertainPlant((system,), 1e6, 0.03, 0.1, (0.5, 2.0), 0.2)
     point, h, s = np.array([0.02, 0.1, -0.05, 0.07, 1.5, 0.1]), 1e-5, 2j * np.pi * 60.0
 
     def response(at: np.ndarray) -> complex:

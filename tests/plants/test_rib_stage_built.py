@@ -18,7 +18,6 @@ from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
-from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.errors import UserError
@@ -33,7 +32,7 @@ def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
     theta = built.theta_of(built.DESIGN)
     stage, kept = rib_stage(NAMES), json.loads((built.DESIGN / "inner.json").read_text())
     assert hardware_cost(stage, theta) == pytest.approx(kept["hardware_cost"], rel=1e-9)
-    box = UncertainPlant((mechanics(stage, theta, derivatives=False),), Suspension(), built.M_K,
+    box = UncertainPlant((mechanics(stage, theta, derivatives=False),), built.M_K,
                          mode_shift=0.02, damping=(0.5, 2.0))  # fmt: skip
     K = built.controller(built.DESIGN)
     for _, point in box.corners()[1:]:

@@ -254,7 +254,7 @@ def test_a_set_of_unlike_plants_is_brought_to_common_units(design) -> None:
 
 def uncertain(**changes: object) -> UncertainPlant:
     system = mechanics(two_mass_model(), (55.0, 55.0))
-    return UncertainPlant((system,), SUSPENSION, WEIGHTS.M_K, **changes)
+    return UncertainPlant((system,), WEIGHTS.M_K, **changes)
 
 
 def test_the_box_holds_the_plants_that_it_names() -> None:
@@ -301,7 +301,7 @@ def test_of_many_parameters_the_worst_plant_is_climbed_to(S_low: float) -> None:
     """Worse than a lattice and than every corner, of a box too large for one move each, also where
     all plants exceed another bound by more."""
     system = mechanics(random_plant(5, rigid=1, flexible=4, inputs=1, outputs=1), (0.5, 0.5))
-    box = UncertainPlant((system,), SUSPENSION, 1e6, 0.01, 0.02, (0.5, 2.0), 0.05)
+    box = UncertainPlant((system,), 1e6, 0.01, 0.02, (0.5, 2.0), 0.05)
     assert len(box.names) == 7
     members = problem_for([box.plant(box.nominal)], SMALL, EASY)
     kappa = stabilising(members, by_rules(members, np.geomspace(0.01, 0.3, 8)))[0]

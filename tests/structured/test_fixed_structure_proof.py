@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
-from helpers import HZ, SUSPENSION, two_mass_model
+from helpers import HZ, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, root, variable
@@ -23,7 +23,7 @@ from ccd_casadi.support.arrays import Array
 
 SYSTEM = mechanics(two_mass_model(), np.array([55.0, 55.0]))
 BOX = UncertainPlant(
-    (SYSTEM,), SUSPENSION, WEIGHTS.M_K, resonance_shift=0.02, damping=(0.5, 2.0), gain=0.03
+    (SYSTEM,), WEIGHTS.M_K, resonance_shift=0.02, damping=(0.5, 2.0), gain=0.03
 )
 STRUCTURE = Structure(biquads=1)
 # integrator, lead, a broad notch on the resonance at 183.6 Hz, roll-off: a PID as in a textbook

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fixed_structure_loops import BOUNDS, LATE, WEIGHTS
-from helpers import HZ, SUSPENSION
+from helpers import HZ
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine
@@ -36,7 +36,7 @@ CARTS = Mechanics(
     55.0 * np.eye(4), np.zeros((4, 4)), STIFFNESS, DRIVE, READING, 0.01, tuple(NONE)
 )  # fmt: skip
 BOX = UncertainPlant(
-    (CARTS,), SUSPENSION, WEIGHTS.M_K, mode_shift=0.02, damping=(0.5, 2.0), gain=0.02
+    (CARTS,), WEIGHTS.M_K, mode_shift=0.02, damping=(0.5, 2.0), gain=0.02
 )
 ONE = Structure(biquads=1)
 BOTH = ChannelStructure(
@@ -178,7 +178,7 @@ def test_two_actuators_on_one_sensor_are_proven_together(sampling) -> None:
     """One output, a channel for each actuator, an integrator in one of them."""
     slopes = (*CARTS.derivatives[:4], np.zeros((0, 1, 4)))
     one = replace(CARTS, C=READING[:1], derivatives=slopes)
-    box = UncertainPlant((one,), SUSPENSION, WEIGHTS.M_K, resonance_shift=0.02, gain=0.02)
+    box = UncertainPlant((one,), WEIGHTS.M_K, resonance_shift=0.02, gain=0.02)
     fast = replace(ONE, integrator=False)
     both = ChannelStructure(given_decoupling(("a", "b"), [[1], [1]], [[1, 0], [0, 1]]), (ONE, fast))
     slow = KAPPA[: len(ONE.names)]

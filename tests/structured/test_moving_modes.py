@@ -42,7 +42,7 @@ def beam(theta, damping=0.01):
 PLANT = build_plant(beam, ["x"], {})
 GRAPH = ca.Function("graph", [X := ca.SX.sym("x")], PLANT.evaluate.matrices.call([X])[:5])
 BOX = UncertainPlant(
-    (mechanics(PLANT, (0.1,)),), SUSPENSION, WEIGHTS.M_K, resonance_shift=0.02,
+    (mechanics(PLANT, (0.1,)),), WEIGHTS.M_K, resonance_shift=0.02,
     ranges=(("x", STROKE[0], 0.1, STROKE[1]),),
     along=lambda option, x: mechanics(PLANT, x.tolist()), graph=lambda option: GRAPH,
 )  # fmt: skip

@@ -1,0 +1,86 @@
+"""A plant as its function returned it, in first order: what a finished loop is judged on.
+
+    M q̈ + D q̇ + K q = B u,   y = C q;   ẋ = [0 1; -M⁻¹K -M⁻¹D] x + [0; M⁻¹B] u,   x = (q, q̇)
+
+in the person's own coordinates and units, free bodies free, nothing reduced, scaled or put in modal
+form. Off the model, with a common shift s of the resonances, shifts s_i of single modes, a factor d
+of the damping and a gain g,
+
+    K' = (1 + s)²(K + Σ_i ((1 + s_i)² - 1) λ_i M φ_i (M φ_i)ᵀ),
+    D' = d (D + Σ_i 2 ζ (1 + s)(1 + s_i) ω_i M φ_i (M φ_i)ᵀ),   B' = (1 + g) B.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ccd_casadi.lti.state_space import StateSpace, strictly_proper
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered
+from ccd_casadi.support.arrays import Array
+
+
+def as_written(
+    system: Mechanics,
+    *,
+    shift: float = 0.0,
+    modes: Sequence[float] = (),
+    damping: float = 1.0,
+    gain: float = 0.0,
+    rigid_modes: int | None = None,
+) -> StateSpace:
+    """The state space of a plant's matrices, on or off the model.
+
+    Parameters
+    ----------
+    system : Mechanics
+        M, D, K, B, C at one θ, SI, and the damping ratio ζ where the model gives one.
+    shift, modes, damping, gain : float, sequence of float, float, float
+        s, s_i in the order of the modes' numbers, d and g; of a given D the matrix is kept.
+    rigid_modes : int, optional
+        How many there are, where the case states it.
+
+    Returns
+    -------
+    StateSpace
+        Force to displacement. Free bodies that are neither driven nor measured are left out.
+
+    Raises
+    ------
+    PlantError
+        Where it is not known which modes are rigid, or no controller can hold one.
+    """
+    lam, shapes, rigid = natural_modes(system.K, system.M, rigid_modes)
+    own = np.zeros(len(lam))
+    single = numbered(shapes, rigid)[: len(modes)]
+    own[single] = list(modes)[: len(single)]
+    pushes = system.M @ shapes
+    ratio = (1.0 + shift) * (1.0 + own)
+    K = (1.0 + shift) ** 2 * (system.K + (pushes * (((1.0 + own) ** 2 - 1.0) * lam)) @ pushes.T)
+    zeta = system.damping_ratio or 0.0
+    D = damping * (system.D + (pushes * (2.0 * zeta * ratio * np.sqrt(lam))) @ pushes.T)
+    M, B, C = system.M, (1.0 + gain) * system.B, system.C
+    sides = _seen(shapes, rigid, B, C)
+    if sides is not None:
+        left, right = sides
+        M, K, D = (left.T @ part @ right for part in (M, K, D))
+        B, C = left.T @ B, C @ right
+    n, rates = len(M), np.linalg.solve(M, np.hstack([K, D, B]))
+    A = np.zeros((2 * n, 2 * n))
+    A[:n, n:] = np.eye(n)
+    A[n:] = -rates[:, : 2 * n]
+    drive = np.vstack([np.zeros_like(B), rates[:, 2 * n :]])
+    return strictly_proper(A, drive, np.hstack([C, np.zeros_like(C)]))
+
+
+def _seen(shapes: Array, rigid: np.ndarray, B: Array, C: Array) -> tuple[Array, Array] | None:
+    """Test and trial shapes (n, k) without the rigid-body motions that are neither driven nor
+    measured; None where all are: then the person's own coordinates stay."""
+    free, flexible = shapes[:, rigid], shapes[:, ~rigid]
+    sizes = np.linalg.norm(shapes.T @ B, 2), np.linalg.norm(C @ shapes, 2)
+    if not free.size or not all(sizes):
+        return None
+    T, back = driven_and_measured(free.T @ B / sizes[0], C @ free / sizes[1])
+    if T.shape[1] == free.shape[1]:
+        return None
+    return np.hstack([free @ back.T, flexible]), np.hstack([free @ T, flexible])

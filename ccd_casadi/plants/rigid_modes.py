@@ -1,0 +1,161 @@
+"""Natural modes of K v = λ M v, and which of them are rigid: what K does not resist.
+
+Whether λ is zero cannot be seen from λ: its rounding is that of the largest, so that one stiff
+link (1 mg on 1e9 N/m) would hide a resonance. It is seen from K in units in which every entry of
+its diagonal is one,
+
+    K' = d⁻¹K d⁻¹,   d = √diag K,
+
+which no unit of a coordinate changes: entries of K with relative errors ε move the eigenvalues of
+K' by n ε. So K' resists a motion by what it has there, or by rounding. What lies between is
+refused unless the case states how many rigid-body modes there are.
+
+Flexible modes are those of the M-orthogonal complement, low ones by the inverse where stiffnesses
+are many decades apart: an eigenvalue solver errs by ε of its largest eigenvalue.
+"""
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+EPS = float(np.finfo(float).eps)
+ROUNDING = 100.0  # times n ε: an eigenvalue of K' that rounding makes of zero is below it
+KNOWN = 1e-10  # eigenvalue of K' from which on K resists: its λ is known to n ε/KNOWN
+STATED = 1e-3  # eigenvalue of K' up to which a motion is rigid where the case states their number
+HIDDEN = 1e-9  # relative: a rigid body that is driven or measured by less is not
+STIFF = 1e8  # λ_max/λ_min from which on low modes are found by the inverse
+
+
+def natural_modes(K: Array, M: Array, stated: int | None = None) -> tuple[Array, Array, np.ndarray]:
+    """Eigenvalues λ, modes and which are rigid, with λ = 0 there, lowest first.
+
+        K Φ = M Φ Λ,   ΦᵀMΦ = 1
+
+    Parameters
+    ----------
+    K, M : arrays (n, n)
+        Stiffness and mass, symmetric, M positive definite, SI.
+    stated : int, optional
+        How many rigid-body modes the case states: where K leaves it open the lowest ones are.
+
+    Returns
+    -------
+    λ (n,), Φ (n, n), rigid (n,)
+
+    Raises
+    ------
+    PlantError
+        K has a negative eigenvalue, or one that is neither zero nor known.
+    """
+    diagonal = np.diag(K)
+    if (diagonal < 0.0).any():
+        raise _negative()
+    d = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    w, U = np.linalg.eigh(K / d[:, None] / d)
+    rounding = ROUNDING * len(K) * EPS
+    count = int((w <= rounding).sum())
+    if stated is not None and count <= stated < len(w) and w[:stated].max(initial=0.0) <= STATED:
+        count = stated
+    if w[0] < -(rounding if stated is None else STATED):
+        raise _negative()
+    open_ones = w[count:] < KNOWN
+    if open_ones.any() and count != stated:
+        raise PlantError(
+            f"the stiffness matrix resists a motion by {w[count]:.2g} of its entries: by rounding, "
+            f"or by a spring? If it is a rigid-body mode, state [suspension] rigid_modes = "
+            f"{count + int(open_ones.sum())}; else give more digits, or softer links"
+        )
+    L = np.linalg.cholesky(M)
+    A = np.linalg.solve(L, np.linalg.solve(L, K).T)
+    rigid = U[:, :count] / d[:, None]
+    Q, _ = np.linalg.qr(L.T @ rigid, mode="complete")
+    own, rest = Q[:, :count], Q[:, count:]
+    lam, shapes = np.linalg.eigh(rest.T @ (0.5 * (A + A.T)) @ rest)
+    modes = np.linalg.solve(L.T, np.hstack([own, rest @ shapes]))
+    if len(lam) and lam[-1] > STIFF * lam[0]:
+        lam, modes[:, count:] = _low_ones_by_the_inverse(K, M, lam, modes, count)
+    return np.append(np.zeros(count), lam), modes, np.arange(len(K)) < count
+
+
+def numbered(modes: Array, rigid: np.ndarray) -> np.ndarray:
+    """The flexible ones of modes (n, n), lowest first, in the order of their numbers.
+
+    Where each coordinate of the model is a mode the model's order counts: what shifts a mode alone
+    then shifts the same one at every θ, also past a crossing of frequencies. Else the lowest is
+    the first. Each branch of eigenvalues has a function of its own, of which the divided
+    differences hold as they do for one, where eigenvalues are apart.
+    """
+    flexible = np.flatnonzero(~rigid)
+    if np.count_nonzero(modes[:, flexible]) == len(flexible):
+        flexible = flexible[np.argsort(np.abs(modes).argmax(0)[flexible])]
+    return flexible
+
+
+def driven_and_measured(B: Array, C: Array) -> tuple[Array, Array]:
+    """Coordinates z, q = T z, of which the first ones alone are driven and measured.
+
+    Free bodies q̈ = B u, y = C q are C B/s², whatever T. Where C, B and C B are of one rank,
+    T = [range B, kernel C] parts what the loop sees from what it neither drives nor measures.
+
+    Parameters
+    ----------
+    B, C : arrays (k, m), (p, k)
+        Relative to those of the whole plant.
+
+    Returns
+    -------
+    T (k, rank), and its part (rank, k) of T⁻¹
+
+    Raises
+    ------
+    PlantError
+        A motion is driven and not measured, or the reverse: no controller can hold it.
+    """
+    U, s, _ = np.linalg.svd(B, full_matrices=False)
+    driven = int((s > HIDDEN).sum())
+    _, s, Vt = np.linalg.svd(C)
+    measured = int((s > HIDDEN).sum())
+    both = np.linalg.svd(Vt[:measured] @ U[:, :driven], compute_uv=False)
+    known = int((both > HIDDEN).sum())
+    for count, words in (
+        (driven, "driven and not measured: it drifts away; add an output that sees it"),
+        (measured, "measured and not driven: no force holds it; add an input that moves it"),
+    ):
+        if count > known:
+            raise PlantError(f"a rigid-body motion is {words}, or a spring in the model")
+    if known == len(B):
+        return np.eye(known), np.eye(known)
+    T = np.hstack([U[:, :known], Vt[known:].T])
+    return T[:, :known], np.linalg.inv(T)[:known]
+
+
+def placed(T: Array, own: np.ndarray, kept: np.ndarray) -> Array:
+    """T of the coordinates `own` (k,) among all, of which the `kept` ones stay: (n, len(kept))."""
+    n = len(own) - T.shape[1] + len(kept)
+    whole = np.eye(n)[:, kept]
+    whole[np.ix_(own, np.isin(kept, own))] = T
+    return whole
+
+
+def _low_ones_by_the_inverse(
+    K: Array, M: Array, lam: Array, modes: Array, count: int
+) -> tuple[Array, Array]:
+    """λ and modes of the flexible ones, those below the middle of M v = μ K v, μ = 1/λ.
+
+    A Cholesky factor errs as the entries of K in their own units do, so that the largest μ are
+    known as well as K' is. Rigid modes are held at a λ among these.
+    """
+    rigid = M @ modes[:, :count]
+    held = 0.5 * max(lam[0], EPS * lam[-1])  # below the flexible ones, and of their size
+    inverse, shapes = eigh(M, K + held * rigid @ rigid.T)
+    along = np.linalg.norm(rigid.T @ shapes, axis=0) ** 2 / inverse
+    flexible = np.sort(np.argsort(along)[: len(lam)])[::-1]
+    low, found = 1.0 / inverse[flexible], shapes[:, flexible] / np.sqrt(inverse[flexible])
+    fine = low < np.sqrt(lam[-1] * low[0])
+    return np.where(fine, low, lam), np.where(fine, found, modes[:, count:])
+
+
+def _negative() -> PlantError:
+    return PlantError("the stiffness matrix has a negative eigenvalue; the plant is not stable")

@@ -1,0 +1,112 @@
+"""Rigid is what K does not resist, in any units and beside any stiff link; the rest is flexible."""
+
+from dataclasses import replace
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ccd_casadi.lti.hold import sampled
+from ccd_casadi.plants.as_written import as_written
+from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant, without_hidden_rigid_modes
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.rigid_modes import natural_modes
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+decades = st.floats(-1.0, 1.0)
+
+
+def springs(ends: list[tuple[int, int]], k: Array, n: int) -> Array:
+    """K of springs between coordinates; -1 is the ground."""
+    K = np.zeros((n, n))
+    for (i, j), stiffness in zip(ends, k, strict=True):
+        e = np.zeros(n)
+        e[i] = 1.0
+        if j >= 0:
+            e[j] = -1.0
+        K += stiffness * np.outer(e, e)
+    return K
+
+
+def chain(masses: Array, stiffness: Array, damping: float = 0.003) -> Mechanics:
+    """A free chain, driven and measured at its first mass."""
+    n = len(masses)
+    K = springs([(i, i + 1) for i in range(n - 1)], stiffness, n)
+    first = np.eye(n)[:, :1]
+    none = tuple(np.zeros((0, *shape)) for shape in ((n, n), (n, n), (n, n), (n, 1), (1, n)))
+    return Mechanics(np.diag(masses), 0.0 * K, K, first, first.T, damping, none)  # type: ignore[arg-type]
+
+
+@settings(max_examples=25, deadline=None)
+@given(m=st.lists(decades, min_size=3, max_size=5), k=decades, stiff=st.floats(2.0, 7.0),
+       units=st.lists(st.floats(-3.0, 3.0), min_size=5, max_size=5))  # fmt: skip
+def test_one_mode_of_a_free_chain_is_rigid_beside_any_stiff_link_in_any_units(
+    m, k, stiff, units
+) -> None:
+    n = len(m)
+    masses = 10.0 ** np.array(m)
+    masses[-1] *= 1e-6  # a small node on a penalty link
+    stiffness = 10.0 ** (4.0 + k) * np.ones(n - 1)
+    stiffness[-1] *= 10.0**stiff
+    system = chain(masses, stiffness)
+    own = 10.0 ** np.array(units[:n])  # other units of each coordinate
+    K, M = (part * own * own[:, None] for part in (system.K, system.M))
+    lam, shapes, rigid = natural_modes(K, M)
+    assert rigid.tolist() == [True] + [False] * (n - 1)
+    with mp.workdps(60):
+        root = mp.diag([1 / mp.sqrt(mp.mpf(value)) for value in masses.tolist()])
+        truth = sorted(mp.eigsy(root * mp.matrix(system.K.tolist()) * root, eigvals_only=True))
+        off = [abs(float(x / mp.mpf(own)) - 1.0) for own, x in zip(truth, lam, strict=True)][1:]
+    assert max(off) < 1e-5  # 1e-7 was seen for links of 1e14 N/m
+    assert np.abs(shapes.T @ M @ shapes - np.eye(n)).max() < 1e-6
+
+
+def test_what_lies_between_rigid_and_held_is_refused_unless_the_case_states_it() -> None:
+    system = chain(np.ones(3), np.array([1e6, 1e6]))
+    held = system.K + np.diag([1e-5, 0.0, 0.0])  # 1e-11 of the springs
+    with pytest.raises(PlantError, match="state .suspension. rigid_modes = 1"):
+        natural_modes(held, system.M)
+    assert natural_modes(held, system.M, stated=1)[2].tolist() == [True, False, False]
+    soft = system.K + np.diag([1.0, 0.0, 0.0])
+    lam, _, rigid = natural_modes(soft, system.M)
+    assert not rigid.any()
+    assert abs(lam[0] / (1.0 / 3.0) - 1.0) < 1e-5  # 1 N/m on 3 kg
+    with pytest.raises(PlantError, match="negative eigenvalue"):
+        natural_modes(system.K - np.diag([1.0, 0.0, 0.0]), system.M)
+
+
+OFF = [Perturbation(), Perturbation(0.03, 0.5), Perturbation(-0.02, 2.0, (0.05, -0.04))]
+
+
+@pytest.mark.parametrize("off", OFF, ids=["model", "common", "single"])
+def test_the_plant_as_written_answers_as_its_modes_do(off) -> None:
+    system = chain(np.array([4.0, 1.0, 0.3]), np.array([2500.0, 9000.0]))
+    modal = modal_plant(system, FREE, off).state_space
+    written = as_written(system, shift=off.shift, modes=off.modes, damping=off.damping)
+    s = 2j * np.pi * np.geomspace(0.05, 500.0, 400)
+    a, b = modal.at(s), written.at(s)
+    assert np.abs(a - b).max(axis=(1, 2)) / np.abs(a).max(axis=(1, 2)) == pytest.approx(0, abs=1e-9)
+    held = [sampled(own, 1e-3, 4e-4) for own in (modal, written)]
+    z = np.exp(1e-3 * s)
+    a, b = (own.at(z) for own in held)
+    assert np.abs(a / b - 1.0).max() < 1e-6
+
+
+def test_free_motions_that_nothing_drives_or_reads_are_left_out_and_halves_are_refused() -> None:
+    system = chain(np.array([4.0, 1.0, 2.0]), np.array([2500.0, 0.0]))  # the last one flies alone
+    assert natural_modes(system.K, system.M)[2].sum() == 2
+    seen = without_hidden_rigid_modes(modal_plant(system, FREE))
+    s = 2j * np.pi * np.geomspace(0.1, 100.0, 50)
+    pair = chain(np.array([4.0, 1.0]), np.array([2500.0]))
+    for found in (seen.state_space, as_written(system)):
+        assert len(found.A) == 4
+        assert np.abs(found.at(s) / as_written(pair).at(s) - 1.0).max() < 1e-9
+    pushed = replace(system, B=np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]]))
+    with pytest.raises(PlantError, match="driven and not measured"):
+        as_written(pushed)
+    read = replace(system, C=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    with pytest.raises(PlantError, match="measured and not driven"):
+        without_hidden_rigid_modes(modal_plant(read, FREE))
