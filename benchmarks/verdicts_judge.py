@@ -14,7 +14,6 @@ from scipy.linalg import block_diag, eigh, expm
 from scipy.optimize import brentq, minimize_scalar
 
 HZ = 2.0 * np.pi
-SUSPENSION_HZ, SUSPENSION_DAMPING = 0.1, 0.7  # where a free chain is hung, the case's default
 CLOSE = 2e-6  # relative: of a figure against the same found here
 LOOSE = 2.1e-4  # relative: by how much sections may exceed a bound, which their page says
 NEAR = 2e-3  # of a range: how near to its end it is looked at
@@ -41,15 +40,15 @@ class Chain:
         lam, modes = eigh(K, np.diag(mass))
         omega = np.sqrt(np.maximum(lam, 0.0)) * (1.0 + shift)
         zeta = np.full(n, self.zeta * factor)
-        omega[0], zeta[0] = SUSPENSION_HZ * HZ, SUSPENSION_DAMPING
+        omega[0] = 0.0  # a free chain stays free
         A = np.block(
-            [[np.zeros((n, n)), np.diag(omega)], [-np.diag(omega), -np.diag(2.0 * zeta * omega)]]
+            [[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), -np.diag(2.0 * zeta * omega)]]
         )
         zero = np.zeros(n)
         return (
             A,
             np.concatenate([zero, modes[0]]),
-            np.concatenate([modes[self.sensor] / omega, zero]),
+            np.concatenate([modes[self.sensor], zero]),
         )
 
 

@@ -103,12 +103,12 @@ def loops_off_model(
     system: Mechanics,
     controller: StateSpace,
     sampling: Sampling | None = None,
-    free: Suspension = FREE,
+    suspension: Suspension = FREE,
 ) -> LoopsOffModel:
-    """Of a plant's matrices at one θ, its bodies `free`."""
+    """Of a plant's matrices at one θ, whose free bodies are free but for a `suspension`."""
 
     def modal(off: Perturbation) -> ModalPlant:
-        return without_hidden_rigid_modes(modal_plant(system, free, off))
+        return without_hidden_rigid_modes(modal_plant(system, suspension, off))
 
     def D(off: Perturbation) -> Array:
         return modal(off).D

@@ -2,7 +2,7 @@
 
 s = y/x, so that frequencies from 0 to infinity are no special case: x = 1, y = jω below a unit,
 x = 1/ω, y = j above it; sampled x = cos(ωT/2), y = (2j/T) sin(ωT/2), z = e^{jωT}. A free body is
-infinite at 0 Hz: on boxes that touch it it is enclosed times y².
+infinite at 0 Hz: at rest it is enclosed times y².
 """
 
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ class Boxes:
 @dataclass(frozen=True)
 class Axis:
     """Frequencies as forms of variable 0: s = y/x, e^{-sT}; period (None: continuous) and delay.
-    `touches`: which boxes touch 0 Hz."""
+    `at_rest`: as they are there."""
 
     x: Affine
     y: Affine
@@ -68,7 +68,7 @@ class Axis:
     turn: Affine
     period: float | None
     delay: float
-    touches: np.ndarray
+    at_rest: bool
 
     def factor(self, p: Affine, residue: Affine) -> Pair:
         """D and N of a pole, both times x; they vanish together nowhere."""
@@ -86,7 +86,7 @@ class Axis:
 
     @property
     def free_body(self) -> Affine:
-        """1/s², or y²/s² = x² where boxes touch 0 Hz; sampled y² times what hold and delay make of
+        """1/s², or y²/s² = x² at rest; sampled y² times what hold and delay make of
         1/s² (`kernels.modes`):
 
         z⁻ᵈ ((h² + (T² - h²)/z)(1 - 1/z)/2 + T (h + (T - h)/z)/z)/T²
@@ -118,23 +118,22 @@ class Axis:
         return self._per_y_squared(sinc * sinc)
 
     def _per_y_squared(self, form: Affine) -> Affine:
-        """The form itself where boxes touch 0 Hz, else over y²."""
-        return _either(self.touches, form, form * inverse(self.y * self.y))
+        """The form itself at rest, else over y²."""
+        return form if self.at_rest else form * inverse(self.y * self.y)
 
 
-def axis_of(boxes: Boxes, period: float | None, delay: float) -> Axis:
+def axis_of(boxes: Boxes, period: float | None, delay: float, at_rest: bool = False) -> Axis:
     """The frequencies of boxes."""
     f = variable(boxes.low[0], boxes.high[0], 0, 1)
-    touches = (boxes.low[0] == 0.0) & (boxes.chart != Chart.HIGH)
     if period is None:
         upper = boxes.chart == Chart.HIGH
         one = Affine(np.ones(len(f.centre)), np.zeros_like(f.slope), np.zeros(len(f.centre)))
         x, y = _either(upper, f, one), _either(upper, one, f) * 1j
-        return Axis(x, y, y, one, None, 0.0, touches)
+        return Axis(x, y, y, one, None, 0.0, at_rest)
     half = exponential(f * 0.5j)
     back = exponential(f * -0.5j)
     x, y = (half + back) * 0.5, (half - back) * (1.0 / period)
-    return Axis(x, y, f * (1j / period), back * back, period, delay, touches)
+    return Axis(x, y, f * (1j / period), back * back, period, delay, at_rest)
 
 
 def gain_of(structure: Structure, kappa: Array, axis: Axis, integrator: bool) -> Affine:

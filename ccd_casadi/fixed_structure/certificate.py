@@ -287,4 +287,4 @@ def _balanced(system: StateSpace) -> StateSpace:
 
 
 def _size(system: StateSpace) -> float:
-    return float(np.abs(np.linalg.eigvals(system.A)).max())
+    return float(np.abs(np.linalg.eigvals(system.A)).max()) or 1.0  # of a free body alone

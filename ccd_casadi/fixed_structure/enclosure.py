@@ -6,7 +6,8 @@ with their number and not with that of the boxes' corners. With K = K̂/y and W 
 
     S = yW,  KS = K̂W,  T = W GK̂,  GS = yW G,   M = y + GK̂,  G = Σ_i g_i c_i b_iᵀ.
 
-Free bodies are infinite at 0 Hz: boxes that touch it are of `_at_rest`.
+Free bodies are infinite at 0 Hz, and far above all else beside it: up to ω_low what `_at_rest`
+finds holds, too.
 
 The largest norms over all discs are those of `largest_norm`: every disc counts along its own
 direction, so that modes which move one channel leave the others alone, and to all orders. What y
@@ -74,33 +75,32 @@ class LoopFamily:
 
     def enclose(self, boxes: Boxes) -> Enclosures:
         """All bounds on all boxes."""
-        axis = axis_of(boxes, self.period, self.delay)
-        resting = axis.touches & self.plant.rigid.any()
-        if not resting.any():
-            return self._on_the_way(boxes, axis)
-        parts = [
-            (
-                chosen,
-                enclose(boxes.only(chosen), axis_of(boxes.only(chosen), self.period, self.delay)),
-            )
-            for chosen, enclose in ((resting, self._at_rest), (~resting, self._on_the_way))
-            if chosen.any()
-        ]
-        order = np.argsort(np.concatenate([np.flatnonzero(chosen) for chosen, _ in parts]))
-        joint = (np.concatenate([getattr(found, key) for _, found in parts], axis=-1)[..., order]
-                 for key in ("highest", "lowest", "spread", "bounded"))  # fmt: skip
-        return Enclosures(parts[0][1].names, *joint)
+        found = self._on_the_way(boxes)
+        slow = self.bounds.omega_low / self.unit * (self.period or 1.0)
+        near = (boxes.low[0] == 0.0) | (boxes.high[0] <= slow)
+        near &= np.isin(boxes.chart, (Chart.LOW, Chart.SAMPLED))
+        if not (self.plant.rigid.any() and near.any()):
+            return found
+        rest = self._at_rest(boxes.only(near))
+        better = rest.highest.max(axis=0) < found.highest[:, near].max(axis=0)
+        highest, spread, bounded = found.highest.copy(), found.spread.copy(), found.bounded.copy()
+        highest[:, near] = np.minimum(rest.highest, highest[:, near])
+        spread[:, near] = np.where(better, rest.spread, spread[:, near])
+        bounded[near] |= rest.bounded
+        return Enclosures(found.names, highest, found.lowest, spread, bounded)
 
-    def _at_rest(self, boxes: Boxes, axis: Axis) -> Enclosures:
-        """The same, upper bounds alone, on boxes that touch 0 Hz, of a plant with free bodies.
+    def _at_rest(self, boxes: Boxes) -> Enclosures:
+        """The same, upper bounds alone, on boxes at rest, of a plant with free bodies.
 
         G = G_r + F, G_r = R/s². With P the projection on what free bodies do not move, P R = 0, and
-        q = y², N = q(1 - P) + P, so that N G_r = q G_r is finite, M is taken times N:
+        q = y²/μ, μ the size of y² G_r K̂, N = q(1 - P) + P, so that N G_r = q G_r is finite, M is
+        taken times N:
 
             M = y N + q G_r K̂ + N F K̂,   |M - y P - (q G_r + P F) K̂| <= |q| (|y| + |F K̂|)
 
         S = y M⁻¹N,  KS = K̂ M⁻¹N,  T = 1 - S,  GS = y M⁻¹N G;   |N| <= max(|q|, |P|)
         """
+        axis = axis_of(boxes, self.period, self.delay, at_rest=True)
         compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
         held, free, damped = discs_of(
             self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
@@ -117,7 +117,13 @@ class LoopFamily:
         unit = np.eye(c.shape[1])
         P = unit - U @ U.T
         held_too = float(U.shape[1] < len(unit))  # |P|
-        n = np.maximum(axis.y.size**2, held_too)
+        size = norm((c[rigid].T * m[:, None, rigid]) @ (b @ K)[:, rigid])
+        good &= size > 0.0
+        size = np.where(good, size, 1.0)
+        for part in (m, r, g, e):
+            part[:, rigid] /= size[:, None]
+        q = axis.y.size**2 / size
+        n = np.maximum(q, held_too)
         columns = np.where(rigid[:, None], c, c @ P)
         rows, one = b @ K, np.ones(len(good))
         y, most, moved = one, one, 0.0 * one
@@ -127,7 +133,7 @@ class LoopFamily:
         good &= np.linalg.det(M) != 0.0
         W = np.linalg.inv(np.where(good[:, None, None], M, unit))
         sizes = (np.abs(m) + r) * _lengths(c) * _lengths(rows)
-        unknown = axis.y.size**2 * (most + sizes[:, ~rigid].sum(axis=1)) + held_too * moved
+        unknown = q * (most + sizes[:, ~rigid].sum(axis=1)) + held_too * moved
         grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
         unknown += grain * ((np.abs(m) + r) * _lengths(c) * _lengths(b)).sum(axis=1)
         total = sizes.sum(axis=1) + held_too * np.abs(y)
@@ -146,22 +152,24 @@ class LoopFamily:
             KS = ((1.0 + loose) * norm(K) + grain) * over
             found += self._weighted(boxes, level, (KS, none), (1.0 + S, none))
         if compliance is not None:
-            # N G: q g of the free bodies
-            G = ((np.abs(g) + e) * _lengths(c) * _lengths(b)).sum(axis=1)
-            inside = compliance * self._inside(boxes)
-            GS = most * over / n * np.maximum(n, 1.0) * G
-            found.append(("GS", GS / inside, none))
+            G = (np.abs(g) + e) * _lengths(c) * _lengths(b)
+            NG = G[:, rigid].sum(axis=1) + n * G[:, ~rigid].sum(axis=1)
+            GS = most * over / n * NG / (compliance * self._inside(boxes))
+            found.append(("GS", GS, none))
         most_at = np.array([most_of for _, most_of, _ in found])
         highest = np.where(good & np.isfinite(most_at), most_at, np.inf)
         weight = np.where(finite[:, None], _lengths(c) * _lengths(rows), 1.0)
         shares = np.where(np.isfinite(held.shares), held.shares, 0.0)
         spread = np.einsum("Ni,ikN->kN", weight, shares)
-        spread[0] += unknown + most * loose
+        # Figures fall with ω; what is not bounded is so by ω, too, unless the discs are wide.
+        wide = ~good & ((r * weight).sum(axis=1) > FAR * norm(M))
+        spread[0] += np.where(wide, unknown, unknown + spread.sum(axis=0) + 1e-300)
         names = tuple(name for name, *_ in found)
         return Enclosures(names, highest, np.zeros_like(highest), spread, good)
 
-    def _on_the_way(self, boxes: Boxes, axis: Axis) -> Enclosures:
+    def _on_the_way(self, boxes: Boxes) -> Enclosures:
         """The same on boxes on which every mode is finite."""
+        axis = axis_of(boxes, self.period, self.delay)
         compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
         held, free, damped = discs_of(
             self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None

@@ -130,7 +130,7 @@ def _roots(limits: Limits, omega_b: float) -> list[complex]:
     """-p̄ of the oscillating poles and zeros p next to ω_b, each once."""
     v = limits.variable(omega_b)
     found: list[complex] = []
-    for r in sorted(limits.roots.tolist(), key=lambda r: abs(np.log(abs(r) / v))):
+    for r in sorted(filter(None, limits.roots.tolist()), key=lambda r: abs(np.log(abs(r) / v))):
         p = complex(abs(r.real), r.imag)
         known = any(abs(p - other) < SAME * abs(p) for other in found)
         if r.imag > 0.0 and BAND[0] * v < abs(r) < BAND[1] * v and not known:

@@ -22,6 +22,7 @@ from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
+AT_REST = 1e-6  # of the fastest: a pole that is as slow is that of a free body, at 0
 FAITHFUL = 1e-6  # relative error of a response by its poles and zeros, up to which they are used
 OUTSIDE = 1e-3  # of its size: real part from which on a zero counts as one of the right half plane
 WIDE = 20.0  # m_T where nothing bounds T: more than 1 + S_max
@@ -78,13 +79,15 @@ def response_of(system: StateSpace) -> Response | None:
     )  # or its zeros have errors of 1e-3
     system = StateSpace(*even, system.D, period=T)
     poles = system.poles
-    size = 1.0 if T else float(np.abs(poles).max())
+    size = 1.0 if T else float(np.abs(poles).max()) or 1.0
     zeros = system.zeros(size)
     if T:
         beyond = np.full(len(poles) - len(zeros), 2.0 / T, complex)  # zeros at z = ∞
         poles, zeros = (2.0 / T * (x - 1.0) / (x + 1.0) for x in (poles, zeros))
         zeros = np.append(zeros, beyond)
-    top = 2.0 / T if T else float(np.median(np.abs(poles)))
+    poles = np.where(_resting(poles), 0.0, poles)
+    moving = np.abs(poles[poles != 0.0])
+    top = 2.0 / T if T else float(np.median(moving)) if moving.size else size
     v = top * np.geomspace(1e-3, 3.0, 25)
     omega = v if not T else 2.0 / T * np.arctan(0.5 * v * T)
     response = system.response(omega)[:, 0, 0]
@@ -94,6 +97,12 @@ def response_of(system: StateSpace) -> Response | None:
         words = "its poles and zeros do not give its response"
         raise PlantError(f"no bound on every controller: {words} (off by {error:.1e})")
     return found
+
+
+def _resting(poles: np.ndarray) -> np.ndarray:
+    """Which poles (s, or v of a sampled plant) are those of free bodies."""
+    size = np.abs(poles)
+    return np.asarray(size <= AT_REST * size.max(initial=0.0))
 
 
 def _reached(A: Array, B: Array) -> np.ndarray:
@@ -174,11 +183,14 @@ def limits_of(
     ratio: float = 1.0,
     integrator: bool = True,
 ) -> Limits:
-    """Of a stable SI plant in a direction of outputs (one output: None); `bounds` are its own.
+    """Of a SI plant, stable but for free bodies, in a direction of outputs (one output: None).
+
+    `bounds` are its own. Free bodies make S vanish at rest; what is used here holds with them too.
 
     Raises PlantError where the plant is not stable.
     """
-    if not plant.stable:
+    poles = plant.poles
+    if not ((poles.real < 0.0) | _resting(poles)).all():
         raise PlantError("no bound on every controller: the plant is not stable")
     if sampling is None:
         held, period = plant, 0.0

@@ -20,12 +20,12 @@ from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
+from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.robust import perturbed
 from ccd_casadi.robust.sampled import sampled_figures
 
-SUSPENSION = Suspension(0.5, 0.7)
+SUSPENSION = FREE
 CROSSOVER = 100.0  # rad/s
 
 
@@ -128,7 +128,7 @@ def drawn(seed: int) -> Drawn:
 def loops_and_bound(
     case: Drawn, seed: int, sampling: Sampling | None = None
 ) -> tuple[LoopsOffModel, float]:
-    loops = loops_off_model(case.system(), SUSPENSION, case.controller(), sampling)
+    loops = loops_off_model(case.system(), case.controller(), sampling, SUSPENSION)
     model = loops.at(Perturbation())
     assume(model.stable and model.peak < 5.0)
     return loops, model.peak * float(np.random.default_rng(seed + 1).choice([1.0, 1.001, 1.1, 1.5]))
@@ -246,7 +246,7 @@ def test_other_damping_is_that_of_the_plant_given_the_other_way(
     case = replace(case, zeta=np.full_like(case.zeta, case.zeta[0]))
     K, off = case.controller(), Perturbation(shift, factor)
     ways = [
-        loops_off_model(replace(case, given=given).system(), SUSPENSION, K)
+        loops_off_model(replace(case, given=given).system(), K, None, SUSPENSION)
         for given in (True, False)
     ]
     for one, two in (ways, ways[::-1]):

@@ -31,7 +31,7 @@ from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice, worst_plants
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
 from ccd_casadi.synthesis.closed_loop import measure
@@ -330,7 +330,7 @@ def test_stationarity_is_measured_not_assumed(design) -> None:
 
 def test_shifted_plants_are_those_of_the_robust_set() -> None:
     system = mechanics(two_mass_model(), (55.0, 55.0))
-    modal = modal_plant(system, SUSPENSION, Perturbation(-0.02))
+    modal = modal_plant(system, FREE, Perturbation(-0.02))
     np.testing.assert_allclose(uncertain(resonance_shift=0.02).plant(np.array([-0.02])).A,
                                scale_plant(modal, WEIGHTS.M_K).A)  # fmt: skip
 
@@ -350,12 +350,12 @@ def test_a_mode_without_damping_that_no_force_drives_is_never_stable(
     K = StateSpace(np.array([[-300.0]]), np.array([[1.0]]), np.array([[2e4]]), np.zeros((1, 1)))
     bounds = Bounds(S_max=3.0, S_low=0.9, omega_low=HZ, shape=None)
     alone = scale_state_space(StateSpace(A[:2, :2], B[:2], C[:, :2], np.zeros((1, 1))), 1.0)
-    assert judged([alone], K, bounds, sampling, False)[0].stable
+    assert judged([alone.plant_si()], K, bounds, sampling, False)[0].stable
     for _ in range(20):
         T = np.linalg.qr(rng.normal(size=(4, 4)))[0]
         turned = StateSpace(T @ A @ T.T, T @ B, C @ T.T, np.zeros((1, 1)))
         other = scale_state_space(turned, 1.0)
-        assert not judged([other], K, bounds, sampling, False)[0].stable
+        assert not judged([other.plant_si()], K, bounds, sampling, False)[0].stable
 
 
 def test_plants_judged_together_are_each_as_alone(design, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -287,7 +287,7 @@ def test_no_h_infinity_design_exceeds_the_bound(seed: int) -> None:
     )
     controller = recertified_in_si(plant, made, omega_low).controller
     loose = Bounds(50.0, 1.0, omega_low, weighted_level=1e9, weights=weights)
-    loop = judged([plant], controller, loose, None, False)[0]
+    loop = judged([plant.plant_si()], controller, loose, None, False)[0]
     level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
     bounds = Bounds(loop.S_peak * (1.0 + 1e-6), 1.0, omega_low, None, level, weights)
     assert loop.crossing <= upper_bound(limits_of(plant.plant_si(), bounds, None)) < np.inf

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from helpers import HZ, PAPER, SUSPENSION, two_mass_model
+from helpers import HZ, PAPER, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
@@ -12,7 +12,7 @@ from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.kernels.loop_grid import NONE
 from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
-from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
@@ -36,7 +36,7 @@ def plant(shift: float = 0.0, damping: float = 1.0, theta: Array | None = None) 
     """Case study 1, at (55, 55) kg unless told."""
     theta = np.array([55.0, 55.0]) if theta is None else theta
     system = mechanics(two_mass_model(), theta)
-    modal = modal_plant(system, SUSPENSION, Perturbation(shift, damping))
+    modal = modal_plant(system, FREE, Perturbation(shift, damping))
     return scale_plant(modal, WEIGHTS.M_K)
 
 

@@ -10,8 +10,9 @@ import mpmath as mp
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.modal import RIGID_RATIO, Suspension
+from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.rigid_modes import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
@@ -33,11 +34,12 @@ class ExactLoop:
         lam, Q = mp.eigsy(inverse * self.K * inverse.T)
         shapes = self.M * (inverse.T * Q)  # M Φ, so that M h(M⁻¹K) = (MΦ) h(Λ) (MΦ)ᵀ
         w_r = 2 * mp.pi * mp.mpf(suspension.frequency_hz)
-        threshold = max(mp.mpf(RIGID_RATIO) ** 2 * max(lam), (w_r / 1000) ** 2)
+        count = int(natural_modes(system.K, system.M)[2].sum())
+        rigid = sorted(range(len(lam)), key=lambda i: lam[i])[:count]
         zeta = mp.mpf(system.damping_ratio or 0.0)
         for i in range(len(lam)):
             column = shapes[:, i]
-            if abs(lam[i]) <= threshold:
+            if i in rigid:
                 self.K += (w_r**2 - lam[i]) * column * column.T
                 self.D += 2 * mp.mpf(suspension.damping_ratio) * w_r * column * column.T
             else:
