@@ -83,11 +83,11 @@ def test_optimum_of_the_prototype(method: str) -> None:
     check_result(result, case.inner)
     cost = hardware_cost(plant_of(case), (55.0, 55.0))
     assert cost == 110.0
-    assert case.w1 * cost + case.w2 * result.bandwidth == pytest.approx(-439.465, abs=5e-4)
+    assert case.w1 * cost + case.w2 * result.bandwidth == pytest.approx(-438.756, abs=1e-3)
     assert result.active == ("S_max", "omega_S upper")
     best = result.optimum.figures
-    assert best.bandwidth / HZ == pytest.approx(72.0452, abs=5e-5)
-    assert best.omega_T / HZ == pytest.approx(26.07, abs=0.005)
+    assert best.bandwidth / HZ == pytest.approx(71.9319, abs=1e-4)
+    assert best.omega_T / HZ == pytest.approx(26.042, abs=0.005)
     assert best.sensitivity_peak == pytest.approx(1.75, abs=2e-8)
 
 
