@@ -5,7 +5,7 @@ better the search begins anew with it. Then a global check over the box, and on 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
@@ -78,9 +78,10 @@ def _looked(
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
     learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
     if learns and end.feasible:
-        missed = abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
-        if missed > formulation.tolerance:  # left out, it tells how they support the design
-            outcome = outer.with_training_sample(outcome, end)
+        foreseen = predicted_value(outcome, end.x, end.value)
+        if abs(foreseen / end.value - 1.0) > formulation.tolerance:
+            learnt = outer.with_training_sample(outcome, end)
+            outcome = replace(learnt, foreseen=foreseen)  # the error that is reported
     return outcome, end, look
 
 
