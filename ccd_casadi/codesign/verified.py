@@ -33,8 +33,8 @@ class Verified(ABC):
     `design` has the `controller`, whether it is `certified`, and its `bandwidth`, unless its kind
     reads these elsewhere. `value` is what J counts of the controller, in SI. `inner_gap`: by how
     much (relative) a search of the whole inner problem at θ beats it, NaN where none was found.
-    `second`: another engine on its loops. `feasible`: certified, within its bounds, and λ(θ) <= 0. `survival` and `damping`: off the model; None where the loop is not
-    stable.
+    `second`: another engine on its loops. `feasible`: certified, within its bounds, and λ(θ) <= 0.
+    `survival` and `damping`: off the model; None where the loop is not stable.
     `problem` has what a search has added to the case's: a plant set, controllers to start from.
     """
 
