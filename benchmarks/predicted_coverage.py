@@ -24,6 +24,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 from surrogates import design
+from surrogates.fitting import recalibrated
 
 ROOT = Path(__file__).parents[1]
 CASES = (  # case, whether its surrogate has gradients, samples
@@ -42,7 +43,7 @@ def misses(outer: Outer, gradients: bool, points: int, seed: int) -> tuple[list[
     problem, bounds = sampler.problem, box(sampler.problem)
     samples = sampler.values(design("sobol", *bounds, points, seed))
     able = [sample for sample in samples if sample.feasible]
-    process = fit_bandwidth(problem, able, seed, gradients=gradients)
+    process = recalibrated(fit_bandwidth(problem, able, seed, gradients=gradients), seed)
     fresh = [one for one in sampler.values(design("lhs", *bounds, FRESH, 99)) if one.feasible]
     mean, std = process.predict(np.array([one.theta for one in fresh]), return_std=True)
     sigma = np.maximum(std / process.band, 1e-7 * np.abs(mean))  # what the truth itself is good for

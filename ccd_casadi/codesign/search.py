@@ -18,6 +18,7 @@ from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.arrays import Array
+from surrogates.fitting import recalibrated
 
 AGAIN = 3  # times at most that a search begins with what the inner problem has found better
 
@@ -106,6 +107,8 @@ def conclude(search: SearchResult, terms: Terms) -> Solution:
         return Solution(infeasible_dict(terms, outcome.message, spent.by_purpose), outcome, None)
     with spent.on("checks"):
         verified = search.outer.verified(search.end, search.rounds)
+    surrogates = tuple(recalibrated(process, terms.seed) for process in outcome.surrogates)
+    outcome = replace(outcome, surrogates=surrogates)
     quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
     result = result_dict(terms, outcome, verified, spent.by_purpose, quality, search.look)
     return Solution(result, outcome, verified, quality)
