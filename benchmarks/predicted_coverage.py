@@ -1,6 +1,6 @@
 """How often the truth at fresh θ lies within 1, 2 and 3 sigma of what a run's surrogate predicts.
 
-Each case is sampled and fitted as `solve` does it, at θ of a Sobol set, with several seeds; then the
+Each case is sampled at θ of a Sobol set and fitted as `solve` does it, with several seeds; then the
 inner problem is solved at θ that neither has seen. Printed are the shares within 1, 2 and 3 of the
 deviations as they are promised (68.3, 95.4, 99.7 % of a normal distribution) and without their
 calibration. Writes predicted_coverage.json. About six minutes of processor time.
@@ -74,7 +74,8 @@ def main() -> None:
                          "band": band, "within": shares[0], "without_band": shares[1],
                          "misses": found})  # fmt: skip
             words = " ".join(f"{100.0 * share:5.1f}" for share in (*shares[0], *shares[1]))
-            print(f"{place:32s}{points:7d}{gradients!s:>11s}{seed:6d}{band:7.2f}  {words}", flush=True)
+            head = f"{place:32s}{points:7d}{gradients!s:>11s}{seed:6d}{band:7.2f}"
+            print(f"{head}  {words}", flush=True)
     for name in ("within", "without_band"):
         print(name, np.mean([row[name] for row in rows], axis=0).round(3).tolist())
     (ROOT / "benchmarks" / "predicted_coverage.json").write_text(json.dumps(rows, indent=1) + "\n")

@@ -83,6 +83,7 @@ def result_dict(
     }
     failed = [name for name, passed in checks.items() if passed is False]
     lost = [f"{name}: {line.words}" for name, line in verdict.items() if line.state is State.FAILED]
+    failed = failed or [name for name, line in verdict.items() if line.state is State.FAILED]
     why = f"failed: {', '.join(failed)} ({'; '.join(lost)})"
     words = "; ".join(part for part in (why, outcome.message) if part) if failed else ""
     result = {

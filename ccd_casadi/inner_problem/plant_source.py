@@ -18,8 +18,8 @@ from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import model_named
-from ccd_casadi.support.errors import PlantError, UserError, described
-from ccd_casadi.support.user_code import require_user_code, with_time_limit
+from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.user_code import MODULE, raised_words, require_user_code, with_time_limit
 
 Names = tuple[str, ...]
 Ends = tuple[float, ...]
@@ -149,7 +149,7 @@ class _PlantFile(SourceFileLoader):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__("user_plant_" + path.stem, str(path))
+        super().__init__(MODULE + path.stem, str(path))
         self._text = path.read_bytes()
 
     def get_data(self, path: str) -> bytes:
@@ -183,7 +183,7 @@ def _own_function(source: PlantSource) -> ModelFunction:
     except PlantError:
         raise
     except Exception as error:
-        raise UserError(f"{path}: cannot be loaded: {described(error)}") from error
+        raise UserError(f"{path}: cannot be loaded: {raised_words(error)}") from error
     if lost := unseen(files, before):
         words = f"loads {lost[0].name} by a way that its text does not show, so that a change of it"
         raise UserError(f"{path}: {words} would go unseen; write a plain import of it")

@@ -94,5 +94,5 @@ def test_an_import_that_no_text_shows_is_refused(folder: Path) -> None:
     words = "import importlib\nhelper = importlib.import_module('ap' + 'art')\n"
     (folder / "apart.py").write_text("")
     (folder / "plant.py").write_text(words + PLANT)
-    with pytest.raises(UserError, match="apart.py by a way that its text does not show"):
+    with pytest.raises(UserError, match=r"apart\.py by a way that its text does not show"):
         plant_from(source(folder), ("m",), (50.0,), (60.0,))
