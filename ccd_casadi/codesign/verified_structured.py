@@ -19,6 +19,7 @@ from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.design import TWICE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -230,5 +231,9 @@ class VerifiedStructured(Verified):
         if self.multistart.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.multistart.value)}"
         multistart = ", ".join(f"{value:.2f}" for value in found)
-        words = f"a multi-start search at this theta ended at {multistart} Hz{of}; {known}"
-        return words, {**figures, "local_optima_hz": found}
+        words = f"a multi-start search at this theta ended at {multistart} Hz{of}"
+        design = self.multistart.design
+        if design.found is not None and design.found < TWICE:
+            words += f", its best not found again from {counted(design.starts, 'start')}"
+        figures = {**figures, "local_optima_hz": found, "best_found": design.found}
+        return f"{words}; {known}", figures

@@ -348,8 +348,14 @@ def test_a_sign_a_delay_and_a_rate_that_are_wrong_are_told(
     assert words in " ".join(found)
 
 
-@pytest.mark.parametrize(("uses", "told"), [("", True), ("|{'hardware_cost': t['foo']}", False),
-                                            ("|{'constraints': {'c': t['foo'] - 2}}", False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("uses", "told"),
+    [
+        ("", True),
+        ("|{'hardware_cost': t['foo']}", False),
+        ("|{'constraints': {'c': t['foo'] - 2}}", False),
+    ],
+)
 def test_a_parameter_that_changes_nothing_is_told(tmp_path: Path, uses: str, told: bool) -> None:
     path = case_file(tmp_path, GOOD + uses)
     path.write_text(path.read_text() + "\n[theta.foo]\nlower = 1.0\nupper = 2.0\n")
