@@ -15,9 +15,8 @@ import numpy as np
 import slycot
 
 from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
-from ccd_casadi.lti.hold import Sampling, sampled, tustin
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.lti.hold import Sampling, in_w, sampled, tustin
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.errors import described
 from ccd_casadi.support.units import counted
 from ccd_casadi.synthesis.weights import Weights
@@ -128,12 +127,17 @@ def weighted_loop(loop: ClosedLoop, weights: Weights) -> StateSpace:
 
 
 def _norm(system: StateSpace) -> float:
-    """ab13dd of a stable system."""
-    n, m, p = len(system.A), system.B.shape[1], len(system.C)
-    parts: list[Array] = [system.A, np.eye(n), system.B, system.C, system.D]
+    """ab13dd of a stable system, over w where it is in discrete time.
+
+    Balanced beforehand: ab13dd's own scaling left norms of loops of case study 1 7 % off in z, and
+    none at all 45 % in w; balanced they agree to 1e-11.
+    """
+    over = in_w(system) if system.period else system
+    A, B, C = balanced(over.A, over.B, over.C)
+    size = len(A), B.shape[1], len(C)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of its own accuracy
-        found = slycot.ab13dd("D" if system.period else "C", "I", "S", "D", n, m, p, *parts,
+        found = slycot.ab13dd("C", "I", "S", "D", *size, A, np.eye(len(A)), B, C, over.D,
                               tol=ACCURACY)  # fmt: skip
     return float(found[0])
 
