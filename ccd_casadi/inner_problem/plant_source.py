@@ -169,7 +169,7 @@ def _own_function(source: PlantSource) -> ModelFunction:
         raise UserError(f"{path}: {words}; give the command again")
     for name in loaded_from(files[1:]):
         del sys.modules[name]  # it may be of an older text
-    before = list(sys.modules)
+    before, kept = list(sys.modules), sys.dont_write_bytecode
     spec = importlib.util.spec_from_loader(loader.name, loader)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
@@ -178,12 +178,15 @@ def _own_function(source: PlantSource) -> ModelFunction:
         "correct it, or give it longer with plant_seconds in a table [limits]"
     )
     try:
+        sys.dont_write_bytecode = True  # which is told apart by the second: an edit may be sooner
         with_time_limit(loader.exec_module, source.seconds, late)(module)
         function = with_time_limit(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:
         raise
     except Exception as error:
         raise UserError(f"{path}: cannot be loaded: {raised_words(error)}") from error
+    finally:
+        sys.dont_write_bytecode = kept
     if lost := unseen(files, before):
         words = f"loads {lost[0].name} by a way that its text does not show, so that a change of it"
         raise UserError(f"{path}: {words} would go unseen; write a plain import of it")

@@ -26,6 +26,7 @@ from ccd_casadi.fixed_structure import certificate
 from ccd_casadi.fixed_structure.bounds import LoopPeaks
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
@@ -140,11 +141,11 @@ def test_a_figure_of_the_judge_that_is_nan_fails_it(
     assert len(counted) == 5
     lost = replace(sound, **{name: NAN if name in NAMES else False})
     matter = name not in ("KS", "T")  # which no bound is of, but for their weighted ones
-    plant = SimpleNamespace(A=np.eye(1), B=np.eye(1), C=np.eye(1))
+    plant = StateSpace(*np.ones((4, 1, 1)))
     for place in range(3):
         each = [lost if i == place else sound for i in range(3)]
         monkeypatch.setattr(certificate, "judged", lambda *_, each=each: each)
-        found = certificate.certify([plant] * 3, plant, bounds)  # type: ignore[arg-type]
+        found = certificate.certify([plant] * 3, plant, bounds)
         assert found.passed is not matter
 
 
