@@ -95,7 +95,8 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     say(f"note: in SI, at the start: {size_words(facts[0])}", sys.stderr)
     for item in first_seen(findings):
         if item.severity is not Severity.NOTE:
-            subject = "" if item.topic is Topic.UNITS else "plant: "
+            of_case = item.topic in (Topic.UNITS, Topic.LOOP, Topic.UNUSED)
+            subject = "" if of_case else "plant: "
             say(f"{item.severity.value}: {subject}{item.words}", sys.stderr)
     for words in plant_of(problem).notes(problem.start):
         say(f"note: {words}", sys.stderr)

@@ -1,5 +1,6 @@
 """Surrogates of one output, or of several, from samples, by maximum marginal likelihood."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError
 
 from surrogates.covariance import Hyperparameters, Kernel
-from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
+from surrogates.gaussian_process import GaussianProcess, conditioned, loo_errors
 from surrogates.interface import Array, SurrogateFitError
 from surrogates.likelihood import LENGTH_BOUNDS, NOISE_BOUNDS, SIGNAL_BOUNDS, log_likelihood
 from surrogates.samples import Samples, checked
@@ -25,7 +26,9 @@ POLISH_ORDER = 600
 # Relative jitter during the search, so that no trial point is lost to rounding.
 SEARCH_JITTER = 1e-15
 SINGULAR = 1e10  # -log p where K is: a wall, flat, so that the line search backs off
-LEAST_TO_CALIBRATE = 20  # samples: of fewer a quantile of 95 % is the largest, and says little
+LEAST_TO_CALIBRATE = 5  # samples: fewer left out say nothing of how a function goes on
+REFITTED, FOLDS = 100, 8  # observations up to which samples are left out of fits; these parts
+NORMAL_SHARES = (0.6827, 0.9545, 0.9973)  # within 1, 2 and 3 deviations
 
 
 def fit(
@@ -199,16 +202,50 @@ def _parameters(natural: Array) -> Hyperparameters:
     return Hyperparameters(natural[:-3], signal, noise, gradient_noise)
 
 
-def calibrated(process: GaussianProcess) -> GaussianProcess:
+def calibrated(process: GaussianProcess, misses: Array | None = None) -> GaussianProcess:
     """Return the process with its deviation stretched until its samples fit in their bands.
 
-    band = max(1, q₉₅(|y_i - μ_{-i}| / σ_{-i}) / 1.96). Maximum likelihood takes the length
-    scales for certain, and a smooth kernel on a function that is less smooth is much too
-    sure of itself: unseen points of the lifted data were covered to 69 to 80 % in place of
-    95 %, and to 84 to 94 % with the factor. It never narrows, the samples being few.
+    Each of n samples is left out in turn: z_i = |y_i - μ_{-i}|/σ_{-i}, the `misses` where these are
+    known already. Of the sorted z the one of number ⌈(n + 1) p⌉ bounds a fresh one with probability
+    p (Vovk, Gammerman & Shafer 2005), so that
+
+        band = max(1, z_(⌈(n + 1) p_k⌉)/k,  k = 1, 2, 3),   p_k of k deviations of a normal one,
+
+    the largest z where n is too small for p_k. It never narrows, the samples being few.
     """
-    if len(process.X) < LEAST_TO_CALIBRATE:
+    n = len(process.X)
+    if n < LEAST_TO_CALIBRATE:
         return process
-    residuals, deviations = loo_errors(process)
-    quantile = float(np.quantile(np.abs(residuals) / deviations, 0.95))
-    return replace(process, band=max(1.0, quantile / TWO_SIDED_95))
+    if misses is None:
+        residuals, deviations = loo_errors(process)
+        misses = np.abs(residuals) / deviations
+    z = np.sort(misses)
+    places = [min(math.ceil((n + 1) * share), n) - 1 for share in NORMAL_SHARES]
+    ratios = [z[place] / k for k, place in enumerate(places, 1)]
+    return replace(process, band=max(1.0, *map(float, ratios)))
+
+
+def recalibrated(process: GaussianProcess, seed: int = 0) -> GaussianProcess:
+    """Return the process with the band of samples that are left out of fits, in `FOLDS` parts.
+
+    Hyperparameters that were found with a sample know it: kept, as `calibrated` alone keeps them,
+    they make few samples much surer of themselves than fresh points bear out. It takes as many
+    fits; the process as it is where it has so many observations that this matters little.
+    """
+    n = len(process.X)
+    if process.targets.size > REFITTED or n < LEAST_TO_CALIBRATE or process.sample_noise.size:
+        return process
+    width, scaled = process.upper - process.lower, process.targets.reshape(-1, n)
+    noise = process.output_scale * math.sqrt(process.hyperparameters.noise_variance)
+    X, Y = process.lower + width * process.X, process.output_mean + process.output_scale * scaled[0]
+    dY = process.output_scale * scaled[1:].T / width if len(scaled) > 1 else None
+    fold, misses = np.random.default_rng(seed).permutation(n) % FOLDS, np.empty(n)
+    for number in range(FOLDS):
+        out = fold == number
+        part = checked(X[~out], Y[~out], process.lower, process.upper,
+                       None if dY is None else dY[~out], noise)  # fmt: skip
+        hyperparameters = estimate(part, process.kernel, seed, 1)
+        other = conditioned(hyperparameters, part, process.kernel, np.empty(0))
+        mean, deviation = other.predict(X[out], return_std=True)
+        misses[out] = np.abs(Y[out] - mean) / deviation
+    return calibrated(process, misses)

@@ -43,7 +43,7 @@ class GaussianProcess:
         What the factorisation needed on its diagonal; closed-form leave-one-out errors.
     sample_noise, band : array, float
         Scaled variances (n,) of samples that differ in their noise, on top of the one in the
-        hyperparameters, else empty; factor on the deviation that `calibration.calibrated` found.
+        hyperparameters, else empty; factor on the deviation that `fitting.calibrated` found.
     """
 
     kernel: Kernel

@@ -27,7 +27,8 @@ NEAR = 0.05  # share of the box: samples this close to the point of interest are
 
 @dataclass(frozen=True)
 class Missed:
-    """A sample at or around the point of interest, left out: error in `unit`, and in deviations."""
+    """A sample at or around the point of interest, left out: error in `unit`, and in deviations
+    as the likelihood has them, not stretched by the band."""
 
     error: float
     sigmas: float
@@ -158,9 +159,11 @@ def quality_of(
     predicted = true - residuals
     away = np.abs(process.X - process.in_unit_box(x)).max(axis=1)
     around = tuple(
-        Missed(float(factor * residuals[i]), float(abs(standardised[i])), bool(away[i] <= SAME))
+        # By the deviations before they were stretched: a wide band excuses no error here.
+        Missed(float(factor * residuals[i]), float(abs(residuals[i] / deviations[i])),
+               bool(away[i] <= SAME))
         for i in np.flatnonzero(away <= NEAR)
-    )
+    )  # fmt: skip
     return Quality(
         name=name,
         unit=unit,

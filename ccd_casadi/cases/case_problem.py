@@ -19,10 +19,11 @@ from ccd_casadi.inner_problem.structured_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import model_named
-from ccd_casadi.support.errors import PlantError, UserError, described
+from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.user_code import raised_words
 
 
 def problem_of(case: Case) -> CoDesignProblem:
@@ -116,7 +117,7 @@ def problem_of(case: Case) -> CoDesignProblem:
     except Exception as error:
         if function is None:
             raise
-        words = f"{function} raised {described(error)}; correct it"
+        words = f"{function} raised {raised_words(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
 

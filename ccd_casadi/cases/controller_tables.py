@@ -78,7 +78,11 @@ class ControllerTable:
     least_damping: float = key(
         "sections: least damping ratio of zeros and poles", 0.0, check=checks.DAMPING
     )
-    starts: int = key("sections: number of starts of the search", 12, check=checks.count(1))
+    starts: int = key(
+        "sections: least number of starts; a search goes on until its best is found twice",
+        12,
+        check=checks.count(1),
+    )
     channel: tuple[tuple[str, ChannelTable], ...] = key(
         "tables [controller.channel.NAME] for plants with several outputs", (), check=checks.table
     )

@@ -16,11 +16,14 @@ from ccd_casadi.cases.findings import (
     Severity,
     Topic,
     entry_findings,
+    loop_findings,
     most_limiting,
     unit_findings,
     zero_findings,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.structured_plant_set import with_ranges
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.facts import PlantFacts, facts_of
 from ccd_casadi.plants.modal import (
     ModalPlant,
@@ -29,7 +32,15 @@ from ccd_casadi.plants.modal import (
     require_damping,
     without_hidden_rigid_modes,
 )
-from ccd_casadi.plants.plant import Plant, mechanics, named_values
+from ccd_casadi.plants.plant import (
+    Mechanics,
+    Plant,
+    constraint_values,
+    hardware_cost,
+    hardware_slopes,
+    mechanics,
+    named_values,
+)
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
@@ -61,9 +72,11 @@ def diagnose(
     """Facts and findings of the problem's plant over its box; `rigid_modes` are expected if given.
 
     Facts are of the points where the matrices are those of a plant, in the order of
-    `points_to_check`; asked again, they are not computed again. Raises PlantError where the
-    model's function fails.
+    `points_to_check`; asked again, they are not computed again. What varies is among θ there.
+    Raises PlantError where the model's function fails.
     """
+    if isinstance(problem.controller, StructuredProblem):
+        problem = with_ranges(problem)
     plant = plant_of(problem)
     facts: list[PlantFacts] = []
     findings = list(_outside(problem, plant))
@@ -90,6 +103,7 @@ def diagnose(
             here += [*_hidden(modal, place), *zero_findings(found, problem.inner.S_max, place)]
             if index == 0:
                 here += unit_findings(problem, found, scaled) + entry_findings(problem, system)
+                here += loop_findings(problem, found, modal) + _unused(problem, plant, system)
             findings += [replace(item, index=index) for item in here]
             facts.append(found)
         progress.advance()
@@ -103,6 +117,30 @@ def diagnose(
         )
         findings.append(Finding(Severity.WARNING, Topic.RIGID_MODES, words))
     return tuple(facts), tuple(findings)
+
+
+def _unused(problem: CoDesignProblem, plant: Plant, system: Mechanics) -> list[Finding]:
+    """Parameters that change no matrix, cost or constraint, from end to end of their bounds."""
+    of_cost = (np.moveaxis(of, -1, 0) for of in hardware_slopes(plant, problem.start))
+    slopes = [*system.derivatives, *of_cost]
+    found = []
+    for i, name in enumerate(problem.names):
+        if any(len(slope) and np.abs(slope[i]).max(initial=0.0) > 0.0 for slope in slopes):
+            continue
+        ends = [(*problem.start[:i], end, *problem.start[i + 1 :])
+                for end in (problem.lower[i], problem.upper[i])]  # fmt: skip
+        low, high = (
+            [*mechanics(plant, end, derivatives=False).matrices, constraint_values(plant, end)]
+            for end in ends
+        )
+        same = hardware_cost(plant, ends[0]) == hardware_cost(plant, ends[1])
+        if same and all(np.array_equal(a, b) for a, b in zip(low, high, strict=True)):
+            words = (
+                f"theta.{name} changes nothing: neither matrices nor hardware_cost nor a "
+                "constraint depend on it; use it in the plant function, or take it out of the case"
+            )
+            found.append(Finding(Severity.WARNING, Topic.UNUSED, words))
+    return found
 
 
 def first_seen(findings: Sequence[Finding]) -> list[Finding]:

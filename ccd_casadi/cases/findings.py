@@ -13,7 +13,9 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.facts import PlantFacts, Zero, bandwidth_limit_hz
+from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
@@ -22,6 +24,8 @@ LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency respon
 FAR = 3.0  # how far above the frequencies that [inner] searches effort may end
 TWICE = 2.0  # M_K suits 0.1 to 1.5 times the first resonance on the shipped cases
 SHOWS = 0.1  # of the largest gain: a mode that is driven and measured so much shows in the loop
+LEAST_DELAY = 1e-3  # of a period: a shorter one is none, or was written in seconds
+MOST_DELAY = 100.0  # periods: a longer one was not meant in seconds
 DECIBEL = 3.0  # from here on a peak of S is more likely one in dB
 # in SI, by how a person writes them
 MASS = {"t": 1e3, "kg": 1.0, "g": 1e-3, "mg": 1e-6}
@@ -48,6 +52,8 @@ class Topic(StrEnum):
     DOMAIN = "domain"
     UNITS = "units"
     DERIVATIVES = "derivatives"
+    LOOP = "loop"
+    UNUSED = "unused parameter"
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,44 @@ def unit_findings(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlan
         *peak_words(problem.inner.S_max),
     ]
     return [Finding(Severity.WARNING, Topic.UNITS, item) for item in words]
+
+
+def loop_findings(problem: CoDesignProblem, facts: PlantFacts, modal: ModalPlant) -> list[Finding]:
+    """Warnings about the sign of a plant with one input and output, and about the delay and the
+    rate of its loop."""
+    words = []
+    if len(modal.C) == 1 == modal.B.shape[1]:
+        gains = modal.C[0] * modal.B[:, 0]
+        rigid = modal.rigid  # else at rest
+        if (gains[rigid] if rigid.any() else gains / np.diag(modal.K)).sum() < 0.0:
+            words.append(
+                "a positive force moves the sensor to negative values, so that a controller of "
+                "positive gain is unstable: is the sign of output or input as it is wired? "
+                "If not, correct the row or the column"
+            )
+    if (run := problem.sampling) is not None:
+        words += _lag_words(run, facts.effort_hz)
+    return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
+
+
+def _lag_words(run: Sampling, meant: float) -> list[str]:
+    """Whether delay and rate are in other units, `meant` in Hz being what M_K suits."""
+    words, seconds, period = [], run.delay_us, run.period
+    if 0.0 < run.delay < LEAST_DELAY * period and seconds < MOST_DELAY * period:
+        words.append(
+            f"loop.delay_us = {run.delay_us:g} is {1e9 * run.delay:.3g} ns: were seconds meant? "
+            f"Then write {1e6 * seconds:g}"
+        )
+    lag = run.delay + 0.5 * period
+    limit = 1.0 / (HZ * lag)
+    if meant > TWICE * limit:
+        why = f"delay_us = {run.delay_us:g} and rate_hz = {run.rate_hz:g}"
+        hint = "rate_hz is in Hz" if run.delay < 0.5 * period else "delay_us is in microseconds"
+        words.append(
+            f"loop: {why} delay the force by {1e3 * lag:.3g} ms, which leaves no bandwidth above "
+            f"some {limit:.2g} Hz, and M_K suits {meant:.3g} Hz: {hint}"
+        )
+    return words
 
 
 def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]:

@@ -99,14 +99,14 @@ def _holds(item: Solution) -> bool:
     """Whether the design keeps its constraints on the whole set, whatever else is said of it."""
     checks = item.result.get("checks", {})
     return bool(checks) and all(
-        checks.get(name, True) for name in ("certificate", "constraints", "robust")
+        checks.get(name, True) for name in ("certificate", "constraints", "second_engine", "robust")
     )
 
 
 def order(item: Solution) -> tuple[int, int, float]:
     """Verified first, then what fails the fewest checks, then the least J."""
     result = item.result
-    failed = sum(not passed for passed in result.get("checks", {}).values())
+    failed = sum(passed is False for passed in result.get("checks", {}).values())
     status = ("verified", "not_verified", "infeasible").index(result["status"])
     return status, failed, result.get("objective", np.inf)
 

@@ -49,6 +49,7 @@ class FormulationResult:
 
     `surrogates` are the processes of ω_b* (nested) or of ω_b, ln‖S‖∞, ln|S(jω_low)| (lifted),
     none for direct; `agreed` tells whether prediction and truth met the tolerance at the end.
+    `foreseen`: what they predicted of the run's end before they learnt it, SI (None: they did not).
     """
 
     x: Array | None = None
@@ -57,6 +58,7 @@ class FormulationResult:
     outer: OuterSolution | None = None
     agreed: bool = False
     message: str = ""
+    foreseen: float | None = None
 
 
 # What a formulation may begin with in place of its own plan: samples at θ, or at (θ, ω_S, ω_T).
@@ -78,11 +80,13 @@ class Terms:
 class GlobalCheck:
     """What was looked at: true inner problems at `points` θ, `feasible` of these with a design.
 
+    `fresh`: those that were solved for it; the run had solved the rest on its way.
     `better`: how many of them beat the J that the formulation came `before` with; `starts` local
     solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
     """
 
     points: int
+    fresh: int
     feasible: int
     better: int
     starts: int

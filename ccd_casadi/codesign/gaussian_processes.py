@@ -13,6 +13,7 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from surrogates import GaussianProcess, Kernel, Quality, SurrogateFitError, condition, quality_of
+from surrogates.fitting import calibrated
 
 TAKEN = 1e-6  # relative: an error at a sample that is rounding
 BOUNDED = ("sensitivity_peak", "sensitivity_low", "compliance")  # whose logarithms are fitted
@@ -48,7 +49,7 @@ def interpolating(
         noise_variance=0.0, gradient_noise_variance=0.0,
     )  # fmt: skip
     ends = {"lower": process.lower, "upper": process.upper}
-    return condition(exact, X, Y, **ends, kernel=process.kernel, dY=dY)
+    return calibrated(condition(exact, X, Y, **ends, kernel=process.kernel, dY=dY))
 
 
 def with_sample(process: GaussianProcess, x: Array, value: float, slope: Array) -> GaussianProcess:

@@ -41,7 +41,7 @@ def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
     problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
     if not outer.global_check_is_cheap:
         points = min(points, FEW)
-    samples = _spread(outer, points, seed) if points else []
+    samples, fresh = _spread(outer, points, seed) if points else ([], 0)
     able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
     values = np.array([objective_of(problem, sample) for sample in able])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
@@ -73,6 +73,7 @@ def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
         solve_from([sample for sample in found if objective_of(problem, sample) < least])
     return GlobalCheck(
         points=len(samples),
+        fresh=fresh,
         feasible=len(able),
         better=int((values < J - margin).sum()),
         starts=begun,
@@ -109,9 +110,9 @@ def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
     return found
 
 
-def _spread(outer: Outer, points: int, seed: int) -> list[InnerSample]:
+def _spread(outer: Outer, points: int, seed: int) -> tuple[list[InnerSample], int]:
     """The inner problems that the run has solved, and as many more as make up `points`; where these
-    are dear, those of a spread set that none is near."""
+    are dear, those of a spread set that none is near. Second, how many these are."""
     sampler, bounds = outer.sampler, box(outer.problem)
     known: list[InnerSample] = []
     for sample in sampler.solved.values():
@@ -128,7 +129,7 @@ def _spread(outer: Outer, points: int, seed: int) -> list[InnerSample]:
     more = [theta for theta in spread if not violated(outer.problem, theta)]
     if more:
         known = [*known, *sampler.values(np.array(more), "global check")]
-    return known
+    return known, len(more)
 
 
 def _starts(

@@ -10,6 +10,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.design_entries import budget_entry, controller_dict, mixed_dict, move_entry
+from ccd_casadi.codesign.second_check import second_on_set, second_on_weighted
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
@@ -104,6 +105,7 @@ def mixed_answer(
         head["design_at"] = problem.robust.design_at
     plant, made = scaled_plant(problem, theta), final_design(problem, theta, point)
     feasible = problem.inner.feasible(made.figures)
+    second = second_on_weighted(problem, theta, made)
     answer = head | {
         **json_values(mixed_dict(problem, theta, made)),
         "active": list(active_constraints(problem.inner, made.figures)) if feasible else [],
@@ -117,8 +119,10 @@ def mixed_answer(
         **move_entry(problem, theta, made.controller),
         "syntheses": syntheses,
         "objective": objective(problem, theta, np.nan_to_num(made.figures.bandwidth)),
+        "second_engine": second.entry,
     }
-    status = "verified" if made.figures.certified else "not_verified"
+    good = made.figures.certified and second.agrees is not False
+    status = "verified" if good else "not_verified"
     return InnerAnswer(status, answer, controller_dict(made.controller), rows)
 
 
@@ -158,7 +162,8 @@ def structured_answer(
         worst = on_box.worst()[0]
     wide, checked, proof = on_box.judged(worst, workers)
     assert made.controller is not None
-    passed = wide.passed and not proof.refuted
+    second = second_on_set(asked, theta, made)
+    passed = wide.passed and not proof.refuted and second.agrees is not False
     figures = head | {
         **design_dict(asked, theta, made),
         "active": active_of(made),
@@ -166,6 +171,7 @@ def structured_answer(
         "objective": objective(problem, theta, value),
         "robust": robust_dict(wide, checked, worst),
         "proof": proof_dict(proof),
+        "second_engine": second.entry,
         "syntheses": 1,
         **budget_entry(asked, theta, made.controller),
         **move_entry(asked, theta, made.controller),

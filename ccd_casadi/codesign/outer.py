@@ -45,7 +45,8 @@ class Place:
 class End:
     """A polished design of the truth before it is judged.
 
-    `x` begins with θ. `gap`: by how much (relative) the whole inner problem at θ is better;
+    `x` begins with θ. `gap`: by how much (relative) the whole inner problem at θ is better, NaN
+    where its search found nothing or was not made;
     `objective` infinite where the design is not certified or breaks a bound.
     """
 

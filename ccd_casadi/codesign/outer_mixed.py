@@ -6,7 +6,6 @@ x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what th
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, other_damping, survived
+from ccd_casadi.codesign.second_check import second_on_weighted
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -30,7 +30,6 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.synthesis.synthesis import Design
 from surrogates import design
 
 POLISH_ROUNDS = 3
@@ -81,8 +80,8 @@ class MixedOuter(Outer):
             with sampler.spent.on("checks"):
                 inner = sampler.values(end.theta, "verifying")[0]
             bandwidth = end.design.figures.bandwidth
-            gap = inner.bandwidth / bandwidth - 1.0 if inner.feasible else 0.0
-            if gap <= INNER_GAP:
+            gap = inner.bandwidth / bandwidth - 1.0 if inner.feasible else np.nan
+            if not gap > INNER_GAP:
                 break
             x = inner.joint
         J = end.objective if end.acceptable else np.inf
@@ -117,8 +116,8 @@ class MixedOuter(Outer):
         here = TrueDesign(sampler.truth, x)
         theta = tuple(float(v) for v in self.theta_of(x))
         figures = here.design.figures
-        make = partial(final_design, problem, theta, (figures.omega_S, figures.omega_T))
-        final = sampler.cached("final", tuple(x), Design, make)
+        # Never from a store: it cannot know all that the design depends on.
+        final = final_design(problem, theta, (figures.omega_S, figures.omega_T))
         loops = loops_of(problem, theta, final.controller)
         found, robust = survived(problem, loops, final.figures)
         return VerifiedDesign(
@@ -136,6 +135,7 @@ class MixedOuter(Outer):
             robust=robust,
             damping=other_damping(problem, loops),
             survival=found,
+            second=second_on_weighted(problem, theta, final),
         )
 
     def point_of(self, run: FinishedRun) -> Array:

@@ -21,6 +21,7 @@ from ccd_casadi.codesign.outer import End, Place, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
+from ccd_casadi.codesign.second_check import second_on_set
 from ccd_casadi.codesign.stored_searches import (
     multistart_at,
     printer,
@@ -42,7 +43,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import Scenario
-from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
@@ -144,8 +145,8 @@ class StructuredOuter(ThetaOuter):
             problem, found = sampler.problem, value_with_design(sampler, best)
             worst, scenarios = _worst_plants(sampler, best, found.design)
             multistart = None if scenarios else multistart_at(sampler, best)
-            gap = 0.0 if multistart is None else _gap(problem, best, multistart)
-            if multistart is None or gap <= (WORTH if self.retries_pay else WORTH_ELEMENTS):
+            gap = np.nan if multistart is None else _gap(problem, best, multistart)
+            if multistart is None or not gap > (WORTH if self.retries_pay else WORTH_ELEMENTS):
                 break
             sampler.value_from(best.theta, multistart.design.kappa.tolist())
             theta = np.array(best.theta)
@@ -168,6 +169,7 @@ class StructuredOuter(ThetaOuter):
         end = cast(StructuredEnd, end)
         sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
+        design = recertified(problem, best.theta, design)  # what a store holds is not relied on
         on_box = DesignOnBox(problem, best.theta, design)
         multistart = multistart_at(sampler, best) if end.multistart is None else end.multistart
         assert design.controller is not None
@@ -193,6 +195,7 @@ class StructuredOuter(ThetaOuter):
             damping, told = other_damping(problem, loops), None
             if problem.figure is MOVE_TIME:
                 told = stated_time(problem, best.theta, design.controller, best.value)
+            second = second_on_set(problem, best.theta, design)
             wide, checked, proof, drawn = judgement()
             bar.advance()
         return VerifiedStructured(
@@ -202,7 +205,7 @@ class StructuredOuter(ThetaOuter):
             objective=end.objective,
             hardware_cost=hardware_cost(plant_of(problem), best.theta),
             kkt=kkt,
-            inner_gap=float(max(_gap(problem, best, multistart), 0.0)),
+            inner_gap=float(np.maximum(_gap(problem, best, multistart), 0.0)),
             feasible=design.certified and not violated(problem, best.theta),
             survival=survival,
             damping=damping,
@@ -218,6 +221,7 @@ class StructuredOuter(ThetaOuter):
             prices=prices,
             gap=gap,
             told=told,
+            second=second,
         )
 
     def responses(self, x: Array) -> PostOptimal:
@@ -250,7 +254,8 @@ def _excluded(problem: CoDesignProblem, theta: Sequence[float], least: float) ->
 
 
 def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValue) -> float:
-    return problem.figure.gain(multistart.value, best.value) if multistart.feasible else 0.0
+    """NaN where the search found no controller: nothing was set against the design."""
+    return problem.figure.gain(multistart.value, best.value) if multistart.feasible else np.nan
 
 
 def polish_structured(

@@ -52,7 +52,7 @@ class ThetaOuter(Outer, ABC):
             best = sampler.values(self.theta_of(x), "polishing")[0]
             best = pieces_from(sampler, best, SETTLED)
         kkt = theta_kkt(problem, best, sampler)
-        return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
+        return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, np.nan)
 
     def local_solve(
         self, sample: InnerSample, known: Sequence[Place], settled: float | None = None

@@ -12,6 +12,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
@@ -20,7 +22,14 @@ from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Term
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.codesign.verdict import State, VerdictLine, deployable, optimal, predicted
+from ccd_casadi.codesign.verdict import (
+    State,
+    VerdictLine,
+    confirmed,
+    deployable,
+    optimal,
+    predicted,
+)
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.sampling.spent import spent_entry
@@ -43,7 +52,10 @@ def result_dict(
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     problem, tolerance = verified.problem, terms.tolerance
-    promised = predicted_value(outcome, verified.point, verified.value)
+    promised = outcome.foreseen
+    learnt = promised is not None
+    if promised is None:
+        promised = predicted_value(outcome, verified.point, verified.value)
     error = abs(promised / verified.value - 1.0)
     optimality = partial(
         optimal, verified.kkt, level=verified.kkt_level, saddle=verified.saddle,
@@ -52,24 +64,26 @@ def result_dict(
     )  # fmt: skip
     judged = quality[0] if quality else None
     verdict = {  # in the order in which they matter
-        "certified": verified.certified_line(),
+        "certified": confirmed(verified.certified_line(), verified.second),
         "optimal": optimality(gap=verified.inner_gap),
-        "predicted": predicted(error, tolerance, verified.value, problem.figure, judged),
+        "predicted": predicted(error, tolerance, verified.value, problem.figure, judged, learnt),
         "survives": verified.survives_line(),
         "deployable": deployable(verified.survival, problem.sampling),
     }
     evidence = verified.evidence(promised)
     held = {k: v for k, v in problem.source.held.items() if k not in evidence.get("varies", {})}
-    checks = {
+    checks: dict[str, bool | None] = {  # None: it could not be made, or there is nothing to check
         "certificate": verified.certified,
         "constraints": verified.feasible,
-        "prediction": bool(error <= tolerance),
-        "inner_optimum": bool(verified.inner_gap <= tolerance),
+        "second_engine": verified.second.agrees,
+        "prediction": None if learnt or judged is None else bool(error <= tolerance),
+        "inner_optimum": None if np.isnan(verified.inner_gap) else verified.inner_gap <= tolerance,
         "optimality": optimality(gap=0.0).state is not State.FAILED,
         **verified.checks(),
     }
-    failed = [name for name, passed in checks.items() if not passed]
+    failed = [name for name, passed in checks.items() if passed is False]
     lost = [f"{name}: {line.words}" for name, line in verdict.items() if line.state is State.FAILED]
+    failed = failed or [name for name, line in verdict.items() if line.state is State.FAILED]
     why = f"failed: {', '.join(failed)} ({'; '.join(lost)})"
     words = "; ".join(part for part in (why, outcome.message) if part) if failed else ""
     result = {
@@ -92,6 +106,7 @@ def result_dict(
         # a vertex has no second-order figure, and says so
         "kkt": {**vars(verified.kkt), "vertex": verified.kkt.second_order == math.inf},
         "globality": outcome.outer or OuterSolution((), 0),
+        "second_engine": verified.second.entry,
         "box_look": {} if look is None else look.entry,
         "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": outcome.iterates,

@@ -5,7 +5,7 @@ better the search begins anew with it. Then a global check over the box, and on 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
@@ -18,6 +18,7 @@ from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.arrays import Array
+from surrogates.fitting import recalibrated
 
 AGAIN = 3  # times at most that a search begins with what the inner problem has found better
 
@@ -78,9 +79,10 @@ def _looked(
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
     learns = not isinstance(formulation, Direct) and formulation.max_refinements > 0
     if learns and end.feasible:
-        missed = abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
-        if missed > formulation.tolerance:  # left out, it tells how they support the design
-            outcome = outer.with_training_sample(outcome, end)
+        foreseen = predicted_value(outcome, end.x, end.value)
+        if abs(foreseen / end.value - 1.0) > formulation.tolerance:
+            learnt = outer.with_training_sample(outcome, end)
+            outcome = replace(learnt, foreseen=foreseen)  # the error that is reported
     return outcome, end, look
 
 
@@ -105,6 +107,8 @@ def conclude(search: SearchResult, terms: Terms) -> Solution:
         return Solution(infeasible_dict(terms, outcome.message, spent.by_purpose), outcome, None)
     with spent.on("checks"):
         verified = search.outer.verified(search.end, search.rounds)
+    surrogates = tuple(recalibrated(process, terms.seed) for process in outcome.surrogates)
+    outcome = replace(outcome, surrogates=surrogates)
     quality = surrogate_quality(outcome.surrogates, verified, quiet=sampler.quiet)
     result = result_dict(terms, outcome, verified, spent.by_purpose, quality, search.look)
     return Solution(result, outcome, verified, quality)

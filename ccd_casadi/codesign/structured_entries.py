@@ -81,6 +81,8 @@ def design_dict(
                 {"bandwidth_hz": item.bandwidth / HZ, "searches": item.count}
                 for item in design.local_optima
             ],
+            "starts": design.starts,
+            "best_found": design.found,
             "multipliers": design.multipliers,
             "at_range": [f"{name} {end}" for name, end, _ in design.at_box],
             "kkt_residual": design.kkt_residual,

@@ -48,7 +48,8 @@ class Survival:
     A range that ends at `REACH` or `FACTORS` was not followed further. Margins are the least of
     all loops broken one at a time at the plant's inputs: `gain` up and down as factors,
     `phase_deg`, `delay` in s, and `modulus` = 1/‖S‖∞. `unstable_poles_hz`: |p|/2π of the
-    controller's poles in the right half plane.
+    controller's poles in the right half plane. `contradiction`: what this engine finds on the model
+    itself that the certificate denies.
     """
 
     stable_shift: tuple[float, float]
@@ -60,6 +61,7 @@ class Survival:
     modulus: float
     unstable_poles_hz: tuple[float, ...]
     statics: Statics
+    contradiction: str = ""
 
     def within(self, low: float, high: float) -> bool:
         """Whether S_max holds for all resonance shifts from `low` to `high`."""
@@ -132,8 +134,11 @@ def survival(
 
     `slack`: what S_max may be passed by, relative; `marks`: shifts that are asked on both sides.
     """
-    nominal = loops.at(Perturbation())
-    excess = partial(excess_of, level=max(S_max, nominal.peak) * (1.0 + slack))
+    nominal, level = loops.at(Perturbation()), S_max * (1.0 + slack)
+    denied = "" if nominal.stable else "a second engine finds the loop unstable on the model itself"
+    if nominal.stable and not nominal.peak <= level:
+        denied = f"a second engine finds a peak of S of {nominal.peak:.6g} on the model itself"
+    excess = partial(excess_of, level=level)
     margins = least_margins(nominal.responses, nominal.grid())
     poles = np.linalg.eigvals(loops.controller.A)
     sizes = np.abs(poles)  # of an integrator rounding alone
@@ -149,11 +154,12 @@ def survival(
         modulus=1.0 / nominal.peak,
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
         statics=statics(nominal.plant, loops.controller, bandwidth=bandwidth, omega_low=omega_low),
+        contradiction=denied,
     )
 
 
 def reach(f: Function, step: Function, limit: float, marks: Sequence[float] = ()) -> float:
-    """The largest x in [0, `limit`] up to which f <= 0, which f(0) is taken to be.
+    """The largest x in [0, `limit`] up to which f <= 0; 0 where f(0) is not.
 
     `step` at x is how far the next place may lie; `marks` are places that are asked besides.
 
@@ -162,11 +168,13 @@ def reach(f: Function, step: Function, limit: float, marks: Sequence[float] = ()
     """
     ahead = sorted(mark for mark in {*marks, limit} if 0.0 < mark <= limit)
     before, x, fx, width = None, 0.0, f(0.0), FIRST
+    if not fx <= 0.0:
+        return 0.0
     while x < limit:
         width = min(GROWTH * width, step(x))
         place = min(x + width, next(mark for mark in ahead if mark > x))
         value = f(place)
-        if value > 0.0:
+        if not value <= 0.0:
             return _end(f, x, place)
         if before is not None:
             top = highest(f, (before[0], x, place), (before[1], fx, value))

@@ -5,7 +5,8 @@ optimality conditions hold and nothing better is known. predicted: what the surr
 survives: the loop stands a plant a little off its model. deployable: it can run on a computer.
 
 Every line is passed, warned, failed or unknown, in words and with the figures that it rests on.
-A design is verified when no line failed; a warning is for the reader to weigh.
+A design is verified when no line failed; a warning is for the reader to weigh. What could not be
+checked is unknown and never passed.
 """
 
 import math
@@ -20,12 +21,14 @@ from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import FigureOfMerit
 from ccd_casadi.optim.kkt import STEP, Kink, KktCertificate
 from ccd_casadi.support.units import counted, small_share, with_unit
+from ccd_casadi.synthesis.second_engine import Comparison
 from surrogates import Quality
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
 LEAST_FACTORS = (0.5, 2.0)  # of their damping, which is known no better
 CLOSER_PEAK = 0.10  # relative: peak of S above S_max on a closer model that is worth a warning
+PRIMAL = 1e-6  # of its size: what a constraint may be exceeded by at an optimum
 SIGMAS = 3.0  # left-out error at the design, in predicted deviations
 DELAY_PERIODS = 1.5  # one period of delay and half a period of hold
 
@@ -37,6 +40,15 @@ class State(StrEnum):
     WARNED = "warned"
     FAILED = "failed"
     UNKNOWN = "unknown"
+
+
+class OwnSet(StrEnum):
+    """What is known of the loop on the case's own set of plants: `set` of the line `survives`."""
+
+    KEPT = "kept"
+    BROKEN = "broken"
+    UNPROVEN = "unproven"  # kept on all plants that were tried; the proof left bounds open
+    NONE = "none"  # the case names no plant but the model
 
 
 @dataclass(frozen=True)
@@ -53,6 +65,16 @@ class VerdictLine:
         return {"state": self.state.value, "words": self.words, **self.figures}
 
 
+def confirmed(line: VerdictLine, second: Comparison) -> VerdictLine:
+    """`certified` with what a second engine says of the same loops."""
+    state, words = line.state, f"{line.words}; {second.words}"
+    if second.agrees is False:
+        state, words = State.FAILED, f"{line.words}, but {second.words}"
+    elif second.agrees is None and state is State.PASSED:
+        state, words = State.WARNED, f"{line.words}; not confirmed: {second.words}"
+    return VerdictLine(state, words, {**line.figures, "second_engine": second.entry})
+
+
 def optimal(
     kkt: KktCertificate,
     *,
@@ -67,12 +89,18 @@ def optimal(
     """KKT residual over θ up to `level`, and the whole inner problem at θ, `better` by `gap`.
 
     `searched`: where something better was looked for, in words and figures; `unknown`: why there
-    may be no gradient, in words.
+    may be no gradient, in words. A `gap` of NaN: nothing was found to set against the design.
     """
     residual, kink, (known, found) = kkt.stationarity, kkt.kink, searched
     figures = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap, **found}
-    if not gap <= tolerance:
+    if gap > tolerance:
         return VerdictLine(State.FAILED, f"not optimal: {better}; {known}", figures)
+    if not kkt.primal <= PRIMAL:
+        words = f"not optimal: a constraint or bound of theta is exceeded by {kkt.primal:.2g}"
+        return VerdictLine(State.FAILED, f"{words}; {known}", figures | {"primal": kkt.primal})
+    if not math.isfinite(gap):
+        known = f"the search at this theta that was to challenge it found nothing; {known}"
+    sound = State.PASSED if math.isfinite(gap) else State.WARNED
     if unknown and not math.isfinite(residual):
         return VerdictLine(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
     if not residual <= level:
@@ -84,7 +112,7 @@ def optimal(
             figures["least_curvature"] = kkt.second_order
             words = f"a stationary point that curves downwards ({kkt.second_order:.2g}): {words}"
             return VerdictLine(State.WARNED, words, figures)
-        return VerdictLine(State.PASSED, words, figures)
+        return VerdictLine(sound, words, figures)
     figures |= {"kkt_residual_one_gradient": kink.one_gradient, "slopes": kink.slopes}
     if kink.least_slope < -level:
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
@@ -97,7 +125,7 @@ def optimal(
         f"{_sides(kink)}; {known}"
     )
     known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)
-    return VerdictLine(State.PASSED if known_all else State.WARNED, words, figures)
+    return VerdictLine(sound if known_all else State.WARNED, words, figures)
 
 
 def _sides(kink: Kink) -> str:
@@ -128,10 +156,12 @@ def search_evidence(
         known += f", {optima} distinct optima"
     if look is None or not look.points:
         return f"{known}, no global check over the box, {gap}", figures
-    counted_up = ("points", "feasible", "better", "starts", "seed")
+    counted_up = ("points", "fresh", "feasible", "better", "starts", "seed")
     figures |= {f"box_{name}": getattr(look, name) for name in counted_up}
     figures["objective_before"] = look.before
-    how = f"{look.points} spread theta"
+    how = f"{look.fresh} fresh spread theta"
+    if look.points > look.fresh:
+        how += f" and {look.points - look.fresh} that the run had solved"
     said = f"none better at {how}"
     if look.moved:
         said = f"moved by the global check at {how}: the formulation ended at J = {look.before:.6g}"
@@ -139,18 +169,20 @@ def search_evidence(
 
 
 def predicted(
-    error: float, tolerance: float, value: float, of: FigureOfMerit, quality: Quality | None
-) -> VerdictLine:
+    error: float, tolerance: float, value: float, of: FigureOfMerit, quality: Quality | None,
+    learnt: bool = False,
+) -> VerdictLine:  # fmt: skip
     """Surrogate against truth at the design, whose `value` of a figure `of` merit is in SI.
 
     Where the design is itself one of the samples the surrogate reproduces it and `error` (relative)
-    shows nothing: its `quality` (None: no surrogate) has the error there without it.
+    shows nothing: its `quality` (None: no surrogate) has the error there without it. `learnt`: the
+    surrogate had `error` there, and has the design among its samples since.
     """
     what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
     if quality is None:
         words = "nothing was predicted: the search used true values"
-        return VerdictLine(State.PASSED, words, figures)
+        return VerdictLine(State.UNKNOWN, f"not applicable: {words}", figures)
     left_out = quality.at_point
     if left_out is not None:
         size, sigmas = abs(left_out[0]), left_out[1]
@@ -160,6 +192,9 @@ def predicted(
         words = (
             f"prediction and truth differ by {100 * error:.2g} %, more than {100 * tolerance:g} %"
         )
+        if learnt and math.isfinite(error):
+            words += "; since then the surrogate has the design among its samples"
+            return VerdictLine(State.WARNED, words, figures | {"learnt": True})
         return VerdictLine(State.FAILED, words, figures)
     if left_out is None:
         words = f"{what} predicted, error {small_share(error)}"
@@ -181,55 +216,54 @@ def survives(
     survival: Survival | None,
     *,
     S_max: float,
-    robust: bool | None = None,
-    robust_words: str = "",
+    own: OwnSet | None = None,
+    own_words: str = "",
     other_damping: str = "",
     closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
 ) -> VerdictLine:
-    """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none;
-    `robust_words` are then a warning).
+    """A loop on plants off its model; `own`: what is known of it on the case's own set, and
+    `own_words` why (None: its kind asks for no set).
 
     `other_damping`: what that set does not keep, in words; `closer` models of the plant by name:
-    stable, and the peak of S; `figures`: more of them.
+    stable, and the peak of S; `figures`: more of them. A figure that is NaN meets no limit.
     """
+    figures = {**(figures or {}), **({} if own is None else {"set": own.value})}
     if survival is None:
-        if robust is False:
-            return VerdictLine(State.FAILED, robust_words, figures or {})
-        return VerdictLine(State.UNKNOWN, "the loop could not be perturbed", figures or {})
-    state, said = State.WARNED if robust is None and robust_words else State.PASSED, []
-    low, high = survival.stable_shift
+        if own is OwnSet.BROKEN:
+            return VerdictLine(State.FAILED, own_words, figures)
+        return VerdictLine(State.UNKNOWN, "the loop could not be perturbed", figures)
+    (low, high), damping = survival.stable_shift, survival.stable_damping
+    failed, warned = own is OwnSet.BROKEN, own in (OwnSet.UNPROVEN, OwnSet.NONE)
+    said = [words for words in (survival.contradiction, own_words, other_damping) if words]
     said.append(f"stable for resonances {_range(low, high)}")
-    if low > -LEAST_SHIFT or high < LEAST_SHIFT:
-        state = State.WARNED
+    if not (low <= -LEAST_SHIFT and high >= LEAST_SHIFT):
+        warned = True
         said[-1] += f", less than +-{100 * LEAST_SHIFT:g} %"
     said.append(f"within S_max {_range(*survival.S_max_shift)}")
-    damping = survival.stable_damping
-    if damping[0] > LEAST_FACTORS[0] or damping[1] < LEAST_FACTORS[1]:
-        state = State.WARNED
+    if not (damping[0] <= LEAST_FACTORS[0] and damping[1] >= LEAST_FACTORS[1]):
+        warned = True
         said.append(f"unstable where damping is not between {damping[0]:.3g} and {damping[1]:.3g}")
     if survival.unstable_poles_hz:
-        state = State.WARNED
+        warned = True
         at = ", ".join(f"{hz:.4g}" for hz in survival.unstable_poles_hz[:3])
         said.append(f"K itself is unstable (poles at {at} Hz)")
     for name, stable, peak in closer:
-        if stable and peak > (1.0 + CLOSER_PEAK) * S_max:
-            state = state if state is State.FAILED else State.WARNED
-            said.append(f"peak of S {peak:.3g} on {name}")
-        elif not stable:
-            state = State.FAILED
+        if not stable:
+            failed = True
             said.insert(0, f"unstable on {name}")
-    said[:0] = [words for words in (robust_words, other_damping) if words]
-    if robust is False:
-        state = State.FAILED
+        elif not peak <= (1.0 + CLOSER_PEAK) * S_max:
+            warned = True
+            said.append(f"peak of S {peak:.3g} on {name}")
+    failed = failed or bool(survival.contradiction)
+    state = State.FAILED if failed else State.WARNED if warned else State.PASSED
     rest = survival.statics
     if rest.differentiates:
         said.append(
             f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
             f"bandwidth, 1 N at rest moves the stage {with_unit(rest.compliance, 'm', 2)}"
         )
-    figures = {
-        **(figures or {}),
+    figures |= {
         "stable_shift": list(survival.stable_shift),
         "S_max_shift": list(survival.S_max_shift),
         "shift_followed_to": REACH,
@@ -243,7 +277,7 @@ def survives(
         "static_stiffness": rest.stiffness,
         "static_compliance": rest.compliance,
         "static_share": rest.share,
-        "robust_set": robust,
+        "robust_set": {OwnSet.KEPT: True, OwnSet.BROKEN: False}.get(own) if own else None,
         "closer_models": {name: {"stable": good, "peak": peak} for name, good, peak in closer},
     }
     return VerdictLine(state, "; ".join(said), figures)
@@ -254,14 +288,14 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
     figures: dict[str, float] = {}
     if survival is not None:
         figures = {"delay_margin": survival.delay, "phase_margin_deg": survival.phase_deg}
-    if sampling is not None:
+    if sampling is not None and survival is not None and not survival.contradiction:
         words = (
             f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "
             "and delay exact at the instants; run deploy for the code"
         )
         figures |= {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
         return VerdictLine(State.PASSED, words, figures)
-    if survival is None or not math.isfinite(survival.delay):
+    if survival is None or sampling is not None or not math.isfinite(survival.delay):
         return VerdictLine(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / survival.delay
     words = (

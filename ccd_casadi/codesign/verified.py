@@ -22,6 +22,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison
 from surrogates import Quality
 
 
@@ -31,9 +32,9 @@ class Verified(ABC):
 
     `design` has the `controller`, whether it is `certified`, and its `bandwidth`, unless its kind
     reads these elsewhere. `value` is what J counts of the controller, in SI. `inner_gap`: by how
-    much (relative) a search of the whole inner problem at θ beats it. `feasible`: certified, within
-    its bounds, and λ(θ) <= 0. `survival` and `damping`: off the model; None where the loop is not
-    stable.
+    much (relative) a search of the whole inner problem at θ beats it, NaN where none was found.
+    `second`: another engine on its loops. `feasible`: certified, within its bounds, and λ(θ) <= 0.
+    `survival` and `damping`: off the model; None where the loop is not stable.
     `problem` has what a search has added to the case's: a plant set, controllers to start from.
     """
 
@@ -48,6 +49,7 @@ class Verified(ABC):
     feasible: bool
     survival: Survival | None
     damping: OtherDamping | None
+    second: Comparison = NOT_COMPARED
 
     kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
     saddle: ClassVar[float] = SADDLE  # least curvature that is none downwards

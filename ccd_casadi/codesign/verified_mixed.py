@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from ccd_casadi.codesign.design_entries import mixed_dict
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
-from ccd_casadi.codesign.verdict import State, VerdictLine
+from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -115,7 +115,8 @@ class VerifiedDesign(Verified):
         ]
         if self.robust is None:
             return {"closer": found}
-        return {"robust": self.robust.passed, "robust_words": self.robust.words, "closer": found}
+        own = OwnSet.KEPT if self.robust.passed else OwnSet.BROKEN
+        return {"own": own, "own_words": self.robust.words, "closer": found}
 
     def gap_words(self) -> str:
         return f"other weights at the same theta give {100 * self.inner_gap:.2g} % more bandwidth"

@@ -15,10 +15,11 @@ from ccd_casadi.codesign.structured_entries import (
     robust_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.verdict import State, VerdictLine
+from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.design import TWICE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -190,20 +191,21 @@ class VerifiedStructured(Verified):
         where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
         share, kept = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(self.worst)
         words = f"{kept} on {where}, the worst that a search found at {share}"
-        robust: bool | None = self.set_is_met
+        own = OwnSet.KEPT if self.set_is_met else OwnSet.BROKEN
         if not self.wide.passed:
             words = f"on {where}: {self.wide.words}"
         elif proof.refuted:
             words = f"{kept} on {where}, but {proof.words}"
         elif self.checked <= 1:
-            robust, words = None, "[robust] names no plant but the model"
+            own, words = OwnSet.NONE, "[robust] names no plant but the model"
         elif not self.all_drawn:
             words = f"{kept} on {where}, but of the whole box {drawn}"
-        elif robust:
+        elif self.set_is_met:
+            own = OwnSet.UNPROVEN if proof.unclosed else own
             words = "; ".join(part for part in (words, drawn, proof.words) if part)
         else:
             words = f"{kept} on {where}, but not all along its common resonance shift"
-        return {"robust": robust, "robust_words": words, "figures": figures}
+        return {"own": own, "own_words": words, "figures": figures}
 
     def gap_words(self) -> str:
         figure = self.problem.figure
@@ -229,5 +231,9 @@ class VerifiedStructured(Verified):
         if self.multistart.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.multistart.value)}"
         multistart = ", ".join(f"{value:.2f}" for value in found)
-        words = f"a multi-start search at this theta ended at {multistart} Hz{of}; {known}"
-        return words, {**figures, "local_optima_hz": found}
+        words = f"a multi-start search at this theta ended at {multistart} Hz{of}"
+        design = self.multistart.design
+        if design.found is not None and design.found < TWICE:
+            words += f", its best not found again from {counted(design.starts, 'start')}"
+        figures = {**figures, "local_optima_hz": found, "best_found": design.found}
+        return f"{words}; {known}", figures

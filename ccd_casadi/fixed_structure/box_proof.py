@@ -6,7 +6,7 @@ bound (`enclosure`). With the model's own loop stable, so are all of them. What 
 boxes does not close is still bounded: the proof then names the factor that is proven.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -59,6 +59,7 @@ class Proof:
     option: int = 0
     point: tuple[float, ...] = ()
     passed: tuple[str, float] = ("", np.nan)
+    channels: bool = False  # whether there are bounds of single channels, which no proof is of
 
     @property
     def proven(self) -> bool:
@@ -76,6 +77,11 @@ class Proof:
         return self.outcome is ProofOutcome.REFUTED
 
     @property
+    def unclosed(self) -> bool:
+        """Whether it was begun, and did not reach every bound within its slack."""
+        return self.outcome in (ProofOutcome.LOOSER, ProofOutcome.OPEN)
+
+    @property
     def stable(self) -> bool:
         """Whether stability is proven on the whole box."""
         return self.outcome in (ProofOutcome.PROVEN, ProofOutcome.LOOSER)
@@ -88,12 +94,19 @@ class Proof:
             return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"
         if not self.stable:
             return f"between these plants nothing is proven: {self.outcome.value}"
+        left = "; bounds of single channels are judged, not proven" if self.channels else ""
         worst = max(self.levels.values(), default=0.0)
+        if self.outcome is ProofOutcome.LOOSER:
+            over = [name for name, level in self.levels.items() if not level <= 1.0 + self.slack]
+            return (
+                f"not every bound is proven: the whole box is stable by {self.boxes} enclosures, "
+                f"but {', '.join(over)} only below {worst:.5g} of its bound{left}"
+            )
         of_S = max((v for k, v in self.levels.items() if k not in ("KS", "T", "GS")), default=0.0)
         own = f"|S| at most {of_S:.5g} and " if of_S < worst else ""
         return (
             f"proven for the whole box by {self.boxes} enclosures: stable, {own}every figure at "
-            f"most {worst:.5g} of its bound"
+            f"most {worst:.5g} of its bound{left}"
         )
 
 
@@ -144,7 +157,8 @@ def prove(
     share, enough = (most_boxes or MOST_BOXES) // len(models), None
     if many and most_boxes is None:
         share, enough = min(share, MOST_OF_MANY), ENOUGH_OF_MANY
-    return divide(families, uncertain.box, slack, share, workers, enough)
+    proof = divide(families, uncertain.box, slack, share, workers, enough)
+    return replace(proof, channels=any(own.given for own in bounds.channels))
 
 
 def divide(

@@ -121,7 +121,7 @@ def certify(
     for figures in found:
         shares = bounds.shares(figures) | bounds.channel_shares(figures.channels)
         for name, ratio in shares.items():
-            worst[name] = max(worst.get(name, 0.0), ratio)
+            worst[name] = float(np.maximum(worst.get(name, 0.0), ratio))  # NaN stays NaN
     broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]

@@ -51,6 +51,7 @@ def synthesise_sections(
     sampling: Sampling | None = None,
     M_K: float | None = None,
     starts: int = 12,
+    most_starts: int = 0,
     seed: int = 0,
     initial: Sequence[Array] = (),
     only_initial: bool = False,
@@ -78,6 +79,8 @@ def synthesise_sections(
         ω₀ = 10 ω_low/S_low.
     starts, seed : int
         Of the multi-start search: how many controllers by rules and at random, and which.
+    most_starts : int
+        Of one channel: up to so many in all, until the best was found from two of them.
     initial, only_initial : sequence of array, bool
         Parameters κ in SI of earlier designs, of several channels stacked, which start beside the
         others, or alone.
@@ -114,8 +117,8 @@ def synthesise_sections(
     """
     scaled = _scaled(plants, bounds, M_K)
     problem = problem_for(scaled, structure, bounds, sampling, frequencies)
-    search = DesignSearch(problem, scaled, sampling, starts, seed, initial, only_initial,
-                          progress or silent, workers)  # fmt: skip
+    search = DesignSearch(problem, scaled, sampling, starts, most_starts, seed, initial,
+                          only_initial, progress or silent, workers)  # fmt: skip
     if isinstance(problem, CompositeProblem):
         return _of_several(search, problem)
     return of_one_channel(search)

@@ -5,6 +5,7 @@ design; its bandwidth has gradients to the hardware by the envelope theorem.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -17,7 +18,7 @@ from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopProblem, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope, envelope_of, optimality
-from ccd_casadi.fixed_structure.race import SAME, distinct, run_race
+from ccd_casadi.fixed_structure.race import SAME, Runner, arrivals, distinct, run_race
 from ccd_casadi.fixed_structure.reinsertion import reinserted
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
@@ -36,6 +37,8 @@ LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search'
 CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 REDRAWS = 2  # searches at most from the best ends, one section of each elsewhere or drawn anew
 REDRAWN = 3  # ends
+TWICE = 2  # times that the best of a search was found, from starts apart
+LEAST_STARTS = 12  # of a search that may go on: two of four may come to one of the lesser optima
 AT_ONCE = 16  # controllers that a process looks at
 POOL = 12  # random starts tried for stability for each one that is kept
 
@@ -62,7 +65,7 @@ def problem_for(
 def of_one_channel(search: DesignSearch) -> SectionsDesign:
     """The best of searches from its initial controllers and, unless these are all, from others by
     rules and at random, then from the best ends with one section of each put elsewhere or drawn
-    anew."""
+    anew; in batches of starts, up to `most_starts`, until the best was found twice."""
     problem, starts, workers = cast(Problem, search.problem), search.starts, search.workers
     rng, names = np.random.default_rng(search.seed), problem.structure.names
     pool = stabilising(problem, np.reshape(search.inside(search.initial), (-1, len(names))))
@@ -72,13 +75,38 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
     if not len(pool):
         return search.failed()
     last, begun = search.only_initial, len(pool)
-    runners = run_race(problem, pool, search.tell, workers, known=known, last=last)
-    tried: list[Point] = []
-    for _ in range(0 if last else REDRAWS):
+    first = run_race(problem, pool, search.tell, workers, known=known, last=last)
+    if last:
+        return search.concluded(first, begun)
+    runners = _reworked(search, problem, first, rng)
+    found, batch = arrivals(first, runners[0]) - max(known - 1, 0), 0  # known ones may be alike
+    least = min(LEAST_STARTS, search.most_starts)
+    while begun < least or (found < TWICE and begun + starts <= search.most_starts):
+        batch += 1
+        rng = np.random.default_rng((search.seed, batch))
+        pool = _pool(problem, starts, rng, workers)
+        begun += len(pool)
+        before, best = arrivals(runners, runners[0]), runners[0]
+        field = run_race(problem, pool, search.tell, workers, runners, last=False)
+        if field[0].merit > best.merit + SAME:
+            runners = _reworked(search, problem, field, rng)
+            found = arrivals(field, runners[0])
+        else:
+            runners, found = field, found + max(arrivals(field, field[0]) - before, 0)
+    return replace(search.concluded(runners, begun), found=found)
+
+
+def _reworked(
+    search: DesignSearch, problem: Problem, runners: list[Runner], rng: np.random.Generator
+) -> list[Runner]:
+    """Searches from the best ends with one section of each put elsewhere or drawn anew, as often as
+    that helps, beside those of before."""
+    workers, tried = search.workers, list[Point]()
+    for _ in range(REDRAWS):
         best, ends = runners[0].merit, distinct(runners, REDRAWN)
         fresh = [end for end in ends if not any(end is other for other in tried)]
         tried += fresh
-        count = max(starts // 2, 1)
+        count = max(search.starts // 2, 1)
         moved = stabilising(problem, reinserted(problem, fresh))[:count]
         more, like = count - len(moved), [end.kappa for end in ends]
         drawn = stabilising(problem, redrawn(problem, like, POOL // 2 * more, rng))
@@ -86,7 +114,7 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
         runners = run_race(problem, pool, search.tell, workers, runners, known=len(moved))
         if runners[0].merit < best + SAME:
             break
-    return search.concluded(runners, begun)
+    return runners
 
 
 def _pool(problem: Problem, starts: int, rng: np.random.Generator, workers: Pool | None) -> Array:

@@ -132,8 +132,9 @@ def _worst(each: Sequence[MeasuredFigures]) -> MeasuredFigures:
     if not stable:
         return MeasuredFigures(False, sure, unstable, words)
     names = [*(field.name for field in fields(LoopPeaks)), "S_between"]
-    worst = {name: max(getattr(one, name) for one in each) for name in names}
-    worst["bandwidth"] = min(one.bandwidth for one in each)
+    # NumPy keeps a NaN, whatever the order: an unknown figure is not the smaller one.
+    worst = {name: float(np.max([getattr(one, name) for one in each])) for name in names}
+    worst["bandwidth"] = float(np.min([one.bandwidth for one in each]))
     worst["S_peak_frequency"] = max(each, key=lambda one: one.S_peak).S_peak_frequency
     return MeasuredFigures(True, sure, unstable, words, **worst)
 

@@ -140,6 +140,15 @@ def at_its_bandwidth(
     return point
 
 
+def arrivals(runners: Sequence[Runner], best: Runner) -> int:
+    """How many searches came to the bandwidth of the best one, within its bounds."""
+    return sum(
+        runner.count for runner in runners
+        if abs(runner.point.tau - best.point.tau) <= SAME
+        and runner.point.assessment.violation <= WITHIN
+    )  # fmt: skip
+
+
 def finished(runners: Sequence[Runner]) -> list[Runner]:
     """Those whose steps no longer help, and the best; the best first."""
     return [runner for i, runner in enumerate(runners) if runner.done or i < LAST]

@@ -59,6 +59,8 @@ class SectionsDesign(NotebookHtml):
         Where no controller meets every bound: those that the nearest one misses, with the factor.
     local_optima, starts, evaluations, seed, seconds
         Of the search: where it ended, how often it started, loops, randomness, time.
+    found : int or None
+        How many of its own starts, apart from each other, led to its best; None: not counted.
     """
 
     outcome: SectionsOutcome
@@ -78,6 +80,7 @@ class SectionsDesign(NotebookHtml):
     evaluations: int
     seed: int
     seconds: float
+    found: int | None = None
 
     @property
     def certified(self) -> bool:
@@ -107,6 +110,7 @@ class DesignSearch:
     plants: Sequence[ScaledPlant]
     sampling: Sampling | None
     starts: int = 0
+    most_starts: int = 0
     seed: int = 0
     initial: Sequence[Array] = ()
     only_initial: bool = False

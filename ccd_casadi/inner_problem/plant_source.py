@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.util
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -11,13 +12,14 @@ from typing import Any
 
 from ccd_casadi.analysis.driven_plant import with_motion
 from ccd_casadi.analysis.motor import Motion
+from ccd_casadi.inner_problem.plant_files import digest_of, files_of, loaded_from, unseen
 from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import model_named
-from ccd_casadi.support.errors import PlantError, UserError, described
-from ccd_casadi.support.user_code import require_user_code, with_time_limit
+from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.user_code import MODULE, raised_words, require_user_code, with_time_limit
 
 Names = tuple[str, ...]
 Ends = tuple[float, ...]
@@ -36,7 +38,7 @@ class PlantSource:
     function: str | None
     options: tuple[tuple[str, object], ...]
     seconds: float = 60.0  # that a function may take; no part of what the plant is
-    content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
+    content: str | None = None  # SHA-256 of its files as the case was read; None: as they are now
     fixed: tuple[tuple[str, float, str], ...] = ()
     places: Places | None = None
     motion: Motion | None = None
@@ -47,14 +49,20 @@ class PlantSource:
         return {name: value for name, value, _ in self.fixed}
 
     def pinned(self) -> "PlantSource":
-        """The same, with the hash of its file's content: a process must not keep an older one."""
+        """The same, with the hash of its files' content: a process must not keep an older one."""
         if self.file is None or self.content is not None:
             return self
         try:
-            content = hashlib.sha256(Path(self.file).read_bytes()).hexdigest()
+            content = digest_of(self.files())
         except OSError as error:
             raise PlantError(f"{self.file}: cannot be read: {error.strerror}") from None
         return replace(self, content=content)
+
+    def files(self) -> tuple[Path, ...]:
+        """Its file, and those that this depends on (`plant_files`)."""
+        assert self.file is not None
+        words = [value for _, value in self.options if isinstance(value, str)]
+        return files_of(Path(self.file), words)
 
     def identity(self) -> dict[str, object]:
         """What determines the plant; a file counts by its content, not by where it lies."""
@@ -141,9 +149,8 @@ class _PlantFile(SourceFileLoader):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__("user_plant_" + path.stem, str(path))
+        super().__init__(MODULE + path.stem, str(path))
         self._text = path.read_bytes()
-        self.digest = hashlib.sha256(self._text).hexdigest()
 
     def get_data(self, path: str) -> bytes:
         return self._text
@@ -156,9 +163,13 @@ def _own_function(source: PlantSource) -> ModelFunction:
     assert source.file is not None
     assert source.function is not None
     path = Path(source.file)
-    loader = _PlantFile(path)
-    if loader.digest != source.content:
-        raise UserError(f"{path}: was changed since the case was read; give the command again")
+    loader, files = _PlantFile(path), source.files()
+    if digest_of(files) != source.content:
+        words = "it or a file that it depends on was changed since the case was read"
+        raise UserError(f"{path}: {words}; give the command again")
+    for name in loaded_from(files[1:]):
+        del sys.modules[name]  # it may be of an older text
+    before, kept = list(sys.modules), sys.dont_write_bytecode
     spec = importlib.util.spec_from_loader(loader.name, loader)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
@@ -167,12 +178,18 @@ def _own_function(source: PlantSource) -> ModelFunction:
         "correct it, or give it longer with plant_seconds in a table [limits]"
     )
     try:
+        sys.dont_write_bytecode = True  # which is told apart by the second: an edit may be sooner
         with_time_limit(loader.exec_module, source.seconds, late)(module)
         function = with_time_limit(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:
         raise
     except Exception as error:
-        raise UserError(f"{path}: cannot be loaded: {described(error)}") from error
+        raise UserError(f"{path}: cannot be loaded: {raised_words(error)}") from error
+    finally:
+        sys.dont_write_bytecode = kept
+    if lost := unseen(files, before):
+        words = f"loads {lost[0].name} by a way that its text does not show, so that a change of it"
+        raise UserError(f"{path}: {words} would go unseen; write a plain import of it")
     if not callable(function):
         raise UserError(f"{path}: defines no function {source.function}; check plant.function")
     return with_time_limit(function, source.seconds, late)

@@ -71,14 +71,17 @@ class ProblemAt:
         self,
         initial: Sequence[Array],
         starts: int | None = None,
+        most_starts: int = 0,
         tell: Tell = silent,
         workers: Pool | None = None,
     ) -> SectionsDesign:
-        """The largest bandwidth, from controllers κ in SI and `starts` others beside them."""
+        """The largest bandwidth, from controllers κ in SI and `starts` others beside them, or up to
+        `most_starts` until its best was found twice."""
         problem, structured = self.problem, structured_of(self.problem)
         return synthesise_sections(
             self.plants, structure_of(problem), bounds_of(problem), sampling=structured.sampling,
-            starts=starts or 0, seed=structured.seed, initial=initial, only_initial=starts is None,
+            starts=starts or 0, most_starts=most_starts, seed=structured.seed, initial=initial,
+            only_initial=starts is None,
             frequencies=structured.frequencies, progress=tell, workers=workers,
         )  # fmt: skip
 

@@ -123,7 +123,7 @@ def uncertain_plant(
     """
     u, held = structured_of(problem).uncertainty, problem.source.held
     options = _options(problem)
-    wider = [plant_of(_with_ranges(option)) for option in options]
+    wider = [plant_of(with_ranges(option)) for option in options]
 
     def along(option: int, values: Array) -> Mechanics:
         return mechanics(wider[option], (*theta, *values.tolist()))
@@ -142,17 +142,20 @@ def uncertain_plant(
     )  # fmt: skip
 
 
-def _with_ranges(problem: CoDesignProblem) -> CoDesignProblem:
+def with_ranges(problem: CoDesignProblem) -> CoDesignProblem:
     """The problem with what varies as the last of its parameters."""
     ranges = structured_of(problem).uncertainty.ranges
     if not ranges:
         return problem
     names, lower, upper = zip(*ranges, strict=True)
     source = problem.source
+    own = {name: (value, unit) for name, value, unit in source.fixed}
     return replace(
         problem,
         source=replace(source, fixed=tuple(f for f in source.fixed if f[0] not in names)),
         names=(*problem.names, *names),
+        units=(*problem.units, *(own[name][1] for name in names)),
+        start=(*problem.start, *(own[name][0] for name in names)),
         lower=(*problem.lower, *lower),
         upper=(*problem.upper, *upper),
     )

@@ -16,14 +16,16 @@ from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import bandwidth_envelope
 from ccd_casadi.fixed_structure.loop_on_box import WITHIN, Excess, LoopOnBox
+from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import LATTICE, lattice, worst_plants
 from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import latest_plant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt
+from ccd_casadi.inner_problem.structured_bandwidth import LOST, ProblemAt
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
+    plants_of,
     structure_of,
     structured_of,
     uncertain_plant,
@@ -33,6 +35,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Tell, silent
+from ccd_casadi.support.units import HZ
 
 AT_ONCE = 8  # plants added in a round
 APART = 1e-4  # of the box: plants that are closer are the same plant
@@ -124,8 +127,10 @@ class DesignOnBox:
         least = self.design.bandwidth * (1.0 - LOOSE)
         kept = [
             one.stable and one.confirmed and one.bandwidth >= least
-            and max((bounds.shares(one) | bounds.channel_shares(one.channels)).values())
-            <= 1.0 + TOLERANCE
+            and all(
+                share <= 1.0 + TOLERANCE
+                for share in (bounds.shares(one) | bounds.channel_shares(one.channels)).values()
+            )
             for one in found
         ]  # fmt: skip
         return Yield(sum(kept), count)
@@ -202,6 +207,25 @@ def violations(
         if head.value > within and (not near or min(near) > APART) and len(found) < AT_ONCE:
             found.append((head.option, tuple(map(float, head.point))))
     return heads[0], tuple(found)
+
+
+def recertified(
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
+) -> SectionsDesign:
+    """The design judged anew on the problem's plants: what a store of designs holds of it may be
+    older than they are. No longer certified where that fails."""
+    if design.controller is None:
+        return design
+    judged = certify(
+        plants_of(problem, theta), design.controller, bounds_of(problem), problem.sampling,
+        integrator=structure_of(problem).integrator,
+    )  # fmt: skip
+    again = replace(design, certificate=judged)
+    if judged.passed and judged.bandwidth >= design.bandwidth * (1.0 - LOST):
+        return again
+    words = f"judged anew, {judged.bandwidth / HZ:.6g} Hz: {judged.words}"
+    outcome = SectionsOutcome.NOT_CERTIFIED if design.certified else design.outcome
+    return replace(again, outcome=outcome, words=words)
 
 
 def certify_corners(

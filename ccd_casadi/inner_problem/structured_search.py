@@ -30,6 +30,7 @@ from ccd_casadi.support.progress import Tell, silent
 
 MOST_WARM_STARTS = 3
 ENOUGH = 12  # starts before a search may say that it found no controller within the bounds
+MOST_STARTS = 36  # of a search that has found its best only once
 DISTINCT = 0.1  # relative: local optima further below the best are no warm starts
 ROUNDS, ROUNDS_OF_ERROR = 8, 4  # of a design on the set and a search for plants that are worse
 SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
@@ -44,15 +45,16 @@ def race(
 ) -> SectionsDesign:
     """A multi-start search at θ: the problem's starts, and its warm starts beside them or alone.
 
-    Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
+    The problem's starts are the least number: it goes on, up to `MOST_STARTS`, until its best was
+    found twice. Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
     """
     here, structured = ProblemAt(problem, theta), structured_of(problem)
     warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
     starts = None if only_warm_starts else structured.starts
-    made = here.searched(warm_starts, starts, tell, workers)
+    made = here.searched(warm_starts, starts, MOST_STARTS, tell, workers)
     if made.certified or starts is None or starts >= ENOUGH:
         return made
-    return here.searched(warm_starts, ENOUGH, tell, workers)
+    return here.searched(warm_starts, ENOUGH, MOST_STARTS, tell, workers)
 
 
 def with_range(problem: CoDesignProblem) -> CoDesignProblem:

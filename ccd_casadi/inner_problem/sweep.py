@@ -79,7 +79,7 @@ class InnerBounds:
     def excess(self, figures: object) -> float:
         """ln of the largest figure over its bound, of a row or a stored sample; 0 is feasible."""
         bounds = self.bounds.values()
-        return max(float(np.log(getattr(figures, name) / bound)) for name, bound in bounds)
+        return float(np.max([np.log(getattr(figures, name) / bound) for name, bound in bounds]))
 
     def feasible(self, figures: DesignFigures) -> bool:
         """Certified, inside the box and within every bound."""
@@ -184,6 +184,7 @@ def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[Po
         np.log(row.bandwidth) - 3.0 * _violation(problem, row) if row.certified else -np.inf
         for row in rows
     ])  # fmt: skip
+    merit = np.nan_to_num(merit, nan=-np.inf)  # an unknown figure is no merit
     around = np.pad(merit.reshape(problem.sweep_points), 1, constant_values=-np.inf)
     highest = sliding_window_view(around, (3, 3)).max(axis=(2, 3)).ravel()
     found = np.flatnonzero(np.isfinite(merit) & (merit >= highest))
@@ -192,7 +193,7 @@ def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[Po
 
 
 def _violation(problem: InnerBounds, row: DesignFigures) -> float:
-    return max(0.0, problem.excess(row))
+    return float(np.maximum(0.0, problem.excess(row)))
 
 
 class _Uncertified(Exception):

@@ -25,7 +25,8 @@ from ccd_casadi.plants.plant import (
 )
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
-from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.user_code import raised_words
 
 STEP = 1e-3  # share of the box: h⁴ is 1e-12, rounding is magnified a thousandfold
 REMEMBERED = 256  # values of the function kept: matrices and hardware cost ask for the same θ
@@ -60,19 +61,29 @@ def user_plant(
             raise  # it was traced, and is no plant
         try:
             numeric.values(middle)
-        except Exception:
-            raise error from None  # it takes no numbers either: what was wrong first is told
+        except Exception as of_numbers:  # it takes none either: what its own lines raised is told
+            own = isinstance(of_numbers, PlantError) or not isinstance(error, PlantError)
+            raise (of_numbers if own else error) from None
         return numeric.plant(f"{type(error).__name__}: {error}")
+    found = plant.evaluate(middle)
     try:
         expected = numeric.values(middle)
     except Exception:
-        return plant  # the symbols are all it takes
-    found = plant.evaluate(middle)
+        if all(np.isfinite(matrix).all() for matrix in found.matrices):
+            return plant  # the symbols are all it takes
+        raise  # `float` of a symbol is nan: what it raised of numbers is what is wrong
     for one, other in zip(found.matrices, expected.matrices, strict=True):
         size = np.abs(other).max(initial=0.0)
         if np.isfinite(size) and not np.abs(one - other).max(initial=0.0) <= AGREEMENT * size:
             return numeric.plant("its expressions differ from the numbers that it returns")
     return plant
+
+
+def _at_theta(error: UserError, names: Sequence[str], theta: Sequence[float]) -> UserError:
+    """The same in words that name θ."""
+    head, _, remedy = str(error).rpartition("; ")
+    place = f"at theta = {named_values(names, theta)}"
+    return type(error)(f"{head} {place}; {remedy}" if head else f"{remedy} {place}")
 
 
 class _Values:
@@ -110,7 +121,14 @@ class DifferencedModel:
 
         @lru_cache(maxsize=REMEMBERED)
         def read(theta: tuple[float, ...]) -> _Values:
-            return _Values(self.model(dict(zip(self.names, theta, strict=True)), **self.options))
+            try:
+                found = self.model(dict(zip(self.names, theta, strict=True)), **self.options)
+            except UserError as error:
+                raise _at_theta(error, self.names, theta) from None
+            except Exception as error:
+                words = f"the plant function raised {raised_words(error)}; correct it"
+                raise _at_theta(PlantError(words), self.names, theta) from error
+            return _Values(found)
 
         return read
 

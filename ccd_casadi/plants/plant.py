@@ -18,6 +18,7 @@ from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.user_code import raised_in_user_code
 
 ModelFunction = Callable[..., Mapping[str, Any]]
 Evaluate = Callable[[Sequence[float]], "Mechanics"]
@@ -151,6 +152,8 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     try:
         result = model({name: theta[i] for i, name in enumerate(names)}, **options)
     except TypeError as error:
+        if raised_in_user_code(error):
+            raise  # by a line of its own, not by how it is called
         words = f"the plant model does not take its options: {error}"
         raise PlantError(f"{words}; correct [plant] or a file of robust.plants") from error
     except KeyError as error:
@@ -177,6 +180,13 @@ def model_parts(
 ) -> tuple[tuple[Any, ...], float | None, dict[str, Any]]:
     """M, D, K, B, C as matrices of CasADi's `kind`, the damping ratio, and f and λ by name, of what
     a model returns. Raises PlantError where that is no plant."""
+    if not isinstance(result, Mapping):
+        words = "returned None" if result is None else f"returned a {type(result).__name__}"
+        raise PlantError(f"the plant function {words}; let it return a mapping, such as a dict")
+    constraints = result.get("constraints", {})
+    if not isinstance(constraints, Mapping):
+        words = f"constraints is a {type(constraints).__name__}; return a mapping of name to value"
+        raise PlantError(f'{words}, such as {{"too thin": 6.0 - t}}')
     missing = [key for key in _REQUIRED if key not in result]
     if missing:
         raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
@@ -185,7 +195,9 @@ def model_parts(
         raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
     if ("damping" in result) == ("damping_ratio" in result):
         raise PlantError("the plant model must return either damping or damping_ratio; give one")
-    M, K, B, C = (kind(result[key]) for key in ("mass", "stiffness", "input", "output"))
+    M, K, B, C = (
+        _converted(kind, key, result[key]) for key in ("mass", "stiffness", "input", "output")
+    )
     n = M.shape[0]
     for key, size in {"mass": n, "input": B.shape[1], "output": C.shape[0]}.items():
         if size > LARGEST[key]:
@@ -197,12 +209,19 @@ def model_parts(
     if ratio is not None and not 0.0 < float(ratio) < 1.0:
         words = "give a number between 0 and 1, both exclusive, such as 0.01"
         raise PlantError(f"damping_ratio is {ratio}; {words}")
-    given = {"hardware_cost": result["hardware_cost"], **result.get("constraints", {})}
-    scalars = {key: kind(value) for key, value in given.items()}
+    given = {"hardware_cost": result["hardware_cost"], **constraints}
+    scalars = {key: _converted(kind, key, value) for key, value in given.items()}
     for key, value in scalars.items():
         if value.shape != (1, 1):
             raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
     return (M, D, K, B, C), None if ratio is None else float(ratio), scalars
+
+
+def _converted(kind: Any, key: str, value: object) -> Any:
+    if value is None or isinstance(value, str | Mapping):
+        what = "None" if value is None else f"a {type(value).__name__}"
+        raise PlantError(f"{key} is {what}; return numbers")
+    return kind(value)
 
 
 def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from ccd_casadi.codesign.verdict import State
+from ccd_casadi.codesign.verdict import OwnSet, State
 from ccd_casadi.drawing.content import Head, VerdictLine
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.support.terminal import columns, wrapped
@@ -27,7 +27,6 @@ USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.m
 SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
 OVERSHOOT = 0.5  # of a step without feedforward
 BETWEEN = 1.1  # of the largest |S| on the lines of a response: what it may reach between them
-NO_SET = "[robust] names no plant"  # as verified_structured says it
 STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
 DECISION = re.compile(r'<p class="decision">(?:Do not b|B)uild this\b.*?</p>', re.DOTALL)
@@ -109,8 +108,14 @@ def advice(result: Mapping[str, Any]) -> str:
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
     if states.get("survives") == State.WARNED:
+        own = result["verdict"]["survives"].get("set")
+        if own == OwnSet.UNPROVEN:
+            return (
+                "Build this only if you accept: the bounds are not proven on the whole [robust] "
+                "set. Next: a smaller set, or fewer parameters in it."
+            )
         words = "Do not build this: it does not survive small errors of its model."
-        if str(result["verdict"]["survives"].get("words")).startswith(NO_SET):
+        if own == OwnSet.NONE:
             words = "Do not build this yet: it was judged on the model alone."
         return f"{words} Next: {NEXT['survives']}."
     warned = [f"{name} warned" for name, state in states.items() if state == State.WARNED]

@@ -5,7 +5,7 @@ A back end answers for the standard plant of H∞ control,
     ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 
 `riccati` is the package's own and serves stable plants in mixed sensitivity; `slicot` (SB10AD)
-serves any standard plant and is optional. `benchmarks/lmi.py` is a third one.
+serves any standard plant. `benchmarks/lmi.py` is a third one.
 
 SLICOT's SB10AD: two Riccati equations (Glover & Doyle 1988). It accepts a γ
 when its Riccati solver reports no error and the loop is stable; it tests neither X >= 0 nor the
@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import slycot
 
 from ccd_casadi.kernels.design import FREED
 from ccd_casadi.kernels.disturbance import four_block_plant
@@ -29,7 +30,6 @@ from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import MissingPackage, require
 from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, synthesise
@@ -107,11 +107,7 @@ Solver = Callable[..., Attempt]
 
 
 def solve_slicot(plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt:
-    """Bisection for γ_opt (job 1), then a controller at gamma_backoff·γ_opt (job 4).
-
-    Raises MissingPackage without slycot.
-    """
-    slycot = require("slycot", "slicot")
+    """Bisection for γ_opt (job 1), then a controller at gamma_backoff·γ_opt (job 4)."""
     whole = balance(plant).whole()
     p, m = plant.C2.shape[0], plant.B2.shape[1]
     size = (len(whole.A), whole.B.shape[1], whole.C.shape[0], m, p)
@@ -170,8 +166,7 @@ def synthesise_with(
 ) -> BackendResult:
     """One synthesis by "riccati" or one of `SOLVERS`, certified; ω_low in rad/s.
 
-    With a `runner` those run in its process and are killed after `limit` seconds. Of a missing
-    package the words are what to install.
+    With a `runner` those run in its process and are killed after `limit` seconds.
     """
     began = time.perf_counter()
     if backend == RICCATI:
@@ -183,7 +178,7 @@ def synthesise_with(
     slack = 1.0 + FREED if plant.family else 1.0
     try:
         attempt, seconds = _timed(*task) if runner is None else runner.call(limit, _timed, *task)
-    except (Overrun, MissingPackage) as error:
+    except Overrun as error:
         attempt, seconds = Attempt(np.nan, np.nan, None, str(error)), time.perf_counter() - began
     K = attempt.controller
     if K is None:
@@ -198,8 +193,7 @@ def synthesise_with(
 
 
 def _timed(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[Attempt, float]:
-    """The attempt and the seconds that it took, the import of slycot not counted."""
-    require("slycot", "slicot")
+    """The attempt and the seconds that it took."""
     began = time.perf_counter()
     attempt = solve(plant, gamma_backoff=gamma_backoff)
     return attempt, time.perf_counter() - began

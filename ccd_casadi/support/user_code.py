@@ -6,13 +6,15 @@ asks here first.
 
 import functools
 import inspect
+import os
 import signal
 import threading
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from ccd_casadi.support.errors import UserError, described
 
@@ -27,6 +29,46 @@ class UserCodeRefused(UserError):
 
 class _Late(BaseException):
     """Not an Exception, so that `except Exception` in a user's loop does not swallow it."""
+
+
+class _Ended(BaseException):
+    """The function would have ended this process."""
+
+
+MODULE = "user_plant_"  # how the module of a plant's file is named, before the file's own name
+_leave = os._exit
+
+
+def raised_in_user_code(error: BaseException) -> str:
+    """The line of a plant's file that an exception came from last, in words; empty: none."""
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if str(frame.f_globals.get("__name__")).startswith(MODULE):
+            place = f"line {line} of {os.path.basename(frame.f_code.co_filename)}"
+    return place
+
+
+def raised_words(error: BaseException) -> str:
+    """An exception of a user's function, and the line that it came from."""
+    place = raised_in_user_code(error)
+    return f"{described(error)} in {place}" if place else described(error)
+
+
+@contextmanager
+def exit_refused() -> Iterator[None]:
+    """Within the block os._exit raises, in this thread; the exit of a C library does not."""
+    caller, before = threading.current_thread(), os._exit
+
+    def refuse(status: int) -> NoReturn:
+        if threading.current_thread() is caller:
+            raise _Ended(f"os._exit({status})")
+        _leave(status)
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = before
 
 
 @contextmanager
@@ -81,20 +123,23 @@ def with_time_limit(
     """The function with a time limit on every call, and with no way out but a value or an error.
 
     Raises `late` after so many seconds, and UserError where the function would end the process
-    (SystemExit) or raises what cannot even be shown.
+    (SystemExit, os._exit) or raises what cannot even be shown.
     """
 
     @functools.wraps(function)
     def call(*arguments: Any, **options: Any) -> Any:
-        with time_limit(seconds, late):
+        with time_limit(seconds, late), exit_refused():
             try:
                 value = function(*arguments, **options)
             except (KeyboardInterrupt, _Late):
                 raise
             except BaseException as error:
-                words = described(error)
-                if isinstance(error, Exception) and words != type(error).__name__:
+                if isinstance(error, Exception) and described(error) != type(error).__name__:
                     raise
+                words = raised_words(error)
+                if isinstance(error, _Ended | SystemExit):
+                    words = f"would end the program ({words.removeprefix('_Ended: ')})"
+                    raise type(late)(f"the function {words}; correct it") from None
                 raise type(late)(f"the function raised {words}; correct it") from None
         if inspect.iscoroutine(value):
             value.close()  # else Python warns that nobody awaited it

@@ -317,3 +317,59 @@ def test_the_proven_limit_is_poissons_integral(damping: float) -> None:
 
     near = quad(weight, 0.0, limit, limit=500, points=[min(y, limit)])[0]
     assert (np.pi - near) * np.log(M) == pytest.approx(0.5 * np.log(2.0) * near, rel=1e-5)
+
+
+SECTIONS = '\n[controller]\nstructure = "sections"\nbiquads = 0\nweighted_level = 9.0\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "loop", "words"),
+    [
+        ("|{'output': ca.DM([[-1, 0]])}", "", "moves the sensor to negative values"),
+        ("|{'input': ca.DM([-1, 0])}", "", "moves the sensor to negative values"),
+        ("|{'output': ca.DM([[-1, 0]]), 'stiffness': 2e8 * chain + 1e8 * ca.DM.eye(2)}", "",
+         "moves the sensor to negative values"),
+        ("", "rate_hz = 10000.0\ndelay_us = 1e-4", "were seconds meant? Then write 100"),
+        ("", "rate_hz = 10000.0\ndelay_us = 20000.0", "delay_us is in microseconds"),
+        ("", "rate_hz = 10.0", "rate_hz is in Hz"),
+        ("|{'output': ca.DM([[-1, 0]]), 'input': ca.DM([-1, 0])}", "rate_hz = 10000.0", ""),
+        ("", "rate_hz = 4000.0\ndelay_us = 100.0", ""),
+    ],
+)  # fmt: skip
+def test_a_sign_a_delay_and_a_rate_that_are_wrong_are_told(
+    tmp_path: Path, more: str, loop: str, words: str
+) -> None:
+    path = case_file(tmp_path, GOOD + more)
+    table = f"\n[loop]\n{loop}\n" if loop else ""
+    path.write_text(path.read_text() + SECTIONS + table)
+    found = [item.words for item in diagnose(problem_of(load_case(path)))[1]
+             if item.topic is Topic.LOOP]  # fmt: skip
+    assert len(found) == bool(words)
+    assert words in " ".join(found)
+
+
+@pytest.mark.parametrize(
+    ("uses", "told"),
+    [
+        ("", True),
+        ("|{'hardware_cost': t['foo']}", False),
+        ("|{'constraints': {'c': t['foo'] - 2}}", False),
+    ],
+)
+def test_a_parameter_that_changes_nothing_is_told(tmp_path: Path, uses: str, told: bool) -> None:
+    path = case_file(tmp_path, GOOD + uses)
+    path.write_text(path.read_text() + "\n[theta.foo]\nlower = 1.0\nupper = 2.0\n")
+    found = [item.words for item in diagnose(problem_of(load_case(path)))[1]
+             if item.topic is Topic.UNUSED]  # fmt: skip
+    assert len(found) == told
+    assert not told or "theta.foo changes nothing" in found[0]
+
+
+def test_what_varies_is_looked_at_to_its_ends() -> None:
+    """Where it would be held at its start its resonances would be those of θ alone."""
+    problem = problem_of(load_case(ROOT / "examples/gantry_stroke/case.toml"))
+    facts = diagnose(problem)[0]
+    (name, low, high), *_ = problem.controller.uncertainty.ranges
+    varied = {point.theta[len(problem.names)] for point in facts}
+    assert {low, high} <= varied, name
+    assert facts[0].theta[: len(problem.names)] == problem.start

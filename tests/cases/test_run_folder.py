@@ -103,3 +103,23 @@ def test_a_run_folder_needs_no_other_file(tmp_path: Path) -> None:
     (tmp_path / "sent" / "plant.py").unlink()
     with pytest.raises(UserError, match=r"plant\.function: there is no"):
         load_case(there.path)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [({"gamma": 1e3}, "norm_bound: is 1000, and a synthesis reaches"), ({}, "S_max = 1.5 of")],
+)
+def test_what_a_file_claims_is_not_relied_on(
+    two_mass_run: Path, tmp_path: Path, changed: dict[str, float], words: str
+) -> None:
+    """A γ that no synthesis needs, and an S_max of the case that the loop does not keep."""
+    for name in ("case.toml", "result.json", "controller.json"):
+        (tmp_path / name).write_text((two_mass_run / name).read_text())
+    result = json.loads((tmp_path / "result.json").read_text()) | changed
+    (tmp_path / "result.json").write_text(json.dumps(result))
+    if not changed:
+        text = (tmp_path / "case.toml").read_text()
+        assert "S_max = 1.75" in text
+        (tmp_path / "case.toml").write_text(text.replace("S_max = 1.75", "S_max = 1.5"))
+    with pytest.raises(UserError, match=words):
+        read_run(tmp_path)

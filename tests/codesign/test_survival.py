@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
 from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, reach, survival
-from ccd_casadi.codesign.verdict import State, survives
+from ccd_casadi.codesign.verdict import OwnSet, State, survives
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.lti.closed_loop import closed_loop
@@ -233,7 +233,8 @@ def test_neither_the_set_nor_the_range_denies_the_other(
         assert "is kept" in check.words
     elif np.isfinite(check.peak):
         assert check.peak > S_max
-    line = survives(found, S_max=S_max, robust=check.passed, robust_words=check.words)
+    own = OwnSet.KEPT if check.passed else OwnSet.BROKEN
+    line = survives(found, S_max=S_max, own=own, own_words=check.words)
     assert (line.state is State.FAILED) == (not check.passed)
 
 

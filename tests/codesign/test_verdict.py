@@ -90,11 +90,11 @@ def test_a_better_inner_design_fails_the_line() -> None:
 
 
 def test_the_look_at_the_box_is_said() -> None:
-    look = GlobalCheck(32, 12, 3, 4, 0, -290.0, -350.0, np.zeros(4))
+    look = GlobalCheck(32, 20, 12, 3, 4, 0, -290.0, -350.0, np.zeros(4))
     words = optimal_line(1e-9, look=look).words
     assert "-290" in words
-    assert "32 spread theta" in words
-    assert "none better at 32" in optimal_line(1e-9, look=replace(look, x=None)).words
+    assert "20 fresh spread theta and 12 that the run had solved" in words
+    assert "none better at 20 fresh" in optimal_line(1e-9, look=replace(look, x=None)).words
 
 
 @given(low=st.floats(-REACH, 0.0), high=st.floats(0.0, REACH))
@@ -117,8 +117,8 @@ def test_an_unstable_controller_a_narrow_damping_and_a_high_closer_peak_are_warn
 
 
 def test_its_own_set_or_an_unstable_closer_model_fails() -> None:
-    assert v.survives(SOUND, S_max=2.0, robust=False).state is v.State.FAILED
-    assert v.survives(SOUND, S_max=2.0, robust=True).state is v.State.PASSED
+    assert v.survives(SOUND, S_max=2.0, own=v.OwnSet.BROKEN).state is v.State.FAILED
+    assert v.survives(SOUND, S_max=2.0, own=v.OwnSet.KEPT).state is v.State.PASSED
     lost = v.survives(SOUND, S_max=2.0, closer=[("20 modes", False, math.inf)])
     assert lost.state is v.State.FAILED
     assert "20 modes" in lost.words

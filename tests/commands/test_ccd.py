@@ -176,7 +176,7 @@ def test_the_page_of_all_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.slow
 def test_the_readme_leads_from_nothing_to_tested_c_code(tmp_path: Path) -> None:
     """Its commands as printed, in an empty folder, without the packages that are optional."""
-    for package in ("slycot", "cvxpy", "bokeh", "dask"):
+    for package in ("cvxpy", "bokeh", "dask"):
         (tmp_path / f"{package}.py").write_text(f"raise ImportError('no {package}')\n")
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     block = (ROOT / "README.md").read_text().partition("## Your own stage\n\n")[2]

@@ -74,7 +74,7 @@ def test_what_examples_and_studies_import_is_there() -> None:
 
 def test_an_extra_that_an_error_names_has_the_package() -> None:
     asked = {pair for path in SOURCES for pair in required(path)}
-    assert ("slycot", "slicot") in asked
+    assert ("bokeh", "explore") in asked
     assert [(name, extra) for name, extra in asked if distribution(name) not in EXTRAS[extra]] == []
 
 

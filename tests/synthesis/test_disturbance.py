@@ -142,7 +142,6 @@ def test_one_riccati_equation_stands_for_two_and_their_coupling(seed: int, p: in
 
 
 def test_gamma_opt_is_that_of_sb10ad() -> None:
-    pytest.importorskip("slycot")
     from ccd_casadi.studies.backends import solve_slicot
 
     compared = 0

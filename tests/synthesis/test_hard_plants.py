@@ -12,7 +12,6 @@ from ccd_casadi.studies.backends import solve_slicot
 from ccd_casadi.support.worker_process import Runner
 
 pytest.importorskip("cvxpy")
-pytest.importorskip("slycot")
 lmi = benchmark("lmi")
 LIMIT = 60.0  # seconds a back end: 5 where the machine is idle
 BACKOFF = 1.02
