@@ -14,7 +14,11 @@ from ccd_casadi.support.units import HZ
 
 BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25
+DERIVATIVES = {1: "a mobility (velocity over force); divide it by j 2π f",
+               2: "an accelerance (acceleration over force); divide it by -(2π f)²"}  # fmt: skip
+RISES = 0.35  # of slope, and rad: so far from those of a derivative
 FIRST = 1.5  # times the first line: up to there its slope says how many poles lie at 0
+LEAST_DAMPING = 5e-4  # of a resonance, where nothing else is known
 PEAK = 1.0  # ln: by so much a resonance stands out of |G|
 
 
@@ -25,7 +29,8 @@ class MeasuredResponse:
     `unstable_poles` of G. `poles_at_zero`: n of G ~ (jω)^-n below the first line; by default by the
     slope of the first lines. `modelled`: a model stands behind it, which decides what lines leave
     open. `spread` of repeated measurements, of the shape of G: each entry lies within it of the
-    plant's. `words`: how a file was understood. Raises UserError where that is no response.
+    plant's. `words`: how a file was understood. `least_damping`: no resonance has less, so that one
+    between two lines shows on them or is harmless. `undamped_hz`: poles of G on the axis. Raises UserError where that is no response.
     """
 
     hz: Array
@@ -35,6 +40,8 @@ class MeasuredResponse:
     modelled: bool = False
     spread: Array | None = None
     words: str = field(default="", compare=False)
+    least_damping: float = LEAST_DAMPING
+    undamped_hz: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         shape = self.G.shape
@@ -67,9 +74,23 @@ class MeasuredResponse:
         """n of G ~ (jω)^-n below the first line."""
         if self.poles_at_zero is not None:
             return self.poles_at_zero
+        return max(0, round(self._fall))
+
+    @cached_property
+    def _fall(self) -> float:
+        """-d ln|G|/d ln f of the first lines."""
         many = max(3, int(np.searchsorted(self.hz, FIRST * self.hz[0])))
         size = np.linalg.norm(self.matrix[:many], axis=(1, 2))
-        return max(0, round(-float(np.polyfit(np.log(self.hz[:many]), np.log(size), 1)[0])))
+        return -float(np.polyfit(np.log(self.hz[:many]), np.log(size), 1)[0])
+
+    @property
+    def derivative(self) -> str:
+        """Of which time derivative of the displacement its first lines are: their slope and angle
+        agree; empty where of none."""
+        order = round(-self._fall)
+        angle = float(np.angle((self.matrix[0] * (-1j) ** order).sum()))
+        rises = order in DERIVATIVES and abs(order + self._fall) < RISES and abs(angle) < RISES
+        return DERIVATIVES[order] if rises else ""
 
     @cached_property
     def static(self) -> np.ndarray:
