@@ -41,6 +41,9 @@ HIDDEN = 0.05  # of GK beside a resonance narrower than the lines, between which
 NOISE = 3.0  # standard deviations up to which a second difference may be noise
 STRIDES = (2, 4, 8)  # lines, over which it is then taken
 CUBIC_WINDOW = range(15)  # lines, over which the noise is estimated
+FITTED = 6  # lines that a parabola over a pole is fitted to
+NEAR_POLE = 1.0  # over the distance of two lines: a pole so near, and as narrow, is between them
+INSIDE = np.linspace(-0.4, 0.4, 5)  # places of a resonance between two lines
 BETWEEN = np.linspace(0.0, 1.0, 9)  # places on a chord
 
 
@@ -201,22 +204,54 @@ def hidden_damping(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> 
     """The largest damping ratio with which a resonance between neighbouring lines (k - 1,) may make
     I + L singular and yet not show on them.
 
-    It has to be H = σ_min(I + L)/σ_max(K) high at least. Over ln f lines h apart then differ by
-    4 H ζ/h or more beside what G does around, its slope removed. Nor is it hidden where lines are
-    closer than its width 2 ζ.
+    It has to be H = σ_min(I + L)/σ_max(K) high at least, and on the lines around it is then
+    q/(t - t₀) with q = H ζ/h, t counted in their distance h in ln f. G, its slope removed, leaves
+    room for a q beside what it does else, by the smaller of two estimates. Nor is a resonance hidden
+    where lines are closer than its width 2 ζ.
     """
-    h = np.diff(np.log(measured.hz))
-    flat = (measured.hz / measured.hz[0]) ** measured.slope
+    x = np.log(measured.hz)
+    h, flat = np.diff(x), (measured.hz / measured.hz[0]) ** measured.slope
     G = measured.matrix * flat[:, None, None]
     slope = np.diff(G, axis=0) / h[:, None, None]
-    around = 0.5 * (np.concatenate([slope[1:2], slope[:-1]]) + np.concatenate([slope[1:], slope[-2:-1]]))
-    jump = sigma_max(slope - around) * h
-    jump = np.lib.stride_tricks.sliding_window_view(np.pad(jump, 2, mode="edge"), 5).max(axis=1)
-    ends = np.linalg.norm(np.eye(L.shape[1]) + L, -2, axis=(1, 2))
-    middle = np.linalg.norm(np.eye(L.shape[1]) + 0.5 * (L[1:] + L[:-1]), -2, axis=(1, 2))
+    around = 0.5 * (np.concatenate([slope[1:2], slope[:-1]])
+                    + np.concatenate([slope[1:], slope[-2:-1]]))  # fmt: skip
+    jump = np.pad(sigma_max(slope - around) * h, 2, mode="edge")
+    room = np.lib.stride_tricks.sliding_window_view(jump, 5).max(axis=1) / 4.0
+    room = np.minimum(room, _room_beside_a_pole(x, G.reshape(len(x), -1)))
+    eye, middle = np.eye(L.shape[1]), 0.5 * (L[1:] + L[:-1])
+    ends, centre = (np.linalg.norm(eye + part, -2, axis=(1, 2)) for part in (L, middle))
     height = flat / sigma_max(k)
-    needed = np.minimum(middle, np.minimum(ends[1:], ends[:-1])) * np.minimum(height[1:], height[:-1])
-    return np.minimum(h * jump / (4.0 * needed), 0.5 * h)
+    height = np.minimum(height[1:], height[:-1])
+    needed = np.minimum(centre, np.minimum(ends[1:], ends[:-1])) * height
+    return np.minimum(h * room / needed, 0.5 * h)
+
+
+def _room_beside_a_pole(x: Array, G: np.ndarray) -> Array:
+    """The largest q between neighbouring lines (k - 1,) of x, if G (k, entries) is else a parabola
+    over one pole on the lines around: how well that fits them over how badly it fits 1/(t - t₀).
+    Infinite where that pole is itself a resonance narrower than the lines."""
+    if len(x) < FITTED:
+        return np.full(len(x) - 1, np.inf)
+    every = np.arange(len(x) - 1)
+    lines = np.clip(every - FITTED // 2 + 1, 0, len(x) - FITTED)[:, None] + np.arange(FITTED)
+    t = (x[lines] - 0.5 * (x[1:] + x[:-1])[:, None]) / np.diff(x)[:, None]
+    room = np.zeros(len(every))
+    for own in G.T:
+        g = own[lines]
+        basis = np.stack([t**0, t, t**2, -t * g], axis=-1)
+        Q, R = np.linalg.qr(basis)
+
+        def beside(v: np.ndarray, Q: np.ndarray = Q) -> np.ndarray:
+            return np.asarray(v - (Q @ (Q.conj().swapaxes(1, 2) @ v[..., None]))[..., 0])
+
+        pole = np.linalg.solve(R, Q.conj().swapaxes(1, 2) @ g[..., None])[:, 3]
+        left = np.linalg.norm(beside(g), axis=1)
+        tails = [np.linalg.norm(beside((1.0 + pole * t) / (t - at)), axis=1) for at in INSIDE]
+        room += (SAFETY * left / np.min(tails, axis=0)) ** 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = -1.0 / pole[:, 0]
+        room[(np.abs(at.real) < NEAR_POLE) & (np.abs(at.imag) < NEAR_POLE)] = np.inf
+    return np.sqrt(room)
 
 
 def _span(hz: Array, i: int) -> str:

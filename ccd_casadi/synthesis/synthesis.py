@@ -17,6 +17,7 @@ from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
@@ -128,6 +129,11 @@ def synthesise(
     Design
         A failure is an outcome of its `figures`, no exception.
 
+    Raises
+    ------
+    PlantError
+        The plant is not stable, and the weights have no disturbance.
+
     Examples
     --------
     >>> import ccd_casadi as ccd
@@ -139,6 +145,11 @@ def synthesise(
     """
     w0 = plant.omega_0
     on = plant.design_plant
+    poles = np.linalg.eigvals(on.A)
+    if not weights.delta and not poles.real.max(initial=-1.0) < 0.0:
+        worst = w0 * abs(poles[np.argmax(poles.real)])
+        words = f"is not stable: a pole at {worst:.4g} rad/s has no damping or less than none"
+        raise PlantError(f"the plant {words}; give weights a disturbance, or use ccd.tune")
     row, Ak, Bk, Ck = design(on.A, on.B, on.C, weights.scaled(w0), on.grid, on.gain, gamma_backoff,
                      omega_low / w0, guess, on.channels, weights.delta,
                      judged_on(plant))  # fmt: skip
