@@ -37,10 +37,11 @@ UNITS = {
 }  # fmt: skip
 WANTED = "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
 READ = "CSV, .npz and .mat are read"
-TURNS = 4.0 * np.pi  # degrees up to which radians would do as well, radians from which degrees would
+FEW_DEGREES = 30.0  # a phase that stays within them may as well be in radians
+TURNS = 4.0 * np.pi  # radians beyond which a phase may as well be in degrees
 DIGITS = "0123456789+-."
-WINDOW, PLACES, DELAYS = 0.35, 200, 60  # of the test by Bode's relation: ln f, places, delays tried
-MISFIT, BETTER = np.radians(25.0), 0.5  # a named reading that fits worse, and another half as badly
+PLACES, DELAYS = 200, 60  # of the test by Bode's relation: places over ln f, delays tried
+MISFIT, BETTER = np.radians(20.0), 0.85  # of a reading that is doubted, and of one that is as likely
 
 
 @dataclass(frozen=True)
@@ -341,38 +342,38 @@ def _of_size_and_angle(
     if factor > 0.0 and (size < 0.0).any():
         words = "is negative at a line; if it is in decibels name it magnitude_db"
         raise UserError(f"{path}: {sized.name}: {words}")
-    largest = np.abs(angle).max(initial=0.0)
-    degrees = to_rad != 1.0
-    if (0.0 < largest <= TURNS) if degrees else largest > TURNS:
-        words = f"is {largest:.4g} at most: {'radians' if degrees else 'degrees'} may be meant"
-        raise UserError(f"{path}: {turned.name}: {words}; give re and im, or the phase as "
-                        f"{'phase_rad' if degrees else 'phase_deg'}")  # fmt: skip
+    largest, degrees = np.abs(angle).max(initial=0.0), to_rad != 1.0
     decibels = 10.0 ** (np.clip(size, -6e3, 6e3) / 20.0)
     named = decibels if factor < 0.0 else size * factor
     own = _bode_misfit(hz, named, angle * to_rad)
-    other = np.pi / 180.0 if to_rad == 1.0 else 1.0
-    readings = {f"{turned.name}: {'radians' if degrees else 'degrees'} may be meant":
-                (named, angle * other)}  # fmt: skip
-    if factor > 0.0:
-        readings[f"{sized.name}: decibels may be meant"] = (decibels, angle * to_rad)
-    for words, (gain, phase) in readings.items():
-        if own > MISFIT and _bode_misfit(hz, gain, phase) < BETTER * own:
-            raise UserError(f"{path}: {words}, phase and slope then agree; give re and im")
+    turned_other = _bode_misfit(hz, named, angle * (1.0 if degrees else np.pi / 180.0))
+    clear = own < MISFIT and turned_other > own / BETTER
+    odd = 0.0 < largest <= FEW_DEGREES if degrees else largest > TURNS and not clear
+    if odd or (own > MISFIT and turned_other < BETTER * own):
+        words = f"is {largest:.4g} at most: {'radians' if degrees else 'degrees'} may be meant"
+        raise UserError(f"{path}: {turned.name}: {words}; give re and im, or name it "
+                        f"{'phase_rad' if degrees else 'phase_deg'}")  # fmt: skip
+    if factor > 0.0 and own > MISFIT:
+        if _bode_misfit(hz, decibels, angle * to_rad) < BETTER * own:
+            words = "decibels may be meant, with which phase and slope agree"
+            raise UserError(f"{path}: {sized.name}: {words}; name it magnitude_db, or give re and im")
     return np.asarray(named * np.exp(1j * angle * to_rad))
 
 
 def _bode_misfit(hz: Array, size: Array, angle: Array) -> float:
-    """Median of |φ - 90° d ln|G|/d ln f| over ln f, modulo 180°, after the delay that fits best."""
-    x = np.log(np.where(hz > 0.0, hz, np.nan))
-    good = np.isfinite(x) & (size > 0.0)
-    if good.sum() < 5 or not (np.diff(x[good]) > 0.0).all():
+    """Mean |φ - φ₀| (rad) over ln f, φ₀ the phase of the minimum-phase G with this |G| (Bode's weight
+    of its slope), for either sign of G and behind the delay that fits best."""
+    good = (hz > 0.0) & (size > 0.0)
+    x, y = np.log(hz[good]), np.log(size[good])
+    if len(x) < 5 or not (np.diff(x) > 0.0).all():
         return 0.0
-    x, y = x[good], np.log(size[good])
     places = np.linspace(x[0], x[-1], PLACES)
-    ends = [np.interp(np.clip(places + s * WINDOW, x[0], x[-1]), x, y) for s in (-1.0, 1.0)]
-    widths = np.clip(places + WINDOW, x[0], x[-1]) - np.clip(places - WINDOW, x[0], x[-1])
-    turns = np.interp(places, x, np.unwrap(angle[good]))
-    off = turns - 0.5 * np.pi * (ends[1] - ends[0]) / widths
-    lag = np.exp(places) / np.exp(places[-1])
-    delays = np.append(0.0, np.geomspace(0.1, 100.0, DELAYS))[:, None]
-    return float(np.median(np.abs(np.angle(np.exp(2j * (off + delays * lag)))), axis=1).min() / 2.0)
+    slope = np.pad(np.gradient(np.interp(places, x, y), places), PLACES, mode="edge")
+    v = (np.arange(-PLACES, PLACES + 1) + 0.5 / PLACES) * (places[1] - places[0])
+    weight = np.log(1.0 / np.tanh(0.5 * np.abs(v)))
+    smooth = np.convolve(slope, weight / weight.sum(), mode="same")[PLACES:-PLACES]
+    off = np.interp(places, x, np.unwrap(angle[good])) - 0.5 * np.pi * smooth
+    lag = np.append(0.0, np.geomspace(0.1, 100.0, DELAYS))[:, None] * np.exp(places - places[-1])
+    apart = np.abs(np.angle(np.exp(1j * (off + lag)))).mean(axis=1)
+    opposite = np.abs(np.angle(-np.exp(1j * (off + lag)))).mean(axis=1)
+    return float(np.minimum(apart, opposite).min())

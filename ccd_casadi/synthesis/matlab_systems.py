@@ -87,7 +87,7 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
         sizes = ", ".join(str(part.shape) for part in (A, B, C, D))
         raise UserError(f"{path}: {name}: the sizes of A, B, C, D do not fit: {sizes}")
     many = [f"{n} state{'s' * (n != 1)}, {m} input{'s' * (m != 1)}, {p} output{'s' * (p != 1)}"]
-    if reader.given("E"):
+    if np.size(fields.get("e", ())):
         E = reader.matrix("E")
         if E.shape != (n, n) or not np.linalg.cond(E) < SINGULAR:
             raise reader.fail("E", "is not regular: the system has algebraic equations; reduce it")
