@@ -39,6 +39,7 @@ from ccd_casadi.support.progress import Tell, silent, titled
 FEWER = 600  # lines that starts of single channels are designed on
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
 CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
+NEGATIVE = "K has a negative gain, by the sign of the plant's"
 NO_START = (
     "no start is stable by its winding: this structure may not stabilise the plant; of data state "
     "its unstable poles (--unstable-poles, unstable_poles) and those at zero (--poles-at-zero, "
@@ -143,7 +144,7 @@ def _sign(responses: Sequence[MeasuredResponse]) -> float:
 
 def _turned(design: MeasuredDesign) -> MeasuredDesign:
     """With the other sign of K."""
-    K, words = design.controller, f"K has a negative gain, as the plant has; {design.words}"
+    K, words = design.controller, f"{design.words}; {NEGATIVE}"
     if K is not None:
         K = replace(K, C=-K.C, D=-K.D)
     return replace(design, controller=K, words=words, sign=-1.0)

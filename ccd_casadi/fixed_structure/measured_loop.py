@@ -37,6 +37,7 @@ from ccd_casadi.support.units import HZ
 GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
 SAFETY = 2.0  # on the error of interpolation
 LARGE, SMALL = 2.0, 0.5  # gains of L at the first line at least, at the last at most
+RISEN = 0.6  # half turns of G's angle beside those of its unstable poles, from which they are doubted
 HIDDEN = 0.05  # of GK beside a resonance narrower than the lines, between which it may reach 1
 NOISE = 3.0  # standard deviations up to which a second difference may be noise
 STRIDES = (2, 4, 8)  # lines, over which it is then taken
@@ -332,6 +333,11 @@ def winding(
     doubts = []
     if len(set(measured.undamped_hz)) < len(measured.undamped_hz):
         doubts.append("G has two undamped modes at one frequency")
+    large = np.flatnonzero(np.linalg.norm(own, 2, axis=(1, 2)) > SMALL)
+    seen = 0.0 if measured.modelled or not len(large) else measured.excess(hz[large[-1]])
+    if seen > measured.unstable_poles + RISEN:
+        doubts.append(f"the angle of G rises by {180.0 * seen:.0f} deg more than that of a stable G of "
+                      "its size: state its unstable poles (--unstable-poles, unstable_poles)")  # fmt: skip
     if measured.gap > GAP:
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
     if q > 0 and np.linalg.norm(own[0], -2) < LARGE:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.plants.response_table import read_table
+from ccd_casadi.plants.response_table import PLACES, least_phase, read_table
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
@@ -119,6 +119,18 @@ class MeasuredResponse:
         """The angle (rad) between G at the first line and its asymptote there."""
         turned = self.matrix[0] * 1j**self.slope
         return float(np.arctan2(np.linalg.norm(turned.imag), np.linalg.norm(turned.real)))
+
+    def excess(self, to_hz: float) -> float:
+        """Half turns by which the angle of det G rises from the first line on, at most up to `to_hz`,
+        more than that of a stable G of this size: each unstable pole there adds one."""
+        used = self.hz <= to_hz
+        if used.sum() < 3 or self.matrix.shape[1] != self.matrix.shape[2]:
+            return 0.0
+        x, F = np.log(self.hz[used]), np.linalg.det(self.matrix[used])
+        places = np.linspace(x[0], x[-1], PLACES)
+        least = least_phase(np.interp(places, x, np.log(np.abs(F))), places)
+        risen = np.interp(places, x, np.unwrap(np.angle(F))) - least
+        return float((risen - risen[0]).max() / np.pi)
 
     @cached_property
     def followed(self) -> "MeasuredResponse":

@@ -360,19 +360,25 @@ def _of_size_and_angle(
     return np.asarray(named * np.exp(1j * angle * to_rad))
 
 
+def least_phase(y: Array, x: Array) -> Array:
+    """Phase (rad) of the stable minimum-phase G with ln|G| = y at even x = ln f: Bode's weight of the
+    slope, which is taken to go on beyond the ends."""
+    slope = np.pad(np.gradient(y, x), len(x), mode="edge")
+    v = (np.arange(-len(x), len(x) + 1) + 0.5 / len(x)) * (x[1] - x[0])
+    weight = np.log(1.0 / np.tanh(0.5 * np.abs(v)))
+    smooth = np.convolve(slope, weight / weight.sum(), mode="same")[len(x) : -len(x)]
+    return np.asarray(0.5 * np.pi * smooth)
+
+
 def _bode_misfit(hz: Array, size: Array, angle: Array) -> float:
-    """Mean |φ - φ₀| (rad) over ln f, φ₀ the phase of the minimum-phase G with this |G| (Bode's weight
-    of its slope), for either sign of G and behind the delay that fits best."""
+    """Mean |φ - φ₀| (rad) over ln f, φ₀ = `least_phase`, for either sign of G and behind the delay that
+    fits best."""
     good = (hz > 0.0) & (size > 0.0)
     x, y = np.log(hz[good]), np.log(size[good])
     if len(x) < 5 or not (np.diff(x) > 0.0).all():
         return 0.0
     places = np.linspace(x[0], x[-1], PLACES)
-    slope = np.pad(np.gradient(np.interp(places, x, y), places), PLACES, mode="edge")
-    v = (np.arange(-PLACES, PLACES + 1) + 0.5 / PLACES) * (places[1] - places[0])
-    weight = np.log(1.0 / np.tanh(0.5 * np.abs(v)))
-    smooth = np.convolve(slope, weight / weight.sum(), mode="same")[PLACES:-PLACES]
-    off = np.interp(places, x, np.unwrap(angle[good])) - 0.5 * np.pi * smooth
+    off = np.interp(places, x, np.unwrap(angle[good])) - least_phase(np.interp(places, x, y), places)
     lag = np.append(0.0, np.geomspace(0.1, 100.0, DELAYS))[:, None] * np.exp(places - places[-1])
     apart = np.abs(np.angle(np.exp(1j * (off + lag)))).mean(axis=1)
     opposite = np.abs(np.angle(-np.exp(1j * (off + lag)))).mean(axis=1)

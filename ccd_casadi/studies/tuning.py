@@ -14,7 +14,7 @@ import scipy
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
+from ccd_casadi.fixed_structure.measured_design import NEGATIVE, MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import bandwidth_within
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.closed_loop import closed_loop, sigma_max
@@ -234,6 +234,7 @@ def _on_models(
         figures = replace(figures, S_between=worst.norm, S_between_frequency=worst.peak)
     bandwidth = bandwidth if only else min(bandwidth, design.bandwidth)
     words = f"stable by the poles of the sampled loop, ‖S‖∞ = {worst.norm:.4g} by a Hamiltonian matrix"
+    words = words if design.sign > 0.0 else f"{words}; {NEGATIVE}"
     words = words if only else f"{words} on the models; on the lines {design.words}"
     return replace(design, bandwidth=bandwidth, figures=replace(figures, bandwidth=bandwidth),
                    words=words)  # fmt: skip
