@@ -27,8 +27,13 @@ from ccd_casadi.support.units import HZ
 
 MODEL = "measured"
 _TABLES = ("weights", "inner", "controller", "loop")
-_PLANT = {"model": text, "file": text, "unstable_poles": count(0), "poles_at_zero": count(0),
-          "least_damping": POSITIVE}
+_PLANT = {
+    "model": text,
+    "file": text,
+    "unstable_poles": count(0),
+    "poles_at_zero": count(0),
+    "least_damping": POSITIVE,
+}
 
 
 @dataclass(frozen=True)

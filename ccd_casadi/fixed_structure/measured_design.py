@@ -52,8 +52,8 @@ class MeasuredDesign:
     """A controller found on measured lines; SI, frequencies in rad/s.
 
     `figures` are the judge's; `usable` where it is stable, surely so, and within every bound on
-    every line. `words` say what is missing. `sign`: that of K, -1 where the plant of one channel has
-    a negative gain; κ is that of |K|.
+    every line. `words` say what is missing. `sign` of K: -1 where the plant of one channel has a
+    negative gain; κ is that of |K|.
     """
 
     structure: Structure | ChannelStructure
@@ -87,7 +87,7 @@ def design_on_data(
     A structure of one channel on responses of several is that of each channel of
     `static_decoupling`. With an `effort` also |KS| <= effort/|G|, the mean over the two octaves
     about ω_b, where G has its least singular value. Of the bandwidth the share `given_up` is given
-    in the end for integral gain. A search begins from `initial` (κ in SI) alone where that is stable.
+    in the end for integral gain. A search begins from `initial` (κ in SI) alone if that is stable.
     Raises UserError for responses of unlike shape or sign, derivatives of a displacement, or lines
     beyond half the sampling rate.
     """
@@ -102,7 +102,9 @@ def design_on_data(
         structure = ChannelStructure(decoupling, (structure,) * len(decoupling.names))
     for one in responses:
         if one.derivative:
-            raise UserError(f"the measured response is {one.derivative}; G is displacement over force")
+            raise UserError(
+                f"the measured response is {one.derivative}; G is displacement over force"
+            )
     sign = 1.0
     if shapes == {(1, 1)}:
         sign = _sign(responses)
@@ -137,8 +139,8 @@ def _sign(responses: Sequence[MeasuredResponse]) -> float:
     K G there times -1 for each unstable pole, and has to be positive."""
     signs = {float(np.sign(one.static[0, 0])) * (-1.0) ** one.unstable_poles for one in responses}
     if len(signs - {0.0}) > 1:
-        raise UserError("the plants have gains of both signs: no controller with an integrator holds "
-                        "them all; change the sign of some")  # fmt: skip
+        words = "the plants have gains of both signs, which no controller with an integrator holds"
+        raise UserError(f"{words}; change the sign of some")
     return -1.0 if -1.0 in signs else 1.0
 
 

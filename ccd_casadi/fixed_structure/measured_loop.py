@@ -37,7 +37,9 @@ from ccd_casadi.support.units import HZ
 GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
 SAFETY = 2.0  # on the error of interpolation
 LARGE, SMALL = 2.0, 0.5  # gains of L at the first line at least, at the last at most
-RISEN = 0.6  # half turns of G's angle beside those of its unstable poles, from which they are doubted
+RISEN = (
+    0.6  # half turns of G's angle beside those of its unstable poles, from which they are doubted
+)
 HIDDEN = 0.05  # of GK beside a resonance narrower than the lines, between which it may reach 1
 NOISE = 3.0  # standard deviations up to which a second difference may be noise
 STRIDES = (2, 4, 8)  # lines, over which it is then taken
@@ -54,8 +56,8 @@ class MeasuredFigures(LoopPeaks):
 
     `right_half_plane`: Z. `sure`: whether the
     assumptions that the data can show hold. `S_between` bounds |S| on and between the lines by r,
-    infinite where I + L may be singular on the curve, and `S_between_frequency` (rad/s) is where it is
-    largest; `bandwidth` is the largest that the shape allows on the lines.
+    infinite where I + L may be singular on the curve, and `S_between_frequency` (rad/s) is where it
+    is largest; `bandwidth` is the largest that the shape allows on the lines.
     """
 
     stable: bool
@@ -127,7 +129,9 @@ def judge(
         S_peak=float(size["S"].max()),
         S_peak_frequency=float(omega[np.argmax(size["S"])]),
         S_between=float(reach.max()),
-        S_between_frequency=float(np.sqrt(np.prod(omega[[worst := int(reach.argmax()), worst + 1]]))),
+        S_between_frequency=float(
+            np.sqrt(np.prod(omega[[worst := int(reach.argmax()), worst + 1]]))
+        ),
         S_low=float(sigma_max(sensitivity(L_low))[0]),
         bandwidth=bandwidth_within(omega, np.log(size["S"]), bounds, integrator),
         **most,
@@ -183,7 +187,7 @@ def _half_width(x: Array, stride: int) -> Array:
 
 
 def _noise(x: Array, L: np.ndarray) -> Array:
-    """Standard deviation of the noise of L at each line (k,): how far it lies from the cubic through
+    """Standard deviation of the noise of L at each line (k,): its distance from the cubic through
     the two lines on each side, the median of those around."""
     if len(x) < len(CUBIC_WINDOW):
         return np.zeros(len(x))
@@ -207,8 +211,8 @@ def hidden_damping(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> 
 
     It has to be H = σ_min(I + L)/σ_max(K) high at least, and on the lines around it is then
     q/(t - t₀) with q = H ζ/h, t counted in their distance h in ln f. G, its slope removed, leaves
-    room for a q beside what it does else, by the smaller of two estimates. Nor is a resonance hidden
-    where lines are closer than its width 2 ζ.
+    room for a q beside what it does else, by the smaller of two estimates. Where lines are closer
+    than its width 2 ζ a resonance is not hidden either.
     """
     x = np.log(measured.hz)
     h, flat = np.diff(x), (measured.hz / measured.hz[0]) ** measured.slope
@@ -259,19 +263,17 @@ def _span(hz: Array, i: int) -> str:
     return f"between {hz[i]:.4g} and {hz[i + 1]:.4g} Hz"
 
 
-def _hidden(
-    measured: MeasuredResponse, L: np.ndarray, k: np.ndarray, doubts: list[str]
-) -> str:
+def _hidden(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray, doubts: list[str]) -> str:
     """What of a resonance between two lines is assumed; a doubt where the lines do not show it."""
     hz, most, least = measured.hz, hidden_damping(measured, L, k), measured.least_damping
     open_ = np.flatnonzero(most > least)
     if len(open_):
         worst = int(most.argmax())
         doubts.append(
-            f"a resonance of damping up to {most[worst]:.2g} may hide {_span(hz, worst)} and make the "
-            f"loop unstable, and {len(open_)} pairs of lines from {hz[open_[0]]:.4g} to "
-            f"{hz[open_[-1] + 1]:.4g} Hz do not exclude one of {least:g}: measure more lines there, or "
-            "state the least damping of the plant (--least-damping, least_damping)"
+            f"a resonance of damping up to {most[worst]:.2g} may hide {_span(hz, worst)} and make "
+            f"the loop unstable, and {len(open_)} pairs of lines from {hz[open_[0]]:.4g} to "
+            f"{hz[open_[-1] + 1]:.4g} Hz do not exclude one of {least:g}: measure more lines there"
+            ", or state the least damping of the plant (--least-damping, least_damping)"
         )  # fmt: skip
     return f"no resonance of less damping than {least:g} hides between two lines"
 
@@ -336,8 +338,10 @@ def winding(
     large = np.flatnonzero(np.linalg.norm(own, 2, axis=(1, 2)) > SMALL)
     seen = 0.0 if measured.modelled or not len(large) else measured.excess(hz[large[-1]])
     if seen > measured.unstable_poles + RISEN:
-        doubts.append(f"the angle of G rises by {180.0 * seen:.0f} deg more than that of a stable G of "
-                      "its size: state its unstable poles (--unstable-poles, unstable_poles)")  # fmt: skip
+        doubts.append(
+            f"the angle of G rises by {180.0 * seen:.0f} deg more than that of a stable G of its "
+            "size: state its unstable poles (--unstable-poles, unstable_poles)"
+        )
     if measured.gap > GAP:
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
     if q > 0 and np.linalg.norm(own[0], -2) < LARGE:

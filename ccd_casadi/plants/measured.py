@@ -30,7 +30,8 @@ class MeasuredResponse:
     slope of the first lines. `modelled`: a model stands behind it, which decides what lines leave
     open. `spread` of repeated measurements, of the shape of G: each entry lies within it of the
     plant's. `words`: how a file was understood. `least_damping`: no resonance has less, so that one
-    between two lines shows on them or is harmless. `undamped_hz`: poles of G on the axis. Raises UserError where that is no response.
+    between two lines shows on them or is harmless. `undamped_hz`: poles of G on the axis.
+    Raises UserError where that is no response.
     """
 
     hz: Array
@@ -121,8 +122,8 @@ class MeasuredResponse:
         return float(np.arctan2(np.linalg.norm(turned.imag), np.linalg.norm(turned.real)))
 
     def excess(self, to_hz: float) -> float:
-        """Half turns by which the angle of det G rises from the first line on, at most up to `to_hz`,
-        more than that of a stable G of this size: each unstable pole there adds one."""
+        """Half turns by which the angle of det G rises from the first line on, up to `to_hz`, more
+        than that of a stable G of this size: each unstable pole there adds one."""
         used = self.hz <= to_hz
         if used.sum() < 3 or self.matrix.shape[1] != self.matrix.shape[2]:
             return 0.0

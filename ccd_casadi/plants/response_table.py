@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -30,18 +31,23 @@ COMPLIANCE = {"": 1.0, "m/n": 1.0, "mm/n": 1e-3, "um/n": 1e-6, "µm/n": 1e-6, "n
 UNITS = {
     "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ},
     "size": COMPLIANCE | {"db": -1.0},  # a size in decibels
-    "angle": {unit: np.pi / 180.0 for unit in ("deg", "degree", "degrees", "°")}
-    | {unit: 1.0 for unit in ("rad", "radian", "radians")},
+    "angle": dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180.0)
+    | dict.fromkeys(("rad", "radian", "radians"), 1.0),
     "re": COMPLIANCE, "im": COMPLIANCE, "G": COMPLIANCE, "spread": COMPLIANCE,
     "coherence": {"": 1.0},
 }  # fmt: skip
-WANTED = "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
+WANTED = (
+    "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
+)
 READ = "CSV, .npz and .mat are read"
 FEW_DEGREES = 30.0  # a phase that stays within them may as well be in radians
 TURNS = 4.0 * np.pi  # radians beyond which a phase may as well be in degrees
 DIGITS = "0123456789+-."
 PLACES, DELAYS = 200, 60  # of the test by Bode's relation: places over ln f, delays tried
-MISFIT, BETTER = np.radians(20.0), 0.85  # of a reading that is doubted, and of one that is as likely
+MISFIT, BETTER = (
+    np.radians(20.0),
+    0.85,
+)  # of a reading that is doubted, and of one that is as likely
 
 
 @dataclass(frozen=True)
@@ -56,11 +62,11 @@ class ResponseTable:
 
 def read_table(path: Path) -> ResponseTable:
     """The response in a .csv, .npz or .mat file. Raises UserError that names what is not clear."""
-    suffix = path.suffix.lower()
+    suffix, notes = path.suffix.lower(), list[str]()
     if suffix == ".npz":
-        columns, notes = _variables(path, _npz(path)), []
+        columns = _variables(path, _npz(path))
     elif suffix == ".mat":
-        columns, notes = _variables(path, mat_variables(path)), []
+        columns = _variables(path, mat_variables(path))
     else:
         columns, notes = _csv(path)
     return _understood(path, columns, notes)
@@ -89,7 +95,7 @@ class Column:
     rows: tuple[int, ...] = ()
 
 
-def _variables(path: Path, content: Mapping[str, object]) -> list[Column]:
+def _variables(path: Path, content: Mapping[str, Any]) -> list[Column]:
     """Those that hold numbers; texts are notes."""
     found = []
     for name, value in content.items():
@@ -123,8 +129,8 @@ def _csv(path: Path) -> tuple[list[Column], list[str]]:
     rows = [(i, _cells(line, mark)) for i, line in lines]
     comma, note = _decimal_comma(path, rows, mark)
     notes += note
-    first = next((k for k, (_, row) in enumerate(rows)
-                  if len(row) > 1 and all(_is_number(cell, comma) for cell in row)), None)  # fmt: skip
+    numeric = (len(row) > 1 and all(_is_number(cell, comma) for cell in row) for _, row in rows)
+    first = next((k for k, found in enumerate(numeric) if found), None)
     if first is None:
         bad = next((cell for cell in rows[-1][1] if not _is_number(cell, comma)), last.strip())
         words = f"is not a table of numbers with a header: {bad!r} in line {rows[-1][0]}"
@@ -134,7 +140,11 @@ def _csv(path: Path) -> tuple[list[Column], list[str]]:
     at = first - 1
     names = rows[at][1]
     units = {unit for known in UNITS.values() for unit in known} | {"-", "abs", "linear"}
-    if at and all(cell.casefold() in units for cell in names) and len(rows[at - 1][1]) == len(names):
+    if (
+        at
+        and all(cell.casefold() in units for cell in names)
+        and len(rows[at - 1][1]) == len(names)
+    ):
         names = [_with_unit(path, rows[at][0], name, unit)
                  for name, unit in zip(rows[at - 1][1], names, strict=True)]  # fmt: skip
         notes.append(f"line {rows[at][0]} holds the units")
@@ -190,7 +200,9 @@ def _decimal_comma(
     notes = [f"separated by {word}"] if word else []
     if mark == ",":
         return False, notes
-    cells = [(i, c) for i, row in rows for c in row if c and set(c.casefold()) <= set(DIGITS + ",e")]
+    cells = [
+        (i, c) for i, row in rows for c in row if c and set(c.casefold()) <= set(DIGITS + ",e")
+    ]
     with_comma = [(i, c) for i, c in cells if "," in c]
     if not with_comma:
         return False, notes
@@ -270,6 +282,7 @@ def _understood(path: Path, columns: Sequence[Column], notes: Sequence[str]) -> 
             raise UserError(f"{path}: {known[key][0].name}: {words}")
         if key != "G" and np.iscomplexobj(parts[key]):
             raise UserError(f"{path}: {known[key][0].name}: is complex; name it G")
+    G: np.ndarray
     if given == {"re", "im"}:
         if known["re"][1] != known["im"][1]:
             raise UserError(f"{path}: re and im have different units; give both in m/N")
@@ -324,8 +337,8 @@ def _quantities(
             raise UserError(f"{path}: {words}; keep one")
         seen[quantity] = column.name
         if unit not in UNITS[quantity]:
-            choices = " or ".join(dict.fromkeys(
-                {"f": ("hz", "rad/s"), "angle": ("deg", "rad")}.get(quantity, UNITS[quantity])))  # fmt: skip
+            usual = {"f": ("hz", "rad/s"), "angle": ("deg", "rad")}
+            choices = " or ".join(filter(None, usual.get(quantity, UNITS[quantity])))
             words = f"has the unit {unit!r}" if unit else "names no unit"
             raise UserError(f"{path}: {column.name!r}: {words}; it may be {choices}")
         yield quantity, (column, UNITS[quantity][unit])
@@ -337,7 +350,9 @@ def _of_size_and_angle(
     """G of a magnitude and a phase. Raises UserError where another reading is as possible."""
     (sized, factor), (turned, to_rad) = known.get("size") or known["G"], known["angle"]
     if np.iscomplexobj(sized.values) or sized.values.ndim != 1:
-        raise UserError(f"{path}: {sized.name}: is complex or of several channels; drop {turned.name}")
+        raise UserError(
+            f"{path}: {sized.name}: is complex or of several channels; drop {turned.name}"
+        )
     size, angle = sized.values.astype(float), turned.values.astype(float)
     if factor > 0.0 and (size < 0.0).any():
         words = "is negative at a line; if it is in decibels name it magnitude_db"
@@ -353,16 +368,16 @@ def _of_size_and_angle(
         words = f"is {largest:.4g} at most: {'radians' if degrees else 'degrees'} may be meant"
         raise UserError(f"{path}: {turned.name}: {words}; give re and im, or name it "
                         f"{'phase_rad' if degrees else 'phase_deg'}")  # fmt: skip
-    if factor > 0.0 and own > MISFIT:
-        if _bode_misfit(hz, decibels, angle * to_rad) < BETTER * own:
-            words = "decibels may be meant, with which phase and slope agree"
-            raise UserError(f"{path}: {sized.name}: {words}; name it magnitude_db, or give re and im")
+    doubted = factor > 0.0 and own > MISFIT
+    if doubted and _bode_misfit(hz, decibels, angle * to_rad) < BETTER * own:
+        words = "decibels may be meant, with which phase and slope agree"
+        raise UserError(f"{path}: {sized.name}: {words}; name it magnitude_db, or give re and im")
     return np.asarray(named * np.exp(1j * angle * to_rad))
 
 
 def least_phase(y: Array, x: Array) -> Array:
-    """Phase (rad) of the stable minimum-phase G with ln|G| = y at even x = ln f: Bode's weight of the
-    slope, which is taken to go on beyond the ends."""
+    """Phase (rad) of the stable minimum-phase G with ln|G| = y at even x = ln f: Bode's weight of
+    the slope, which is taken to go on beyond the ends."""
     slope = np.pad(np.gradient(y, x), len(x), mode="edge")
     v = (np.arange(-len(x), len(x) + 1) + 0.5 / len(x)) * (x[1] - x[0])
     weight = np.log(1.0 / np.tanh(0.5 * np.abs(v)))
@@ -371,14 +386,16 @@ def least_phase(y: Array, x: Array) -> Array:
 
 
 def _bode_misfit(hz: Array, size: Array, angle: Array) -> float:
-    """Mean |φ - φ₀| (rad) over ln f, φ₀ = `least_phase`, for either sign of G and behind the delay that
-    fits best."""
+    """Mean |φ - φ₀| (rad) over ln f, φ₀ = `least_phase`, for either sign of G and behind the delay
+    that fits best."""
     good = (hz > 0.0) & (size > 0.0)
     x, y = np.log(hz[good]), np.log(size[good])
     if len(x) < 5 or not (np.diff(x) > 0.0).all():
         return 0.0
     places = np.linspace(x[0], x[-1], PLACES)
-    off = np.interp(places, x, np.unwrap(angle[good])) - least_phase(np.interp(places, x, y), places)
+    off = np.interp(places, x, np.unwrap(angle[good])) - least_phase(
+        np.interp(places, x, y), places
+    )
     lag = np.append(0.0, np.geomspace(0.1, 100.0, DELAYS))[:, None] * np.exp(places - places[-1])
     apart = np.abs(np.angle(np.exp(1j * (off + lag)))).mean(axis=1)
     opposite = np.abs(np.angle(-np.exp(1j * (off + lag)))).mean(axis=1)

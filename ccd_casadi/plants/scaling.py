@@ -152,9 +152,9 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
 
         ω₀² = M_K ‖C A B‖, the inertial compliance being C A B / s²
 
-    Where that is 0, ω₀ⁿ = M_K ‖C Aⁿ⁻¹ B‖ with the first n for which it is not (a lag before the force
-    gives 3). Coordinates are balanced; there are no derivatives and no channels. Raises PlantError
-    for a plant with feedthrough, that is not finite, or whose output no force moves.
+    Where that is 0, ω₀ⁿ = M_K ‖C Aⁿ⁻¹ B‖ with the first n for which it is not (3 with a lag
+    before the force). Coordinates are balanced; there are no derivatives and no channels. Raises
+    PlantError for a plant with feedthrough, that is not finite, or whose output no force moves.
     """
     n, m, p = len(system.A), system.B.shape[1], system.C.shape[0]
     if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C)):

@@ -6,6 +6,7 @@ end it is a model again: the poles of the sampled loop and ‖S‖∞ by a Hamil
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -131,15 +132,21 @@ def tune(
     if not given:
         raise UserError("there is no plant to tune for; give one")
     tell = progress or silent
-    stated = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
-              "least_damping": least_damping}  # fmt: skip
-    stated = {name: value for name, value in stated.items() if value is not None}
+    own = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
+           "least_damping": least_damping}  # fmt: skip
+    stated = [name for name, value in own.items() if value is not None]
     read = [_plant(item, rate_hz, delay, tell) for item in given]
     models = tuple(model for _, model in read)
     if stated and None not in models:
         words = f"{', '.join(stated)}: is of measured plants, and of a model its poles are known"
         raise UserError(f"{words}; drop it")
-    responses = tuple(one if G is not None else replace(one, **stated) for one, G in read)
+    responses = tuple(
+        one if G is not None else replace(
+            one, unstable_poles=unstable_poles or one.unstable_poles,
+            poles_at_zero=one.poles_at_zero if poles_at_zero is None else poles_at_zero,
+            least_damping=least_damping or one.least_damping)
+        for one, G in read
+    )  # fmt: skip
     if structure is None:
         biquads = min(NOTCHES, len(responses[0].resonances))
         structure = Structure(biquads=biquads, least_damping=0.1)
@@ -156,7 +163,7 @@ def tune(
                                 workers=workers)  # fmt: skip
         if not design.usable or not periods:
             break
-        loops = [G and _loop_on(G, design.controller, bounds, structure.integrator) for G in models]
+        loops = _loops_on(models, design.controller, bounds, structure.integrator)
         known = [loop for loop in loops if loop is not None]
         worse = [loop for loop in known if not loop.norm <= S_max]
         slower = [loop for loop in known if loop.bandwidth < (1.0 - SLOWER) * design.bandwidth]
@@ -168,8 +175,9 @@ def tune(
                           for one, G in zip(responses, models, strict=True))  # fmt: skip
     norms: tuple[float | None, ...] = tuple(None for _ in models)
     if periods and design.controller is not None:
-        loops = [G and _loop_on(G, design.controller, bounds, structure.integrator) for G in models]
-        design, norms = _on_models(design, loops, S_max), tuple(loop and loop.norm for loop in loops)
+        loops = _loops_on(models, design.controller, bounds, structure.integrator)
+        design = _on_models(design, loops, S_max)
+        norms = tuple(None if loop is None else loop.norm for loop in loops)
     case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
     return Tuned(case, design, models, norms)
 
@@ -184,9 +192,15 @@ class LoopOnModel:
     limits: tuple[float, ...]
 
 
-def _loop_on(G: StateSpace, K: StateSpace | None, bounds: Bounds, integrator: bool) -> LoopOnModel:
+def _loops_on(
+    models: Sequence[StateSpace | None], K: StateSpace | None, bounds: Bounds, integrator: bool
+) -> list[LoopOnModel | None]:
+    """The loop with each model; None with a response, or without a controller."""
+    return [None if G is None or K is None else _loop_on(G, K, bounds, integrator) for G in models]
+
+
+def _loop_on(G: StateSpace, K: StateSpace, bounds: Bounds, integrator: bool) -> LoopOnModel:
     """The loop with a model in discrete time; infinite and 0 where it is not stable."""
-    assert K is not None
     S = closed_loop(G, tustin(K, G.period)).S
     norm, peak = hinf_norm(S)
     if not np.isfinite(norm):
@@ -194,16 +208,18 @@ def _loop_on(G: StateSpace, K: StateSpace | None, bounds: Bounds, integrator: bo
     top = np.pi / G.period
     roots = S.rates
     low = BELOW * float(np.abs(roots).min())
-    omega = frequency_grid(low, top, int(FINE * np.log10(top / low)), root_flanks(roots), apart=APART)
+    omega = frequency_grid(
+        low, top, int(FINE * np.log10(top / low)), root_flanks(roots), apart=APART
+    )
 
     def level(omega: np.ndarray, slope: float = 0.0) -> np.ndarray:
         size = sigma_max(S.swept(omega.ravel())).reshape(omega.shape)
         return np.asarray(np.log(size) - slope * np.log(omega))
 
     for slope in (0.0, 1.0):  # of the bound of |S|: constant, and the shape
-        i = local_maxima(level(omega, slope))
-        where, _ = zoomed(lambda x, slope=slope: level(x, slope), omega[i - 1], omega[i + 1])
-        omega = np.union1d(omega, where)
+        top_at = local_maxima(level(omega, slope))
+        ends = omega[top_at - 1], omega[top_at + 1]
+        omega = np.union1d(omega, zoomed(partial(level, slope=slope), *ends)[0])
     found = bandwidth_within(omega, level(omega), bounds, integrator)
     for _ in range(2):  # it lies at a crossing, or by the shape at a maximum that is there already
         i = int(np.clip(np.searchsorted(omega, found), 1, len(omega) - 1))
@@ -233,7 +249,9 @@ def _on_models(
     if only:
         figures = replace(figures, S_between=worst.norm, S_between_frequency=worst.peak)
     bandwidth = bandwidth if only else min(bandwidth, design.bandwidth)
-    words = f"stable by the poles of the sampled loop, ‖S‖∞ = {worst.norm:.4g} by a Hamiltonian matrix"
+    words = (
+        f"stable by the poles of the sampled loop, ‖S‖∞ = {worst.norm:.4g} by a Hamiltonian matrix"
+    )
     words = words if design.sign > 0.0 else f"{words}; {NEGATIVE}"
     words = words if only else f"{words} on the models; on the lines {design.words}"
     return replace(design, bandwidth=bandwidth, figures=replace(figures, bandwidth=bandwidth),
@@ -287,7 +305,9 @@ def _plant(
     undamped = np.abs(rates.real) <= ON_AXIS * np.abs(rates)
     axis = _folded(rates[undamped & ~rest & (rates.imag > 0.0)], T).imag
     narrow = np.abs(roots.real) <= ON_AXIS * np.abs(roots)
-    beside = root_flanks(BESIDE * np.abs(roots[narrow]) + 1j * roots[narrow].imag, FLANKS[FLANKS != 0.0])
+    beside = root_flanks(
+        BESIDE * np.abs(roots[narrow]) + 1j * roots[narrow].imag, FLANKS[FLANKS != 0.0]
+    )
     omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),
                            root_flanks(roots[~narrow]), beside, apart=APART)  # fmt: skip
     close = np.abs(omega[:, None] - axis) <= 0.1 * BESIDE * axis
@@ -303,7 +323,9 @@ def _plant(
 def _folded(rates: np.ndarray, T: float) -> np.ndarray:
     """Rates in 1/s with their frequencies where a sampled system has them, up to half the rate."""
     turns = np.abs(rates.imag) * T
-    return np.asarray(rates.real + 1j * np.abs(turns - 2.0 * np.pi * np.round(turns / (2.0 * np.pi))) / T)
+    return np.asarray(
+        rates.real + 1j * np.abs(turns - 2.0 * np.pi * np.round(turns / (2.0 * np.pi))) / T
+    )
 
 
 def _require_seen(system: StateSpace) -> None:
@@ -333,7 +355,9 @@ def _of_file(path: Path) -> MeasuredResponse | interchange.NamedSystem:
     except Exception:  # a damaged file: what reads it says so
         variables = []
     names = {name for name, _, _ in variables}
-    if holds_lines(sorted(names)) or not ({"A", "B", "C"} <= names or any(kind == "struct" for _, _, kind in variables)):
+    if holds_lines(sorted(names)) or not (
+        {"A", "B", "C"} <= names or any(kind == "struct" for _, _, kind in variables)
+    ):
         return read_frequency_response(path)
     systems = interchange.read_mat(path).systems
     if len(systems) != 1:

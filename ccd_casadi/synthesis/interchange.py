@@ -20,7 +20,6 @@ import scipy
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.mat_files import mat_variables
 from ccd_casadi.synthesis.matlab_systems import PARTS, strings, system_of, systems_in
@@ -181,13 +180,14 @@ def read_mat(path: Path) -> DesignFile:
 def _named(path: Path, name: str, fields: Mapping[str, Any]) -> NamedSystem:
     found = system_of(path, name, fields)
     signals = ("InputName", "OutputName", "InputUnit", "OutputUnit")
-    inputs, outputs, *units = (strings(fields.get(key)) for key in signals)
+    inputs, outputs, input_unit, output_unit = (strings(fields.get(key)) for key in signals)
     m, p = found.system.B.shape[1], len(found.system.C)
     return NamedSystem(
         found.system,
         inputs if len(inputs) == m else _names("u", m),
         outputs if len(outputs) == p else _names("y", p),
-        *map(" ".join, units),
+        " ".join(input_unit),
+        " ".join(output_unit),
         found.delay,
         found.words,
     )

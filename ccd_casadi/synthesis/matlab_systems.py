@@ -1,4 +1,4 @@
-"""A linear system as MATLAB writes it, `get(sys)` or its matrices: what a field does to the plant is
+"""A linear system as MATLAB writes it, `get(sys)` or matrices: what a field does to the plant is
 understood exactly, or the field is refused by name.
 
     E ẋ = A x + B u(t - τ),   y = C x + D u,   times in TimeUnit, delays of a sampled one in samples
@@ -17,9 +17,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
 PARTS = ("A", "B", "C", "D")
-OF_NAMES = {"name", "notes", "userdata", "statename", "stateunit", "statepath", "inputname", "inputunit",
-            "inputgroup", "outputname", "outputunit", "outputgroup", "samplinggrid", "scaled",
-            "theta", "theta_names", "theta_units"}  # fmt: skip
+OF_NAMES = {"name", "notes", "userdata", "statename", "stateunit", "statepath", "inputname",
+            "inputunit", "inputgroup", "outputname", "outputunit", "outputgroup", "samplinggrid",
+            "scaled", "theta", "theta_names", "theta_units"}  # fmt: skip
 DELAYS = ("InputDelay", "OutputDelay", "IODelay")
 SECONDS = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "seconds": 1.0,
            "minutes": 60.0, "hours": 3600.0, "days": 86400.0}  # fmt: skip
@@ -39,20 +39,28 @@ class MatlabSystem:
 def systems_in(path: Path, content: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """The fields of each struct with an A; a file that has A, B and C themselves is one, without a
     name. Raises UserError for a variable beside them that may be part of the plant."""
-    structs = {name: value for name, value in content.items()
-               if isinstance(value, np.ndarray) and {"A", "a"} & set(value.dtype.names or ())}
+    structs = {
+        name: value
+        for name, value in content.items()
+        if isinstance(value, np.ndarray) and {"A", "a"} & set(value.dtype.names or ())
+    }
     others = {name: value for name, value in content.items()
               if name not in structs and not name.startswith("__")}  # fmt: skip
     if {"A", "B", "C"} <= set(content):
         size = np.shape(others["A"])
-        drawn = {name: value for name, value in others.items()
-                 if name.casefold() in FIELDS or _numbers(value) and np.shape(value) in (size, (1, 1))}
+        drawn = {
+            name: value
+            for name, value in others.items()
+            if name.casefold() in FIELDS or (_numbers(value) and np.shape(value) in (size, (1, 1)))
+        }
         yield "", drawn
     else:
         for name, value in others.items():
             changes = name.casefold() in FIELDS - {"a", "b", "c", "d"} or "delay" in name.casefold()
             if changes and name.casefold() not in OF_NAMES and not _nothing(value):
-                raise UserError(f"{path}: {name}: belongs to no system; make it a field of its struct")
+                raise UserError(
+                    f"{path}: {name}: belongs to no system; make it a field of its struct"
+                )
     for name, struct in structs.items():
         if struct.size != 1:
             raise UserError(f"{path}: {name}: is an array of structs; save one struct")
@@ -65,7 +73,8 @@ FIELDS = {"a", "b", "c", "d", "e", "ts", "timeunit", "internaldelay",
 
 def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
     """The system of these fields. Raises UserError naming the one that is not understood."""
-    fields, names = {}, {}
+    fields: dict[str, Any] = {}
+    names: dict[str, str] = {}
     for key, value in given.items():
         if key.casefold() in fields:
             raise UserError(f"{path}: {name}: has {names[key.casefold()]} and {key}; keep one")
@@ -92,7 +101,7 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
         if E.shape != (n, n) or not np.linalg.cond(E) < SINGULAR:
             raise reader.fail("E", "is not regular: the system has algebraic equations; reduce it")
         if (np.eye(n) != E).any():
-            A, B = np.linalg.solve(E, A), np.linalg.solve(E, B)
+            A, B = (np.asarray(np.linalg.solve(E, part), float) for part in (A, B))
             many.append("E is inverted")
     unit, word = reader.time_unit()
     Ts = unit * reader.number("Ts")

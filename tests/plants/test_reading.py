@@ -54,7 +54,8 @@ def input_delay(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
 def unlike_delays(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
     p = np.asarray(m["D"]).shape[0]
     tau = rng.uniform(1e-3, 0.1, p)
-    return {"OutputDelay": tau[:, None]}, lambda omega: np.exp(-1j * np.outer(omega, tau))[:, :, None]
+    late = {"OutputDelay": tau[:, None]}
+    return late, lambda omega: np.exp(-1j * np.outer(omega, tau))[:, :, None]
 
 
 def minutes(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
@@ -108,12 +109,11 @@ def test_no_model_is_read_as_another(seed: int, tmp_path: Path) -> None:
         return
     omega = np.geomspace(0.1, 1e4, 60)
     truth = response(m, omega) * factor(omega)
-    try:
-        (found,) = read_mat(path).systems.values()
-    except UserError as error:
-        assert word == "OutputDelay" and len(truth[0]) > 1, error
-        assert "OutputDelay" in str(error)
+    if word == "OutputDelay" and len(truth[0]) > 1:
+        with pytest.raises(UserError, match="OutputDelay: differs between channels"):
+            read_mat(path)
         return
+    (found,) = read_mat(path).systems.values()
     read = found.system.response(omega) * np.exp(-1j * omega * found.delay)[:, None, None]
     assert np.abs(read - truth).max() <= 1e-6 * np.abs(truth).max()
     np.testing.assert_allclose(read, truth, rtol=1e-5, atol=1e-9 * np.abs(truth).max())
@@ -139,7 +139,8 @@ def table_text(names: list[str], columns: list[np.ndarray], rng: np.random.Gener
     ]
     rows = [mark.join(names)]
     for row in zip(*columns, strict=True):
-        cells = [f"{v.real:.12g}{v.imag:+.12g}j" if isinstance(v, complex) else f"{v:.12g}" for v in row]
+        cells = [f"{v.real:.12g}" + (f"{v.imag:+.12g}j" if isinstance(v, complex) else "")
+                 for v in row]  # fmt: skip
         rows.append(mark.join(c.replace(".", ",") if comma else c for c in cells))
     if rng.random() < 0.3:
         rows.insert(0, "# measured by hand")
@@ -201,7 +202,8 @@ def test_no_table_is_read_as_another(seed: int, tmp_path: Path) -> None:
     names, columns, word = table_of(form, fault, hz, G)
     if seed % 3 and fault != "twice":  # a file of arrays cannot have a name twice
         path = tmp_path / ("x.npz" if seed % 3 == 1 else "x.mat")
-        content = {re.sub(r"\W+", "_", n).strip("_"): c for n, c in zip(names, columns, strict=True)}
+        plain_names = [re.sub(r"\W+", "_", name).strip("_") for name in names]
+        content = dict(zip(plain_names, columns, strict=True))
         np.savez(path, **content) if seed % 3 == 1 else savemat(path, content)
     else:
         path = tmp_path / "x.csv"

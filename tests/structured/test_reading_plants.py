@@ -1,4 +1,4 @@
-"""Plants that were once refused for a false reason, and what lines leave open: counted, by truth."""
+"""Plants that were once refused for a false reason, and what lines leave open, by the truth."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -74,8 +74,8 @@ def test_undamped_modes_have_a_design_that_another_judge_confirms(seed: int) -> 
     """Poles on the axis: beside a lag, an integrator, alone, folded; also far from any line."""
     rng = np.random.default_rng(seed)
     w, rate = rng.uniform(3.0, 60.0), 60.0
-    body = [0.1 / (s**2 + 1.2 * s + 4.0), 0.1 / s**2, 0.0 * s / (s + 1.0), 1.0 / (s + 1.0)][seed % 4]
-    plant = body + rng.uniform(0.005, 0.05) / (s**2 + w**2)
+    body = [0.1 / (s**2 + 1.2 * s + 4.0), 0.1 / s**2, 0.0 * s / (s + 1.0), 1.0 / (s + 1.0)]
+    plant = body[seed % 4] + rng.uniform(0.005, 0.05) / (s**2 + w**2)
     found = ccd.tune(control.ss(plant), rate_hz=rate, starts=6)
     if found.design.usable:
         S = judged(plant, found.controller, rate)
@@ -172,21 +172,18 @@ def test_transfer_functions_are_not_converted_to_other_plants() -> None:
     rng = np.random.default_rng(3)
     for _ in range(60):
         n = int(rng.integers(1, 9))
-        poles, zeros = -(10.0 ** rng.uniform(-4.0, 3.0, n)), -(10.0 ** rng.uniform(-4.0, 3.0, n - 1))
+        poles, zeros = (-(10.0 ** rng.uniform(-4.0, 3.0, size)) for size in (n, n - 1))
         gain = 10.0 ** rng.uniform(-20.0, 5.0)
         G = control.zpk(zeros, poles, gain)
-        try:
-            found = from_control(control.tf(G.num[0][0], G.den[0][0]))
-        except UserError as error:
-            assert "lost in conversion" in str(error)
-            continue
+        found = from_control(control.tf(G.num[0][0], G.den[0][0]))
         omega = 10.0 ** rng.uniform(-6.0, 5.0, 50)
         truth = [gain * np.prod(1j * o - zeros) / np.prod(1j * o - poles) for o in omega]
         np.testing.assert_allclose(found.response(omega)[:, 0, 0], truth, rtol=1e-5)
     slow = np.poly(np.full(6, -1e-3)).tolist()
     four = from_control(control.tf([[[1.0], [2e-18]], [[2e-18], [1.0]]],
                                    [[[1, 2, 1], slow], [slow, [1, 2, 1]]]))  # fmt: skip
-    np.testing.assert_allclose(four.response(np.zeros(1))[0].real, [[1.0, 2.0], [2.0, 1.0]], rtol=1e-6)
+    static = four.response(np.zeros(1))[0].real
+    np.testing.assert_allclose(static, [[1.0, 2.0], [2.0, 1.0]], rtol=1e-6)
     with pytest.raises(UserError, match="not stable and"):
         ccd.tune(control.tf([1.0, -1.0], [1.0, 0.0, -1.0]), rate_hz=50.0)
 
@@ -203,7 +200,7 @@ def test_a_delay_in_a_struct_is_the_delay_of_the_loop(tmp_path: Path) -> None:
 
 
 def hidden_case(seed: int) -> tuple[StateSpace, MeasuredResponse]:
-    """A stage whose lines may hide a resonance, near another one or apart, with noise or without."""
+    """A stage whose lines may hide a resonance, near another one or apart, some with noise."""
     rng = np.random.default_rng(seed)
     even = rng.random() < 0.3
     hz = np.arange(2.0, 1500.0, rng.choice([0.5, 1.0])) if even else np.geomspace(
