@@ -265,6 +265,8 @@ def _span(hz: Array, i: int) -> str:
 
 def _hidden(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray, doubts: list[str]) -> str:
     """What of a resonance between two lines is assumed; a doubt where the lines do not show it."""
+    if measured.modelled:
+        return "a model is behind the lines"
     hz, most, least = measured.hz, hidden_damping(measured, L, k), measured.least_damping
     open_ = np.flatnonzero(most > least)
     if len(open_):

@@ -17,7 +17,6 @@ from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
@@ -46,6 +45,10 @@ class Outcome(StrEnum):
         "the controller is lost in rounding: in SI its loop needs more digits than doubles have; "
         "in the case raise inner.gamma_backoff (1.05, 1.2), lower weights.M_K, or narrow "
         "inner.omega_S_hz and inner.omega_T_hz"
+    )
+    PLANT_NOT_STABLE = (
+        "the plant is not stable, which mixed sensitivity needs: give the weights a disturbance, or "
+        "use ccd.tune"
     )
     NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
@@ -129,11 +132,6 @@ def synthesise(
     Design
         A failure is an outcome of its `figures`, no exception.
 
-    Raises
-    ------
-    PlantError
-        The plant is not stable, and the weights have no disturbance.
-
     Examples
     --------
     >>> import ccd_casadi as ccd
@@ -145,15 +143,12 @@ def synthesise(
     """
     w0 = plant.omega_0
     on = plant.design_plant
-    poles = np.linalg.eigvals(on.A)
-    if not weights.delta and not poles.real.max(initial=-1.0) < 0.0:
-        worst = w0 * abs(poles[np.argmax(poles.real)])
-        words = f"is not stable: a pole at {worst:.4g} rad/s has no damping or less than none"
-        raise PlantError(f"the plant {words}; give weights a disturbance, or use ccd.tune")
     row, Ak, Bk, Ck = design(on.A, on.B, on.C, weights.scaled(w0), on.grid, on.gain, gamma_backoff,
                      omega_low / w0, guess, on.channels, weights.delta,
                      judged_on(plant))  # fmt: skip
     figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
+    if not weights.delta and not np.linalg.eigvals(on.A).real.max(initial=-1.0) < 0.0:
+        figures = replace(figures, outcome=Outcome.PLANT_NOT_STABLE, gamma_opt=np.nan)
     controller = plant.controller_si(Ak, Bk, Ck)
     if compliance and figures.certified:
         figures = replace(figures, compliance=compliance_over_family(plant, controller).gain)
