@@ -47,8 +47,8 @@ class Outcome(StrEnum):
         "inner.omega_S_hz and inner.omega_T_hz"
     )
     PLANT_NOT_STABLE = (
-        "the plant is not stable, which mixed sensitivity needs: give the weights a disturbance, or "
-        "use ccd.tune"
+        "the plant is not stable, as mixed sensitivity needs it: give the weights a disturbance, "
+        "or use ccd.tune"
     )
     NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
