@@ -67,6 +67,7 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     if any(value is not None for value in given):
         words = 'plant.model = "measured" has no theta and no weights to place; leave out --theta'
         raise CaseError(f"{case.path}: {words}, --omega-s-hz, --omega-t-hz and --begin-at")
+    PROGRESS(f"{case.file}: {case.responses[0].words}")
     found, made = measured_answer(case, seed=options.seed, tell=PROGRESS)
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:

@@ -20,6 +20,12 @@ from ccd_casadi.support.terminal import inform, say
     valued("--lead", "N", integer(0), "number of leads, with --biquads", 1),
     option("--biquads", metavar="N", type=integer(0),
            help="number of notches (default: by the resonances)"),
+    option("--unstable-poles", metavar="N", type=integer(0),
+           help="of a measured plant, in the right half plane (default: 0)"),
+    option("--poles-at-zero", metavar="N", type=integer(0),
+           help="of a measured plant (default: by the slope of the first lines)"),
+    option("--least-damping", metavar="X", type=positive,
+           help="damping ratio of a resonance that lines may hide, at least (default: 0.0005)"),
     needs=["ccd_casadi.studies.tuning"],
     place=RUN | {"metavar": "DATA", "nargs": "+", "help": "responses (.csv, .mat, .npz) or models "
                  "(.mat with A, B, C, D); several are one set"},
@@ -49,6 +55,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         found = tune(
             options.run, rate_hz=options.rate_hz, delay=options.delay, S_max=options.s_max,
             shape=options.shape, effort=options.effort, structure=structure, seed=options.seed,
+            unstable_poles=options.unstable_poles, poles_at_zero=options.poles_at_zero,
+            least_damping=options.least_damping,
             progress=lambda words: inform(words, sys.stderr),
             workers=workers,
         )  # fmt: skip

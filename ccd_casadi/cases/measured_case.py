@@ -5,6 +5,7 @@ model = "measured"
 file = "stage.csv"            # or .mat: displacement over force, m/N, see `read_frequency_response`
 unstable_poles = 0            # of the plant; default 0
 poles_at_zero = 2             # default: by the slope of its first lines
+least_damping = 0.0005        # of a resonance that lines may hide, at least
 
 with [inner], [controller] structure = "sections", [weights] where weighted_level is given, and
 [loop] rate_hz: then the response was measured as the controller sees it, hold and delay in it.
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.case import read_toml, table_of
-from ccd_casadi.cases.checks import Fail, count, require_good, short_repr, text
+from ccd_casadi.cases.checks import POSITIVE, Fail, count, require_good, short_repr, text
 from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
@@ -26,7 +27,13 @@ from ccd_casadi.support.units import HZ
 
 MODEL = "measured"
 _TABLES = ("weights", "inner", "controller", "loop")
-_PLANT = {"model": text, "file": text, "unstable_poles": count(0), "poles_at_zero": count(0)}
+_PLANT = {
+    "model": text,
+    "file": text,
+    "unstable_poles": count(0),
+    "poles_at_zero": count(0),
+    "least_damping": POSITIVE,
+}
 
 
 @dataclass(frozen=True)
@@ -98,7 +105,8 @@ def _response(plant: Mapping[str, Any], path: Path, fail: Fail) -> MeasuredRespo
     except UserError as error:
         raise fail("plant.file", str(error)) from error
     unstable, at_zero = int(plant.get("unstable_poles", 0)), plant.get("poles_at_zero")
-    return replace(found, unstable_poles=unstable, poles_at_zero=at_zero)
+    least = float(plant.get("least_damping", found.least_damping))
+    return replace(found, unstable_poles=unstable, poles_at_zero=at_zero, least_damping=least)
 
 
 def _check(tables: Mapping[str, Any], fail: Fail) -> None:

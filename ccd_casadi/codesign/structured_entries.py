@@ -176,6 +176,8 @@ def sections_controller(
     """controller.json: the state space in SI, the sections, and how they run."""
     assert design.controller is not None
     words = sections_dict(design.structure, design.kappa) | {"kappa": design.kappa.tolist()}
+    if isinstance(design, MeasuredDesign):
+        words["sign"] = design.sign
     if sampling is not None:
         words["loop"] = vars(sampling) | {"method": "tustin"}
     return controller_dict(design.controller) | {"sections": words}

@@ -100,6 +100,8 @@ def _from_mat(path: Path) -> tuple[StateSpace, float]:
     for name in ("controller_discrete", "controller", ""):
         if name in systems:
             found = systems[name].system
+            if systems[name].delay:
+                raise UserError(f"{path}: {name}: has a delay in it; give the controller without")
             delay, beside = found.period, path.with_name("deploy.json")
             if found.period and beside.exists():
                 told = read_json(beside).get("delay")

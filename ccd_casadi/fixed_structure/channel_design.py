@@ -32,7 +32,7 @@ from ccd_casadi.fixed_structure.sections_design import (
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.plants.scaling import ScaledPlant, leading_gain
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
@@ -136,8 +136,8 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
             continue
         if scale is None:
             space = from_control(system)
-            inertial = float(np.linalg.norm(space.C @ space.A @ space.B, 2))
-            scale = (SLOWEST * bounds.omega_low / bounds.S_low) ** 2 / inertial if inertial else 1.0
+            order, gain = leading_gain(space)
+            scale = (SLOWEST * bounds.omega_low / bounds.S_low) ** order / gain if order else 1.0
         scaled[i] = plant_from_control(system, scale)
     return scaled
 

@@ -39,9 +39,11 @@ from ccd_casadi.support.progress import Tell, silent, titled
 FEWER = 600  # lines that starts of single channels are designed on
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
 CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
+NEGATIVE = "K has a negative gain, by the sign of the plant's"
 NO_START = (
-    "no start is stable by its winding: this structure may not stabilise the plant; of data give "
-    "poles_at_zero, or more low lines"
+    "no start is stable by its winding: this structure may not stabilise the plant; of data state "
+    "its unstable poles (--unstable-poles, unstable_poles) and those at zero (--poles-at-zero, "
+    "poles_at_zero), or measure lower lines"
 )
 
 
@@ -50,7 +52,8 @@ class MeasuredDesign:
     """A controller found on measured lines; SI, frequencies in rad/s.
 
     `figures` are the judge's; `usable` where it is stable, surely so, and within every bound on
-    every line. `words` say what is missing.
+    every line. `words` say what is missing. `sign` of K: -1 where the plant of one channel has a
+    negative gain; κ is that of |K|.
     """
 
     structure: Structure | ChannelStructure
@@ -61,6 +64,7 @@ class MeasuredDesign:
     usable: bool
     words: str
     steps: int
+    sign: float = 1.0
 
 
 def design_on_data(
@@ -73,6 +77,7 @@ def design_on_data(
     seed: int = 0,
     effort: float | None = None,
     given_up: float = 0.0,
+    initial: Array | None = None,
     progress: Tell = silent,
     workers: Pool | None = None,
 ) -> MeasuredDesign:
@@ -82,8 +87,9 @@ def design_on_data(
     A structure of one channel on responses of several is that of each channel of
     `static_decoupling`. With an `effort` also |KS| <= effort/|G|, the mean over the two octaves
     about ω_b, where G has its least singular value. Of the bandwidth the share `given_up` is given
-    in the end for integral gain. Raises UserError for responses of unlike shape, or lines beyond
-    half the sampling rate.
+    in the end for integral gain. A search begins from `initial` (κ in SI) alone if that is stable.
+    Raises UserError for responses of unlike shape or sign, derivatives of a displacement, or lines
+    beyond half the sampling rate.
     """
     responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
     shapes = {one.matrix.shape[1:] for one in responses}
@@ -94,14 +100,26 @@ def design_on_data(
     if shapes != {(1, 1)} and isinstance(structure, Structure):
         decoupling = static_decoupling(responses[0])
         structure = ChannelStructure(decoupling, (structure,) * len(decoupling.names))
+    for one in responses:
+        if one.derivative:
+            raise UserError(
+                f"the measured response is {one.derivative}; G is displacement over force"
+            )
+    sign = 1.0
+    if shapes == {(1, 1)}:
+        sign = _sign(responses)
+        responses = [replace(one, G=sign * one.G) for one in responses]
     problem = line_problem(responses, structure, bounds, period, MARGIN, effort)
-    if isinstance(structure, ChannelStructure):
+    again = None if initial is None else np.clip(in_problem_units(problem, initial), *problem.box)
+    if again is not None and problem.stable(again):
+        pool, spent = [again], 0
+    elif isinstance(structure, ChannelStructure):
         pool, spent = _channels_stacked(problem, structure, period, starts, seed, progress, workers)
     else:
         pool, spent = _pool(problem, starts, np.random.default_rng(seed)), 0
     if not len(pool):
         nothing = np.full(len(structure.names), np.nan)
-        return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent)
+        return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent, sign)
     best: MeasuredDesign | None = None
     for runner in finished(run_race(problem, np.array(pool), progress, workers)):
         end = ascend(problem, runner.point, iterations=60, radius=1e-2, restoring=True)
@@ -113,7 +131,25 @@ def design_on_data(
         if best.usable:
             break
     assert best is not None
-    return best
+    return best if sign > 0.0 else _turned(best)
+
+
+def _sign(responses: Sequence[MeasuredResponse]) -> float:
+    """Of K: with an integrator the closed loop's characteristic polynomial has at 0 the sign of
+    K G there times -1 for each unstable pole, and has to be positive."""
+    signs = {float(np.sign(one.static[0, 0])) * (-1.0) ** one.unstable_poles for one in responses}
+    if len(signs - {0.0}) > 1:
+        words = "the plants have gains of both signs, which no controller with an integrator holds"
+        raise UserError(f"{words}; change the sign of some")
+    return -1.0 if -1.0 in signs else 1.0
+
+
+def _turned(design: MeasuredDesign) -> MeasuredDesign:
+    """With the other sign of K."""
+    K, words = design.controller, f"{design.words}; {NEGATIVE}"
+    if K is not None:
+        K = replace(K, C=-K.C, D=-K.D)
+    return replace(design, controller=K, words=words, sign=-1.0)
 
 
 def _more_integral(problem: LineProblem, point: Point, share: float) -> Array:

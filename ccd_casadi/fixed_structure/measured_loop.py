@@ -37,8 +37,16 @@ from ccd_casadi.support.units import HZ
 GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
 SAFETY = 2.0  # on the error of interpolation
 LARGE, SMALL = 2.0, 0.5  # gains of L at the first line at least, at the last at most
+RISEN = (
+    0.6  # half turns of G's angle beside those of its unstable poles, from which they are doubted
+)
 HIDDEN = 0.05  # of GK beside a resonance narrower than the lines, between which it may reach 1
-LEAST_DAMPING = 5e-4  # of a resonance: lines closer than its width 2 ζ f cannot hide it
+NOISE = 3.0  # standard deviations up to which a second difference may be noise
+STRIDES = (2, 4, 8)  # lines, over which it is then taken
+CUBIC_WINDOW = range(15)  # lines, over which the noise is estimated
+FITTED = 6  # lines that a parabola over a pole is fitted to
+NEAR_POLE = 1.0  # over the distance of two lines: a pole so near, and as narrow, is between them
+INSIDE = np.linspace(-0.4, 0.4, 5)  # places of a resonance between two lines
 BETWEEN = np.linspace(0.0, 1.0, 9)  # places on a chord
 
 
@@ -48,8 +56,8 @@ class MeasuredFigures(LoopPeaks):
 
     `right_half_plane`: Z. `sure`: whether the
     assumptions that the data can show hold. `S_between` bounds |S| on and between the lines by r,
-    infinite where I + L may be singular on the curve; `bandwidth` is the largest that the shape
-    allows on the lines.
+    infinite where I + L may be singular on the curve, and `S_between_frequency` (rad/s) is where it
+    is largest; `bandwidth` is the largest that the shape allows on the lines.
     """
 
     stable: bool
@@ -57,6 +65,7 @@ class MeasuredFigures(LoopPeaks):
     right_half_plane: int
     words: str
     S_between: float = np.nan
+    S_between_frequency: float = np.nan
 
 
 def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
@@ -90,13 +99,16 @@ def judge(
     first = len(whole.hz) - len(hz)
     reach = between(measured, joint[first:], k[first:])
     if not np.isfinite(reach).all():
-        doubts.append(f"between {np.isinf(reach).sum()} pairs of lines GK may pass -1")
+        pairs = np.flatnonzero(np.isinf(reach))
+        doubts.append(f"between {len(pairs)} pairs of lines GK may pass -1, the first "
+                      f"{_span(hz, pairs[0])}: measure more lines there")  # fmt: skip
+    assumption = _hidden(measured, joint[first:], k[first:], doubts)
     head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
     of = "1 + GK" if len(G[0]) == 1 else "det(I + GK)"
     as_low = f"as (jω)^-{measured.slope}" if measured.slope else "constant"
     assumed = (
         f"{head} by the winding of {of}, with {measured.unstable_poles} unstable poles of G, and G "
-        f"{as_low} below {hz[0]:.4g} Hz and |GK| < 1 above {hz[-1]:.4g} Hz"
+        f"{as_low} below {hz[0]:.4g} Hz and |GK| < 1 above {hz[-1]:.4g} Hz; {assumption}"
     )
     words, sure = "; ".join([assumed, *doubts]), measured.modelled or not doubts
     if Z != 0:
@@ -117,8 +129,11 @@ def judge(
         S_peak=float(size["S"].max()),
         S_peak_frequency=float(omega[np.argmax(size["S"])]),
         S_between=float(reach.max()),
+        S_between_frequency=float(
+            np.sqrt(np.prod(omega[[worst := int(reach.argmax()), worst + 1]]))
+        ),
         S_low=float(sigma_max(sensitivity(L_low))[0]),
-        bandwidth=_bandwidth(omega, np.log(size["S"]), bounds, integrator),
+        bandwidth=bandwidth_within(omega, np.log(size["S"]), bounds, integrator),
         **most,
     )
 
@@ -136,24 +151,140 @@ def _worst(each: Sequence[MeasuredFigures]) -> MeasuredFigures:
     worst = {name: float(np.max([getattr(one, name) for one in each])) for name in names}
     worst["bandwidth"] = float(np.min([one.bandwidth for one in each]))
     worst["S_peak_frequency"] = max(each, key=lambda one: one.S_peak).S_peak_frequency
+    most = max(each, key=lambda one: one.S_between)
+    worst["S_between_frequency"] = most.S_between_frequency
     return MeasuredFigures(True, sure, unstable, words, **worst)
 
 
 def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
-    """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f."""
+    """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f.
+
+    Where those of neighbouring lines do not stand out of the noise, of lines further apart.
+    """
     x = np.log(hz)
-    slope = np.diff(L, axis=0) / np.diff(x)[:, None, None]
-    second = sigma_max(2.0 * np.diff(slope, axis=0) / (x[2:] - x[:-2])[:, None, None])
-    around = np.concatenate([second[:1], second, second[-1:]])  # at each line
+    noise = NOISE * np.sqrt(6.0) * _noise(x, L)
+    around = _curvature(x, L, 1)
+    step = _half_width(x, 1)
+    for stride in STRIDES:
+        if len(x) > 2 * stride and noise.max() > 0.0:
+            wide = _curvature(x, L, stride) + noise / _half_width(x, stride) ** 2
+            around = np.where(around * step**2 < noise, np.minimum(around, wide), around)
     wider = np.maximum(np.append(around[1:], 0.0), np.insert(around[:-1], 0, 0.0))
     each = np.maximum(around, wider)
     return np.asarray(SAFETY * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
 
 
+def _curvature(x: Array, L: np.ndarray, stride: int) -> Array:
+    """σ_max of the second derivative at each line (k,), by lines that are `stride` apart."""
+    a, b, c = x[: -2 * stride], x[stride:-stride], x[2 * stride :]
+    rises = [(L[stride:][: len(a)] - L[: len(a)]) / (b - a)[:, None, None],
+             (L[2 * stride :] - L[stride:-stride]) / (c - b)[:, None, None]]  # fmt: skip
+    second = sigma_max(2.0 * (rises[1] - rises[0]) / (c - a)[:, None, None])
+    return np.pad(second, stride, mode="edge")
+
+
+def _half_width(x: Array, stride: int) -> Array:
+    return np.pad(0.5 * (x[2 * stride :] - x[: -2 * stride]), stride, mode="edge")
+
+
+def _noise(x: Array, L: np.ndarray) -> Array:
+    """Standard deviation of the noise of L at each line (k,): its distance from the cubic through
+    the two lines on each side, the median of those around."""
+    if len(x) < len(CUBIC_WINDOW):
+        return np.zeros(len(x))
+    at, near = x[2:-2], [x[:-4], x[1:-3], x[3:-1], x[4:]]
+    off = L[2:-2] + 0.0
+    spread = np.ones(len(at))
+    for i, own in enumerate((L[:-4], L[1:-3], L[3:-1], L[4:])):
+        weight = np.prod([(at - other) / (near[i] - other)
+                          for j, other in enumerate(near) if j != i], axis=0)  # fmt: skip
+        off = off - weight[:, None, None] * own
+        spread += weight**2
+    size = np.pad(sigma_max(off) / np.sqrt(spread), 2, mode="edge")
+    half = len(CUBIC_WINDOW) // 2
+    return np.median(np.lib.stride_tricks.sliding_window_view(
+        np.pad(size, half, mode="reflect"), len(CUBIC_WINDOW)), axis=1)  # fmt: skip
+
+
+def hidden_damping(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
+    """The largest damping ratio with which a resonance between neighbouring lines (k - 1,) may make
+    I + L singular and yet not show on them.
+
+    It has to be H = σ_min(I + L)/σ_max(K) high at least, and on the lines around it is then
+    q/(t - t₀) with q = H ζ/h, t counted in their distance h in ln f. G, its slope removed, leaves
+    room for a q beside what it does else, by the smaller of two estimates. Where lines are closer
+    than its width 2 ζ a resonance is not hidden either.
+    """
+    x = np.log(measured.hz)
+    h, flat = np.diff(x), (measured.hz / measured.hz[0]) ** measured.slope
+    G = measured.matrix * flat[:, None, None]
+    slope = np.diff(G, axis=0) / h[:, None, None]
+    around = 0.5 * (np.concatenate([slope[1:2], slope[:-1]])
+                    + np.concatenate([slope[1:], slope[-2:-1]]))  # fmt: skip
+    jump = np.pad(sigma_max(slope - around) * h, 2, mode="edge")
+    room = np.lib.stride_tricks.sliding_window_view(jump, 5).max(axis=1) / 4.0
+    room = np.minimum(room, _room_beside_a_pole(x, G.reshape(len(x), -1)))
+    eye, middle = np.eye(L.shape[1]), 0.5 * (L[1:] + L[:-1])
+    ends, centre = (np.linalg.norm(eye + part, -2, axis=(1, 2)) for part in (L, middle))
+    height = flat / sigma_max(k)
+    height = np.minimum(height[1:], height[:-1])
+    needed = np.minimum(centre, np.minimum(ends[1:], ends[:-1])) * height
+    return np.minimum(h * room / needed, 0.5 * h)
+
+
+def _room_beside_a_pole(x: Array, G: np.ndarray) -> Array:
+    """The largest q between neighbouring lines (k - 1,) of x, if G (k, entries) is else a parabola
+    over one pole on the lines around: how well that fits them over how badly it fits 1/(t - t₀).
+    Infinite where that pole is itself a resonance narrower than the lines."""
+    if len(x) < FITTED:
+        return np.full(len(x) - 1, np.inf)
+    every = np.arange(len(x) - 1)
+    lines = np.clip(every - FITTED // 2 + 1, 0, len(x) - FITTED)[:, None] + np.arange(FITTED)
+    t = (x[lines] - 0.5 * (x[1:] + x[:-1])[:, None]) / np.diff(x)[:, None]
+    room = np.zeros(len(every))
+    for own in G.T:
+        g = own[lines]
+        basis = np.stack([t**0, t, t**2, -t * g], axis=-1)
+        Q, R = np.linalg.qr(basis)
+
+        def beside(v: np.ndarray, Q: np.ndarray = Q) -> np.ndarray:
+            return np.asarray(v - (Q @ (Q.conj().swapaxes(1, 2) @ v[..., None]))[..., 0])
+
+        pole = np.linalg.solve(R, Q.conj().swapaxes(1, 2) @ g[..., None])[:, 3]
+        left = np.linalg.norm(beside(g), axis=1)
+        tails = [np.linalg.norm(beside((1.0 + pole * t) / (t - at)), axis=1) for at in INSIDE]
+        room += (SAFETY * left / np.min(tails, axis=0)) ** 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = -1.0 / pole[:, 0]
+        room[(np.abs(at.real) < NEAR_POLE) & (np.abs(at.imag) < NEAR_POLE)] = np.inf
+    return np.sqrt(room)
+
+
+def _span(hz: Array, i: int) -> str:
+    return f"between {hz[i]:.4g} and {hz[i + 1]:.4g} Hz"
+
+
+def _hidden(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray, doubts: list[str]) -> str:
+    """What of a resonance between two lines is assumed; a doubt where the lines do not show it."""
+    if measured.modelled:
+        return "a model is behind the lines"
+    hz, most, least = measured.hz, hidden_damping(measured, L, k), measured.least_damping
+    open_ = np.flatnonzero(most > least)
+    if len(open_):
+        worst = int(most.argmax())
+        doubts.append(
+            f"a resonance of damping up to {most[worst]:.2g} may hide {_span(hz, worst)} and make "
+            f"the loop unstable, and {len(open_)} pairs of lines from {hz[open_[0]]:.4g} to "
+            f"{hz[open_[-1] + 1]:.4g} Hz do not exclude one of {least:g}: measure more lines there"
+            ", or state the least damping of the plant (--least-damping, least_damping)"
+        )  # fmt: skip
+    return f"no resonance of less damping than {least:g} hides between two lines"
+
+
 def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
     """What σ_max(S) may reach between neighbouring lines (k - 1,): infinite where nothing is sure.
 
-    By L, or where it is large and its inverse the smoother by 1 + σ_max(T), T = (I + L⁻¹)⁻¹.
+    By L, or where it is large and its inverse the smoother by S = L⁻¹ (I + L⁻¹)⁻¹.
     L = GK at each line is known within u = ‖Δ |K|‖, so L⁻¹ within ‖L⁻¹‖²u/(1 - ‖L⁻¹‖u).
     """
     hz, over, unsure = measured.hz, np.linalg.inv(L), np.zeros(len(L))
@@ -163,9 +294,11 @@ def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
     with np.errstate(divide="ignore"):
         of_inverse = np.where(far < 1.0, sigma_max(over) * far / np.maximum(1.0 - far, 0.0), np.inf)
     direct, inverse = _clearances(hz, L, unsure), _clearances(hz, over, of_inverse)
+    size = sigma_max(over) + of_inverse
+    size = np.maximum(size[1:], size[:-1]) + interpolation_errors(hz, over)
     with np.errstate(divide="ignore"):
         by_L = np.where(direct > 0.0, 1.0 / np.maximum(direct, 0.0), np.inf)
-        by_inverse = np.where(inverse > 0.0, 1.0 + 1.0 / np.maximum(inverse, 0.0), np.inf)
+        by_inverse = np.where(inverse > 0.0, size / np.maximum(inverse, 0.0), np.inf)
     return np.minimum(by_L, by_inverse)
 
 
@@ -198,19 +331,28 @@ def winding(
     begins = float(np.angle(F[0]))
     asymptotes = -0.5 * np.pi * q + np.pi * np.arange(-4 * channels, 4 * channels + 1)
     first = float(asymptotes[np.argmin(np.abs(begins - asymptotes))])
-    grown = begins - first + float(np.angle(F[1:] / F[:-1]).sum() - np.angle(F[-1]))
+    grown = begins - first + float(_turns(measured, F).sum() - np.angle(F[-1]))
     Z = round(measured.unstable_poles + 0.5 * q - grown / np.pi)
     hz = measured.hz
     own = L[len(L) - len(hz) :]
     doubts = []
+    if len(set(measured.undamped_hz)) < len(measured.undamped_hz):
+        doubts.append("G has two undamped modes at one frequency")
+    large = np.flatnonzero(np.linalg.norm(own, 2, axis=(1, 2)) > SMALL)
+    seen = 0.0 if measured.modelled or not len(large) else measured.excess(hz[large[-1]])
+    if seen > measured.unstable_poles + RISEN:
+        doubts.append(
+            f"the angle of G rises by {180.0 * seen:.0f} deg more than that of a stable G of its "
+            "size: state its unstable poles (--unstable-poles, unstable_poles)"
+        )
     if measured.gap > GAP:
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
     if q > 0 and np.linalg.norm(own[0], -2) < LARGE:
-        doubts.append(f"at the first line, {hz[0]:.4g} Hz, |GK| is not large")
+        doubts.append(f"at the first line, {hz[0]:.4g} Hz, |GK| is not large: measure below it")
     if np.linalg.norm(own[-1], 2) > SMALL:
-        doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small")
+        doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small: measure above it")
     own = np.einsum("kii->ki", own)
-    wide = np.diff(hz) > 2.0 * LEAST_DAMPING * hz[1:]
+    wide = np.diff(hz) > 2.0 * measured.least_damping * hz[1:]
     falls = (np.angle(own[1:] / own[:-1]) < -0.5 * np.pi) & wide[:, None]
     hidden = np.flatnonzero((falls & (np.abs(own[1:]) > HIDDEN)).any(axis=1))
     if len(hidden):
@@ -219,7 +361,23 @@ def winding(
     return Z, doubts
 
 
-def _bandwidth(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
+def _turns(measured: MeasuredResponse, F: np.ndarray) -> Array:
+    """How far the angle of F (k,) grows from line to line.
+
+    Past a pole on the axis F ~ a + b/(ω - ω₀): out along b, half a turn back (the contour passes
+    right of the pole, which then counts as stable), and in again.
+    """
+    turns = np.angle(F[1:] / F[:-1])
+    hz = measured.followed.hz
+    for pole in measured.undamped_hz:
+        i = int(np.searchsorted(hz, pole)) - 1
+        if 0 <= i < len(turns):
+            b = (F[i] - F[i + 1]) / (1.0 / (hz[i] - pole) - 1.0 / (hz[i + 1] - pole))
+            turns[i] = np.angle(-b / F[i]) - np.pi + np.angle(F[i + 1] / b)
+    return np.asarray(turns)
+
+
+def bandwidth_within(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
     """The largest ω_b with |S| <= 1/√2 on the lines below it and |S| within the shape."""
     level = -HALF_POWER
     above = np.flatnonzero(ln_S > level)

@@ -1,25 +1,25 @@
 """Measured frequency responses: a plant as its lines, read from files and from python-control."""
 
-import csv
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.plants.response_table import PLACES, least_phase, read_table
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError, described
-from ccd_casadi.support.mat_files import mat_variables
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
 BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25
+DERIVATIVES = {1: "a mobility (velocity over force); divide it by j 2π f",
+               2: "an accelerance (acceleration over force); divide it by -(2π f)²"}  # fmt: skip
+RISES = 0.35  # of slope, and rad: so far from those of a derivative
 FIRST = 1.5  # times the first line: up to there its slope says how many poles lie at 0
+LEAST_DAMPING = 5e-4  # of a resonance, where nothing else is known
 PEAK = 1.0  # ln: by so much a resonance stands out of |G|
-COLUMNS = {"f_hz": "hz", "hz": "hz", "frequency_hz": "hz", "re": "re", "im": "im", "real": "re",
-           "imag": "im", "magnitude": "size", "magnitude_db": "db", "phase_deg": "deg",
-           "phase_rad": "rad", "response": "G", "g": "G"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,9 @@ class MeasuredResponse:
     `unstable_poles` of G. `poles_at_zero`: n of G ~ (jω)^-n below the first line; by default by the
     slope of the first lines. `modelled`: a model stands behind it, which decides what lines leave
     open. `spread` of repeated measurements, of the shape of G: each entry lies within it of the
-    plant's. Raises UserError where that is no response.
+    plant's. `words`: how a file was understood. `least_damping`: no resonance has less, so that one
+    between two lines shows on them or is harmless. `undamped_hz`: poles of G on the axis.
+    Raises UserError where that is no response.
     """
 
     hz: Array
@@ -38,6 +40,9 @@ class MeasuredResponse:
     poles_at_zero: int | None = None
     modelled: bool = False
     spread: Array | None = None
+    words: str = field(default="", compare=False)
+    least_damping: float = LEAST_DAMPING
+    undamped_hz: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         shape = self.G.shape
@@ -55,8 +60,10 @@ class MeasuredResponse:
             raise UserError("a measured response holds finite numbers only; drop the other lines")
         if self.hz[0] <= 0.0 or (np.diff(self.hz) <= 0.0).any():
             raise UserError("the lines of a measured response have to rise from above 0 Hz")
-        if (self.matrix == 0.0).all(axis=(1, 2)).any():
-            raise UserError("a measured response is 0 at a line; drop it")
+        still = (self.matrix == 0.0).all(axis=(1, 2))
+        if still.any():
+            at = f"{self.hz[np.argmax(still)]:.6g} Hz"
+            raise UserError(f"a measured response is 0 at {at}; drop that line")
 
     @property
     def matrix(self) -> np.ndarray:
@@ -68,9 +75,23 @@ class MeasuredResponse:
         """n of G ~ (jω)^-n below the first line."""
         if self.poles_at_zero is not None:
             return self.poles_at_zero
+        return max(0, round(self._fall))
+
+    @cached_property
+    def _fall(self) -> float:
+        """-d ln|G|/d ln f of the first lines."""
         many = max(3, int(np.searchsorted(self.hz, FIRST * self.hz[0])))
         size = np.linalg.norm(self.matrix[:many], axis=(1, 2))
-        return max(0, round(-float(np.polyfit(np.log(self.hz[:many]), np.log(size), 1)[0])))
+        return -float(np.polyfit(np.log(self.hz[:many]), np.log(size), 1)[0])
+
+    @property
+    def derivative(self) -> str:
+        """Of which time derivative of the displacement its first lines are: their slope and angle
+        agree; empty where of none."""
+        order = round(-self._fall)
+        angle = float(np.angle((self.matrix[0] * (-1j) ** order).sum()))
+        rises = order in DERIVATIVES and abs(order + self._fall) < RISES and abs(angle) < RISES
+        return DERIVATIVES[order] if rises else ""
 
     @cached_property
     def static(self) -> np.ndarray:
@@ -99,6 +120,18 @@ class MeasuredResponse:
         """The angle (rad) between G at the first line and its asymptote there."""
         turned = self.matrix[0] * 1j**self.slope
         return float(np.arctan2(np.linalg.norm(turned.imag), np.linalg.norm(turned.real)))
+
+    def excess(self, to_hz: float) -> float:
+        """Half turns by which the angle of det G rises from the first line on, up to `to_hz`, more
+        than that of a stable G of this size: each unstable pole there adds one."""
+        used = self.hz <= to_hz
+        if used.sum() < 3 or self.matrix.shape[1] != self.matrix.shape[2]:
+            return 0.0
+        x, F = np.log(self.hz[used]), np.linalg.det(self.matrix[used])
+        places = np.linspace(x[0], x[-1], PLACES)
+        least = least_phase(np.interp(places, x, np.log(np.abs(F))), places)
+        risen = np.interp(places, x, np.unwrap(np.angle(F))) - least
+        return float((risen - risen[0]).max() / np.pi)
 
     @cached_property
     def followed(self) -> "MeasuredResponse":
@@ -133,8 +166,8 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
     ----------
     path : path
         CSV with a header of f_hz and re, im (or magnitude or magnitude_db, and phase_deg or
-        phase_rad), or .mat or .npz with these names or with f_hz and a complex G. Beside re and im,
-        or G, there may be the `spread` of repeated measurements.
+        phase_rad), or .mat or .npz with these names or with f_hz and a complex G. Beside them there
+        may be the `spread` of repeated measurements.
 
     Returns
     -------
@@ -144,24 +177,13 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
     Raises
     ------
     UserError
-        Something is missing, and what.
+        Something is missing, not understood or may mean two plants, and what.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".npz":
-        return _of_columns(_npz(path), path)
-    if path.suffix.lower() == ".mat":
-        return _of_columns(_named(mat_variables(path)), path)
+    found = read_table(Path(path))
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
-        names = [name.strip().lower() for name in rows[0]]
-        table = np.array([[float(part) for part in row] for row in rows[1:]])
-        columns = {COLUMNS.get(name, name): column for name, column in
-                   zip(names, table.T, strict=True)}  # fmt: skip
-    except (OSError, ValueError, IndexError) as error:
-        reason = getattr(error, "strerror", None) or "it is not a table of numbers with a header"
-        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
-    return _of_columns(columns, path)
+        return MeasuredResponse(found.hz, found.G, spread=found.spread, words=found.words)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
 
 
 def from_control(system: Any) -> MeasuredResponse:
@@ -169,48 +191,3 @@ def from_control(system: Any) -> MeasuredResponse:
     data = np.moveaxis(np.asarray(system.frdata), -1, 0).astype(complex)
     one = data.shape[1:] == (1, 1)
     return MeasuredResponse(np.asarray(system.omega, float) / HZ, data[:, 0, 0] if one else data)
-
-
-def _npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return _named(dict(file))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or described(error)
-        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
-
-
-def _named(variables: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Those that hold numbers, by the names that count; a matrix at each line as it is."""
-    found = {}
-    for name, value in variables.items():
-        numbers = np.asarray(value)
-        if not name.startswith("__") and numbers.dtype.kind in "iufc":
-            numbers = numbers if numbers.ndim == 3 else numbers.ravel()
-            found[COLUMNS.get(name.lower(), name)] = numbers
-    return found
-
-
-def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
-    if "hz" not in columns:
-        raise UserError(f"{path}: has no column f_hz; give the frequencies that name")
-    hz = np.real(columns["hz"]).astype(float)
-    if "G" in columns:
-        G, spread = np.asarray(columns["G"], complex), columns.get("spread")
-        if G.ndim == 3 and len(G) != len(hz):  # lines last, as MATLAB has them
-            G = np.moveaxis(G, -1, 0)
-            spread = spread if spread is None else np.moveaxis(spread, -1, 0)
-        return MeasuredResponse(hz, G, spread=spread)
-    if "re" in columns and "im" in columns:
-        spread = columns.get("spread")
-        return MeasuredResponse(hz, columns["re"] + 1j * columns["im"], spread=spread)
-    size = columns.get("size")
-    if "db" in columns:
-        size = 10.0 ** (columns["db"] / 20.0)
-    angle = columns.get("rad")
-    if "deg" in columns:
-        angle = np.deg2rad(columns["deg"])
-    if size is None or angle is None:
-        words = "needs re and im, or magnitude (or magnitude_db) and phase_deg (or phase_rad)"
-        raise UserError(f"{path}: {words}")
-    return MeasuredResponse(hz, size * np.exp(1j * angle))

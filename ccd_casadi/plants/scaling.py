@@ -17,6 +17,8 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
+ROUNDING = 1e-13  # relative: of C Aⁿ B
+ON_AXIS = 1e-9  # |Re p| over |p| up to which no frequency is put on p
 FLANKS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])  # in half widths of a root
 
 
@@ -150,24 +152,40 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
 
         ω₀² = M_K ‖C A B‖, the inertial compliance being C A B / s²
 
-    Coordinates are balanced; there are no derivatives and no channels. Raises PlantError for a
-    plant with feedthrough, that is not finite, or that no state drives.
+    Where that is 0, ω₀ⁿ = M_K ‖C Aⁿ⁻¹ B‖ with the first n for which it is not (3 with a lag
+    before the force). Coordinates are balanced; there are no derivatives and no channels. Raises
+    PlantError for a plant with feedthrough, that is not finite, or whose output no force moves.
     """
     n, m, p = len(system.A), system.B.shape[1], system.C.shape[0]
     if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C)):
         raise PlantError("its state space is not finite")
     if np.any(system.D):
         raise PlantError("it has a direct feedthrough; a plant is force to displacement, D = 0")
-    inertial = float(np.linalg.norm(system.C @ system.A @ system.B, 2))
-    if not inertial > 0.0:
-        raise PlantError("C A B is zero: no force accelerates what is measured")
-    omega_0 = float(np.sqrt(M_K * inertial))
+    order, inertial = leading_gain(system)
+    if not order:
+        raise PlantError("C Aⁿ B is zero for every n: no force accelerates what is measured")
+    omega_0 = float((M_K * inertial) ** (1.0 / order))
     A, B, C = balanced(system.A / omega_0, system.B * (M_K / omega_0), system.C)
     grid, gain = _gains(A, B, C)
     poles = np.linalg.eigvals(system.A)
     natural = np.sort(np.abs(poles[poles.imag >= 0.0]))
     none = (np.zeros((0, n, n)), np.zeros((0, n, m)), np.zeros((0, p, n)))
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
+
+
+def leading_gain(system: StateSpace) -> tuple[int, float]:
+    """n and ‖C Aⁿ⁻¹ B‖ of the plant's C Aⁿ⁻¹ B / sⁿ at high frequencies: n = 2 where that is not 0,
+    else the first; 0 and 0 where the plant is 0."""
+    A, B, C = balanced(system.A, system.B, system.C)
+    sizes = [float(np.linalg.norm(M, 2)) for M in (C, A, B)]
+    found, power = {}, B
+    for n in range(1, len(A) + 1):
+        size = float(np.linalg.norm(C @ power, 2))
+        if size > ROUNDING * sizes[0] * sizes[1] ** (n - 1) * sizes[2]:
+            found[n] = size
+        power = A @ power
+    order = 2 if 2 in found else min(found, default=0)
+    return order, found.get(order, 0.0)
 
 
 def _scaled_channels(
@@ -194,5 +212,8 @@ def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     roots = np.concatenate([system.poles, system.zeros()])
     roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
     wide = np.maximum(np.abs(roots.real), 1e-9 * roots.imag) + 1j * roots.imag
-    grid = np.ascontiguousarray(frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS)))
+    grid = frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS))
+    axis = system.poles[np.abs(system.poles.real) < ON_AXIS * np.abs(system.poles)].imag
+    on_pole = np.abs(grid[:, None] - np.abs(axis)) < 0.5 * ON_AXIS * grid[:, None]
+    grid = np.ascontiguousarray(grid[~on_pole.any(axis=1)])
     return grid, plant_gain(A, B, C, grid)

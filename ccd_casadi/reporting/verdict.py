@@ -103,7 +103,9 @@ def advice(result: Mapping[str, Any]) -> str:
     looked_at = loop_concerns(result)
     if not states:
         words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
-        return f"{words} Next: a smaller S_max." if looked_at else ""
+        lines = all("between two lines" in concern for concern in looked_at)
+        after = "more lines there, or more averages" if lines else "a smaller S_max"
+        return f"{words} Next: {after}." if looked_at else ""
     if failed or result.get("status") != "verified":
         why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
         return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
@@ -149,7 +151,9 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
             found.append("a step does not settle within 160 periods of the bandwidth")
     reach = result.get("sensitivity_peak_between_lines")  # of a measured response
     if reach is not None and reach > BETWEEN * result["sensitivity_peak"]:
-        found.append(f"|S| may reach {reach:.3g} between two lines: measure more of them there")
+        where = result.get("sensitivity_peak_between_lines_hz")
+        at = "" if where is None else f" about {where:.4g} Hz"
+        found.append(f"|S| may reach {reach:.3g} between two lines{at}")
     return [*found, *result.get("loop_warnings", ())]
 
 

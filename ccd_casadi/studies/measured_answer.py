@@ -40,6 +40,7 @@ def answer_of(case: MeasuredCase, design: MeasuredDesign) -> InnerAnswer:
         "sensitivity_peak": f.S_peak,
         "sensitivity_peak_hz": f.S_peak_frequency / HZ,
         "sensitivity_peak_between_lines": f.S_between,
+        "sensitivity_peak_between_lines_hz": f.S_between_frequency / HZ,
         "sensitivity_low": f.S_low,
         "compliance_max": f.GS,
         "KS_max": f.KS,
@@ -51,7 +52,8 @@ def answer_of(case: MeasuredCase, design: MeasuredDesign) -> InnerAnswer:
             "passed": design.usable,
             "figures_over_bounds": case.bounds.shares(f),
         },
-        "controller": sections_dict(design.structure, kappa) | {"kappa": kappa.tolist()},
+        "controller": sections_dict(design.structure, kappa)
+        | {"kappa": kappa.tolist(), "sign": design.sign},
     }
     sampling = None if case.period is None else Sampling(1 / case.period)
     controller = sections_controller(design, sampling)

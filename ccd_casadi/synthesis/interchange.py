@@ -10,7 +10,7 @@ Ts (s, 0 for continuous time), InputName, OutputName, InputUnit, OutputUnit, and
 theta_names, theta_units. `ss(K.A, K.B, K.C, K.D, K.Ts)` makes it a system.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,26 +20,28 @@ import scipy
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.mat_files import mat_variables
+from ccd_casadi.synthesis.matlab_systems import PARTS, strings, system_of, systems_in
+from ccd_casadi.synthesis.realisation import realised
 
 if TYPE_CHECKING:
     import control  # a second to import: where it is called, and not before
 
-PARTS = ("A", "B", "C", "D")
 LONGEST_NAME = 63  # of a variable in MATLAB
 
 
 @dataclass(frozen=True)
 class NamedSystem:
-    """A state space with named signals."""
+    """A state space with named signals; `delay` in s before it, `words`: how it was understood."""
 
     system: StateSpace
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     input_unit: str
     output_unit: str
+    delay: float = 0.0
+    words: str = ""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ def to_control(named: NamedSystem, name: str = "") -> "control.StateSpace":
 def from_control(system: Any) -> StateSpace:
     """A `control` system, in whatever form it is.
 
-    Raises UserError where it is no linear system, or is discrete without a sampling period.
+    Raises UserError where it is no linear system, is discrete without a sampling period, or has no
+    state space that is the same plant.
     """
     import control
 
@@ -86,12 +89,12 @@ def from_control(system: Any) -> StateSpace:
         raise UserError(f"{type(system).__name__}: {words}")
     if system.dt is True:
         raise UserError("the system is in discrete time without a period; give it a dt in s")
-    try:
-        space = control.ss(system)
-    except (ValueError, control.ControlMIMONotImplemented) as error:
-        raise UserError(f"the system has no state space: {error}; make it proper") from None
-    parts = (np.array(part, dtype=float) for part in (space.A, space.B, space.C, space.D))
-    return StateSpace(*parts, period=float(system.dt or 0.0))
+    if isinstance(system, control.TransferFunction):
+        return realised(system)
+    parts = [np.array(getattr(system, part)) for part in PARTS]
+    if any(np.iscomplexobj(part) or not np.isfinite(part).all() for part in parts):
+        raise UserError("the state space has an entry that is not a finite real number")
+    return StateSpace(*(part.astype(float) for part in parts), period=float(system.dt or 0.0))
 
 
 def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
@@ -161,60 +164,33 @@ def read_mat(path: Path) -> DesignFile:
     UserError naming file and variable where something is missing or damaged.
     """
     content = mat_variables(path)
-    systems = {name: _system(path, name, struct) for name, struct in _structs(path, content)}
+    systems = {name: _named(path, name, fields) for name, fields in systems_in(path, content)}
     if not systems:
-        raise UserError(f"{path}: holds no struct with A, B, C, D; save one for each system")
-    names = _strings(content.get("theta_names"))
+        words = "holds no struct with A, B, C, D, nor f_hz and G of a response"
+        raise UserError(f"{path}: {words}; save one for each system")
+    names = strings(content.get("theta_names"))
     values = np.asarray(content.get("theta", np.zeros(0))).ravel()
-    units = _strings(content.get("theta_units"))
+    units = strings(content.get("theta_units"))
     if len(names) != len(values) or values.dtype.kind not in "fiu":
         raise UserError(f"{path}: theta: is not one number for each of theta_names")
     theta = {name: float(value) for name, value in zip(names, values, strict=True)}
     return DesignFile(systems, theta, dict(zip(names, units, strict=False)))
 
 
-def _structs(path: Path, content: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Each struct with an A; a file that has A, B and C themselves is one, without a name."""
-    if {"A", "B", "C"} <= set(content):
-        yield "", {"D": np.zeros((len(content["C"]), content["B"].shape[1])), **content}
-    for name, value in content.items():
-        if isinstance(value, np.ndarray) and "A" in (value.dtype.names or ()):
-            if value.size != 1:
-                raise UserError(f"{path}: {name}: is an array of structs; save one struct")
-            yield name, {key: value.ravel()[0][key] for key in value.dtype.names or ()}
-
-
-def _system(path: Path, name: str, struct: Mapping[str, Any]) -> NamedSystem:
-    missing = [part for part in PARTS if part not in struct]
-    if missing:
-        raise UserError(f"{path}: {name}: has no {missing[0]}")
-    A, B, C, D = (_matrix(path, f"{name}.{part}".lstrip("."), struct[part]) for part in PARTS)
-    n, m, p = A.shape[0], D.shape[1], D.shape[0]
-    if A.shape != (n, n) or B.shape != (n, m) or C.shape != (p, n):
-        sizes = ", ".join(str(part.shape) for part in (A, B, C, D))
-        raise UserError(f"{path}: {name}: the sizes of A, B, C, D do not fit: {sizes}")
-
-    period = 0.0
-    if "Ts" in struct:
-        Ts = _matrix(path, f"{name}.Ts", struct["Ts"])
-        if Ts.size != 1 or Ts[0, 0] < 0.0:
-            raise UserError(f"{path}: {name}.Ts: is not a sampling period in s, or 0")
-        period = float(Ts[0, 0])
+def _named(path: Path, name: str, fields: Mapping[str, Any]) -> NamedSystem:
+    found = system_of(path, name, fields)
     signals = ("InputName", "OutputName", "InputUnit", "OutputUnit")
-    inputs, outputs, *units = (_strings(struct.get(key)) for key in signals)
+    inputs, outputs, input_unit, output_unit = (strings(fields.get(key)) for key in signals)
+    m, p = found.system.B.shape[1], len(found.system.C)
     return NamedSystem(
-        StateSpace(A, B, C, D, period=period),
+        found.system,
         inputs if len(inputs) == m else _names("u", m),
         outputs if len(outputs) == p else _names("y", p),
-        *map(" ".join, units),
+        " ".join(input_unit),
+        " ".join(output_unit),
+        found.delay,
+        found.words,
     )
-
-
-def _matrix(path: Path, name: str, value: Any) -> Array:
-    matrix = np.asarray(value)
-    if matrix.ndim != 2 or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
-        raise UserError(f"{path}: {name}: is not a finite real matrix")
-    return np.ascontiguousarray(matrix, dtype=float)
 
 
 def _cells(texts: Sequence[str]) -> np.ndarray:
@@ -222,14 +198,6 @@ def _cells(texts: Sequence[str]) -> np.ndarray:
     cells = np.empty((len(texts), 1), dtype=object)
     cells[:, 0] = list(texts)
     return cells
-
-
-def _strings(value: Any) -> tuple[str, ...]:
-    """The texts of a cell array, or of one text."""
-    if value is None:
-        return ()
-    parts = map(np.ravel, np.asarray(value).ravel())
-    return tuple(str(part[0]) if part.size else "" for part in parts)
 
 
 def _names(letter: str, count: int) -> tuple[str, ...]:

@@ -46,6 +46,10 @@ class Outcome(StrEnum):
         "in the case raise inner.gamma_backoff (1.05, 1.2), lower weights.M_K, or narrow "
         "inner.omega_S_hz and inner.omega_T_hz"
     )
+    PLANT_NOT_STABLE = (
+        "the plant is not stable, as mixed sensitivity needs it: give the weights a disturbance, "
+        "or use ccd.tune"
+    )
     NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
 
@@ -143,6 +147,8 @@ def synthesise(
                      omega_low / w0, guess, on.channels, weights.delta,
                      judged_on(plant))  # fmt: skip
     figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
+    if not weights.delta and not np.linalg.eigvals(on.A).real.max(initial=-1.0) < 0.0:
+        figures = replace(figures, outcome=Outcome.PLANT_NOT_STABLE, gamma_opt=np.nan)
     controller = plant.controller_si(Ak, Bk, Ck)
     if compliance and figures.certified:
         figures = replace(figures, compliance=compliance_over_family(plant, controller).gain)

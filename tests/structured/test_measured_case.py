@@ -106,12 +106,12 @@ def test_mistakes_are_named(tmp_path: Path, old: str, new: str, words: str) -> N
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.csv", b"", "not a table of numbers"),
+        ("a.csv", b"", "is empty"),
         ("a.csv", b"f_hz,re,im\n1,2,three\n", "not a table of numbers"),
-        ("a.csv", b"f_hz,re,im\n1,2\n", "not a table of numbers"),
-        ("a.csv", b"time,re,im\n1,2,3\n", "no column f_hz"),
+        ("a.csv", b"f_hz,re,im\n1,2\n", "line 2: has 2 cells"),
+        ("a.csv", b"time,re,im\n1,2,3\n", "'time': is not understood"),
         ("a.csv", b"f_hz,re\n1,2\n", "needs re and im"),
-        ("a.csv", b"f_hz,re,im\n" + b"1,2,3\n" * 6, "have to rise"),
+        ("a.csv", b"f_hz,re,im\n" + b"1,2,3\n" * 6, "line 3 repeats 1 Hz"),
         ("a.csv", b"f_hz,re,im\n1,2,3\n", "five lines or more"),
         ("a.csv", b"\xff\xfe\x00\x01", "not a table of numbers"),
         ("a.mat", b"no such thing", r"\.mat file"),

@@ -1,0 +1,249 @@
+"""200 files of a plant that is known: each is read as that plant, or refused by the name of what is
+not understood; none is read as another one."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+from scipy.sparse import csc_matrix
+
+from ccd_casadi.plants.measured import read_frequency_response
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.synthesis.interchange import read_mat
+
+HZ = 2.0 * np.pi
+Fields = dict[str, object]
+
+
+def random_model(rng: np.random.Generator) -> Fields:
+    """A stage with modes, one or two channels."""
+    n, p = int(rng.integers(1, 4)), int(rng.integers(1, 3))
+    w, zeta = 10.0 ** rng.uniform(0.0, 3.0, n), 10.0 ** rng.uniform(-3.0, 0.0, n)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(w**2), -np.diag(2.0 * zeta * w)]])
+    B = np.vstack([np.zeros((n, p)), rng.normal(size=(n, p))])
+    C = np.hstack([rng.normal(size=(p, n)), np.zeros((p, n))])
+    return {"A": A, "B": B, "C": C, "D": np.zeros((p, p))}
+
+
+def response(m: Fields, omega: np.ndarray) -> np.ndarray:
+    A, B, C, D = (np.asarray(m[part]) for part in "ABCD")
+    return np.stack([C @ np.linalg.solve(1j * o * np.eye(len(A)) - A, B + 0j) + D for o in omega])
+
+
+def plain(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable[[np.ndarray], object]]:
+    return {}, lambda omega: 1.0
+
+
+def descriptor(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
+    n = len(np.asarray(m["A"]))
+    E = np.eye(n) + 0.3 * rng.normal(size=(n, n))
+    return {"E": E, "A": E @ m["A"], "B": E @ m["B"]}, lambda omega: 1.0
+
+
+def input_delay(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
+    tau = rng.uniform(1e-3, 0.1)
+    p = np.asarray(m["D"]).shape[0]
+    key = str(rng.choice(["InputDelay", "OutputDelay", "IODelay", "ioDelay"]))
+    shape = (p, p) if key.lower() == "iodelay" else (p, 1)
+    return {key: np.full(shape, tau)}, lambda omega: np.exp(-1j * omega * tau)[:, None, None]
+
+
+def unlike_delays(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
+    p = np.asarray(m["D"]).shape[0]
+    tau = rng.uniform(1e-3, 0.1, p)
+    late = {"OutputDelay": tau[:, None]}
+    return late, lambda omega: np.exp(-1j * np.outer(omega, tau))[:, :, None]
+
+
+def minutes(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
+    unit, word = [(1e-3, "milliseconds"), (60.0, "minutes")][rng.integers(2)]
+    tau = rng.uniform(1e-3, 0.1)
+    fields = {"A": unit * m["A"], "B": unit * m["B"], "TimeUnit": word, "InputDelay": tau / unit}
+    return fields, lambda omega: np.exp(-1j * omega * tau)[:, None, None]
+
+
+def sparse(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
+    chosen = [part for part in "ABCD" if rng.random() < 0.6] or ["C"]
+    return {part: csc_matrix(m[part]) for part in chosen}, lambda omega: 1.0
+
+
+def harmless(m: Fields, rng: np.random.Generator) -> tuple[Fields, Callable]:
+    return {"Name": "stage", "StateName": "x", "InternalDelay": np.zeros((0, 1)), "UserData": [],
+            "OutputDelay": np.zeros((1, 1)), "NoiseVariance": 0.0}, lambda omega: 1.0  # fmt: skip
+
+
+def refused(name: str, value: object) -> Callable:
+    return lambda m, rng: ({name: value}, None)
+
+
+WAYS = {
+    "": plain, "E": descriptor, "Delay": input_delay, "OutputDelay": unlike_delays,
+    "TimeUnit": minutes, "sparse": sparse, "harmless": harmless,
+    "InternalDelay": refused("InternalDelay", 0.01), "Offsets": refused("Offsets", {"x": [1.0]}),
+    "Kalman": refused("Kalman", np.ones((2, 1))), "tau": refused("tau", 0.02),
+    "timeunit": refused("TimeUnit", "fortnights"), "singular": refused("E", np.zeros((2, 2))),
+    "Ts": refused("Ts", -1.0), "nan": refused("A", np.full((2, 2), np.nan)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_no_model_is_read_as_another(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    m = random_model(rng)
+    word = list(WAYS)[seed % len(WAYS)]
+    fields, factor = WAYS[word](m, rng)
+    whole = m | fields
+    path, nested = tmp_path / "x.mat", bool(rng.random() < 0.5)
+    savemat(path, {"sys": whole} if nested else whole)
+    known = {"nan": r"\bA: ", "singular": r"\bE: ", "timeunit": "TimeUnit", "Kalman": "Kalman"}
+    if factor is None:
+        if word == "Kalman" and not nested:
+            return  # a vector beside matrices, of which nothing says that it is theirs
+        if word == "Offsets" and not nested:
+            return  # a struct beside them
+        with pytest.raises(UserError, match=known.get(word, word)):
+            read_mat(path)
+        return
+    omega = np.geomspace(0.1, 1e4, 60)
+    truth = response(m, omega) * factor(omega)
+    if word == "OutputDelay" and len(truth[0]) > 1:
+        with pytest.raises(UserError, match="OutputDelay: differs between channels"):
+            read_mat(path)
+        return
+    (found,) = read_mat(path).systems.values()
+    read = found.system.response(omega) * np.exp(-1j * omega * found.delay)[:, None, None]
+    assert np.abs(read - truth).max() <= 1e-6 * np.abs(truth).max()
+    np.testing.assert_allclose(read, truth, rtol=1e-5, atol=1e-9 * np.abs(truth).max())
+    assert "state" in found.words
+
+
+def random_lines(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A stage with a resonance and a delay, on lines evenly or by decades apart."""
+    hz = np.linspace(1.0, 800.0, 400) if rng.random() < 0.5 else np.geomspace(0.5, 900.0, 150)
+    s = 1j * HZ * hz
+    w, zeta = HZ * rng.uniform(100.0, 400.0), 10.0 ** rng.uniform(-2.0, -1.0)
+    first = HZ * rng.uniform(1.0, 30.0)
+    body = 1.0 / (s**2 + 2.0 * rng.uniform(0.05, 1.0) * first * s + first**2)
+    G = body + 0.3 * rng.choice([-1.0, 1.0]) / (s**2 + 2.0 * zeta * w * s + w**2)
+    G = 10.0 ** rng.uniform(-2.0, 4.0) * G * np.exp(-s * rng.uniform(0.0, 2e-3))
+    return hz, G
+
+
+def table_text(names: list[str], columns: list[np.ndarray], rng: np.random.Generator) -> bytes:
+    """A dialect of CSV."""
+    mark, comma = [(",", False), (";", False), (";", True), ("\t", False), ("\t", True)][
+        rng.integers(5)
+    ]
+    rows = [mark.join(names)]
+    for row in zip(*columns, strict=True):
+        cells = [f"{v.real:.12g}" + (f"{v.imag:+.12g}j" if isinstance(v, complex) else "")
+                 for v in row]  # fmt: skip
+        rows.append(mark.join(c.replace(".", ",") if comma else c for c in cells))
+    if rng.random() < 0.3:
+        rows.insert(0, "# measured by hand")
+    if rng.random() < 0.3:
+        rows.insert(0, "Session 12")
+    text = "\n".join([*rows, ""]) + ("\n \n" if rng.random() < 0.3 else "")
+    return text.encode(str(rng.choice(["utf-8", "utf-16", "latin-1", "utf-8-sig"])))
+
+
+FORMS = ("re, im", "mag, deg", "db, rad", "Unit (…)", "complex", "khz")
+FAULTS = ("", "", "rad as deg", "unwrapped rad as deg", "deg as rad", "db as mag", "twice",
+          "unknown", "phase dropped", "no unit", "both")  # fmt: skip
+
+
+def table_of(
+    form: str, fault: str, hz: np.ndarray, G: np.ndarray
+) -> tuple[list[str], list[np.ndarray], str]:
+    """Names, columns and the word that a refusal has to have."""
+    size, angle = np.abs(G), np.angle(G)
+    if fault in ("rad as deg", "unwrapped rad as deg"):
+        turned = np.unwrap(angle) if fault.startswith("un") else angle
+        return ["f_hz", "magnitude", "phase_deg"], [hz, size, turned], "phase_deg"
+    if fault == "deg as rad":
+        return ["f_hz", "magnitude", "phase_rad"], [hz, size, np.rad2deg(angle)], "phase_rad"
+    if fault == "db as mag":
+        db = 20.0 * np.log10(size)
+        shifted = db - db.min() + 5.0  # of another unit: all above 0
+        chosen = shifted if hz[1] - hz[0] > 0.5 else db
+        return ["f_hz", "magnitude", "phase_deg"], [hz, chosen, np.rad2deg(angle)], "magnitude"
+    if fault == "no unit":
+        return ["f_hz", "magnitude", "phase"], [hz, size, np.rad2deg(angle)], "phase"
+    if fault == "phase dropped":
+        return ["f_hz", "G"], [hz, size], "phase"
+    names, columns = {
+        "re, im": (["f_hz", "re", "im"], [hz, G.real, G.imag]),
+        "mag, deg": (["frequency_hz", "magnitude", "phase_deg"], [hz, size, np.rad2deg(angle)]),
+        "db, rad": (["hz", "magnitude_db", "phase_rad"], [hz, 20.0 * np.log10(size), angle]),
+        "Unit (…)": (["Frequency [Hz]", "Magnitude (dB)", "Phase (deg)"],
+                     [hz, 20.0 * np.log10(size), np.rad2deg(angle)]),
+        "complex": (["f_hz", "G"], [hz, G]),
+        "khz": (["frequency (kHz)", "real", "imag"], [hz / 1e3, G.real, G.imag]),
+    }[form]  # fmt: skip
+    if fault == "twice":
+        return [*names, names[1]], [*columns, 0.01 * columns[1]], re.escape(names[1])
+    if fault == "unknown":
+        return [*names, "delay"], [*columns, np.full(len(hz), 1e-3)], "delay"
+    if fault == "both":
+        if form in ("re, im", "khz"):
+            return [*names, "G"], [*columns, G], "G"
+        return [*names, "real", "imag"], [*columns, G.real, G.imag], "real"
+    return list(names), list(columns), ""
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_no_table_is_read_as_another(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    hz, G = random_lines(rng)
+    form, fault = FORMS[seed % len(FORMS)], FAULTS[seed % len(FAULTS)]
+    names, columns, word = table_of(form, fault, hz, G)
+    if seed % 3 and fault != "twice":  # a file of arrays cannot have a name twice
+        path = tmp_path / ("x.npz" if seed % 3 == 1 else "x.mat")
+        plain_names = [re.sub(r"\W+", "_", name).strip("_") for name in names]
+        content = dict(zip(plain_names, columns, strict=True))
+        np.savez(path, **content) if seed % 3 == 1 else savemat(path, content)
+    else:
+        path = tmp_path / "x.csv"
+        path.write_bytes(table_text(names, columns, rng))
+    if fault:
+        with pytest.raises(UserError, match=word):
+            read_frequency_response(path)
+        return
+    found = read_frequency_response(path)
+    np.testing.assert_allclose(found.hz, hz, rtol=1e-9)
+    np.testing.assert_allclose(found.G, G, rtol=1e-8)
+    assert "lines from" in found.words
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1,2,3\n" * 6, "line 1: has no header"),
+        ("f_hz,re,im\n1,2,3\n2,x,3\n", "line 3: 'x' is not a number"),
+        ("f_hz,re,im\n1,2,3\n2,nan,3\n", "line 3: 'nan' is not a finite number"),
+        ("f_hz,re,im\n1,2,3\n3,2,3\n2,2,3\n", "line 4 falls to 2 Hz"),
+        ("f_hz,re,im\n1,2,3\n1,2,3\n", "line 3 repeats 1 Hz"),
+        ("f_hz,re,im\n1,5,0,2,0,3\n", "line 2: has 6 cells and the header 3: are its decimals"),
+        ("f_hz;re;im\n1,234;5,678;9,123\n", "line 2: a comma may be a decimal or part thousands"),
+        ("f_hz;re;im\n1.5;5,678;9,123\n", "line 2: a comma may be"),
+        ("f,re,im\n1,2,3\n", "'f': names no unit; it may be hz or rad/s"),
+        ("    -1\n    58\n", "universal file"),
+    ],
+)
+def test_the_cause_is_named_with_its_line(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=re.escape(words)):
+        read_frequency_response(path)
+
+
+def test_a_line_at_0_hz_and_a_row_of_units_are_reported(tmp_path: Path) -> None:
+    rows = "".join(f"{f},{1.0 / f},{-0.1 * f}\n" for f in range(1, 8))
+    (tmp_path / "x.csv").write_text(f"f_hz,re,im\nHz,m/N,m/N\n0,1,0\n{rows}")
+    found = read_frequency_response(tmp_path / "x.csv")
+    assert found.hz[0] == 1.0
+    assert "line 2 holds the units" in found.words
+    assert "line 3 at 0 Hz is left out" in found.words
