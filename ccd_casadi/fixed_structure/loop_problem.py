@@ -1,12 +1,13 @@
 """What is asked of the loops of a set, as constraints on logarithms of gains over their bounds.
 
     S_max   ln|S| - ln S_max                    every local peak
-    level   ln|S| + ½ ln 2                      every local peak on ω <= ω_b, and ω_b itself
-    shape   ln|S| + ½ ln 2 - ln(shape ω/ω_b)    every local peak, or those on ω <= ω_b
+    level   ln|S| + ½ ln 2 - x                  every local peak on ω <= ω_b, and ω_b itself
+    shape   ln|S| + ½ ln 2 - x - ln shape min(1, x/ln OPEN)      every local peak on ω >= ω_b
     S_low   ln|S(jω_low)| - ln S_low
     KS, T   ln|W_KS KS|, ln|W_T T| - ln weighted_level,   GS   ln|GS| - ln compliance_max
 
-A constraint is c(κ, τ) <= 0 with τ = ln ω_b. Of several channels |M| stands for every singular
+A constraint is c(κ, τ) <= 0 with τ = ln ω_b and x = ln ω - τ; without a shape, or where it ends at
+ω_b, the level has no x (`kernels.limits`). Of several channels |M| stands for every singular
 value: row number i + kP is the k-th of plant i of P. After those of the whole, p of them, come the
 rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u and w of `ChannelBounds`.
 """
@@ -21,7 +22,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.limits import HALF_POWER, Limit, LoopCurve
+from ccd_casadi.kernels.limits import HALF_POWER, OPEN, Limit, LoopCurve
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.modes import responses
 from ccd_casadi.lti.grid import root_flanks
@@ -110,6 +111,11 @@ class LoopProblem:
         ends = self.bounds.shape_ends is ShapeEnd.CROSSING
         return np.isin(self.curves, [LoopCurve.LEVEL, *[LoopCurve.SHAPE] * ends])
 
+    @cached_property
+    def late(self) -> np.ndarray:
+        """Which of the curves are bounded on ω >= ω_b only."""
+        return np.isin(self.curves, [LoopCurve.SHAPE] * self.bounds.opens)
+
     @property
     def first(self) -> int:
         """How many gains of each matrix are of the whole; the others are rows of channels."""
@@ -156,7 +162,7 @@ class LoopProblem:
 
     @cached_property
     def limits(self) -> Array:
-        """What gains are held against at ω_b = ω₀, (Limit.COUNT, numbers), see `kernels.limits`."""
+        """What gains are held against but for ω_b, (Limit.COUNT, numbers); see `kernels.limits`."""
         b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
         found = np.zeros((Limit.COUNT, self.first + len(b.channels)))
         found[: len(LoopCurve)] = np.inf
@@ -164,6 +170,7 @@ class LoopProblem:
         whole[[LoopCurve.S_MAX, LoopCurve.S_LOW]] = np.log([[b.S_max], [b.S_low]])
         whole[[LoopCurve.CROSSING, LoopCurve.LEVEL]] = -HALF_POWER
         found[Limit.LEAST] = 0.0 if self.structure.integrator else self.low
+        found[Limit.OPENS] = float(b.opens)
         if b.shape is not None:
             whole[LoopCurve.SHAPE] = np.log(b.shape) - HALF_POWER
         if b.compliance_max is not None:
@@ -173,15 +180,15 @@ class LoopProblem:
             whole[LoopCurve.KS] = level - np.log(w.c_K / w.M_K * force)
             whole[LoopCurve.T] = level + np.log(w.A_u)
             ends = (w.omega_K, w.c_K * w.omega_K, w.omega_T / w.A_l, w.omega_T / w.A_u)
-            found[Limit.KS_ZERO : Limit.COUNT] = np.array(ends)[:, None] / w0
+            found[Limit.KS_ZERO : Limit.BANDWIDTH] = np.array(ends)[:, None] / w0
         for i, one in enumerate(b.channels):
             if one.S_max is not None:
                 alone[LoopCurve.S_MAX, i] = np.log(one.S_max)
             if one.M_K is not None and b.weights is not None:
                 alone[LoopCurve.KS, i] = whole[LoopCurve.KS, 0] + np.log(one.M_K / b.weights.M_K)
             if one.lead > 0.0:
-                alone[[LoopCurve.CROSSING, LoopCurve.LEVEL], i] = -HALF_POWER
-                alone[LoopCurve.SHAPE, i] = whole[LoopCurve.SHAPE, 0] - one.lead
+                for curve in (LoopCurve.CROSSING, LoopCurve.LEVEL, LoopCurve.SHAPE):
+                    alone[curve, i] = whole[curve, 0]
         return found
 
     @cached_property
@@ -206,10 +213,24 @@ class LoopProblem:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
         return [LoopCurve(int(code)).name for code in constraints.curve]
 
+    def beyond(self, at: "Places", tau: float) -> Array:
+        """ln ω/ω_i of rows (M,)."""
+        lead = self.leads[at.plant // self.plants.count]
+        return np.asarray(np.log(self.plants.frequency(at.v)) - tau - lead)
+
+    def to_tau(self, at: "Places", tau: float) -> Array:
+        """∂c/∂τ of rows at a fixed frequency (M,)."""
+        opens, shape = self.bounds.opens, at.curve == LoopCurve.SHAPE
+        found = np.where(shape | (opens & (at.curve == LoopCurve.LEVEL)), 1.0, 0.0)
+        if opens and self.bounds.shape is not None:
+            rising = shape & (self.beyond(at, tau) < np.log(OPEN))
+            found[rising] += np.log(self.bounds.shape) / np.log(OPEN)
+        return found
+
     def loop(self, kappa: Array, tau: float) -> LoopArrays:
         """What the kernels take at κ and τ."""
         limits = self.limits.copy()
-        limits[LoopCurve.SHAPE] -= tau
+        limits[Limit.BANDWIDTH] = np.exp(tau + self.leads)
         plants = self.plants
         factors, channel = self._factors
         return LoopArrays(factors, np.exp(kappa), channel, plants.into, plants.out, *plants.modes,

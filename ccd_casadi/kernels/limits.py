@@ -3,7 +3,9 @@
     c = ln σ + offset(ω),   a constraint c <= 0
 
     S_max   -ln S_max,   S_low   -ln S_low,   GS   -ln compliance_max
-    level   ½ ln 2,      shape   ½ ln 2 - ln(shape ω/ω_i),   ω_i = lead ω_b
+    level   ½ ln 2 - x for x < 0,   shape   ½ ln 2 - x - ln shape min(1, x/ln OPEN) for x >= 0,
+            with x = ln ω/ω_i,  ω_i = lead ω_b; where the shape ends at ω_b
+            ½ ln 2  and  ½ ln 2 - x - ln shape,  both for x < 0
     KS, T   ln|W| - ln weighted_level
 
 The gains of a matrix are numbered: its p singular values first, then the rows that single channels
@@ -19,19 +21,22 @@ import numpy as np
 from ccd_casadi.kernels.compiled import compiled
 
 HALF_POWER = 0.5 * np.log(2.0)
+# ω/ω_b at which all the room of a shape is open. A step of it at ω_b would be worth as much
+# bandwidth to any pair of a zero and a pole there, wide or narrow.
+OPEN = 2.0
 
 
 class LoopCurve(IntEnum):
     """What is bounded; the row of its limit."""
 
     S_MAX = 0
-    SHAPE = 1  # of shape/√2/e^τ/lead
+    SHAPE = 1  # of shape/√2, on the line through ω_i
     S_LOW = 2
     KS = 3  # of the level over scale and unit of force
     T = 4  # of the level over scale
     GS = 5
     CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the level
-    LEVEL = 7  # |S| <= 1/√2 below ω_b
+    LEVEL = 7  # |S| <= 1/√2 below ω_b, or below the line that ends there
 
 
 class Limit(IntEnum):
@@ -42,7 +47,9 @@ class Limit(IntEnum):
     KS_POLE = 10
     T_ZERO = 11
     T_POLE = 12
-    COUNT = 13
+    BANDWIDTH = 13  # ω_i
+    OPENS = 14  # 1 where the room of the shape opens from ω_b on, else 0
+    COUNT = 15
 
 
 @compiled
@@ -58,9 +65,16 @@ def warped(T, v):
 def offset(curve, number, ω, chain, limits):
     """What is added to the logarithm of a gain, and its slope to ln v."""
     level = -limits[curve, number]
-    if curve == LoopCurve.SHAPE:
+    opens = limits[Limit.OPENS, number] > 0.0
+    if curve == LoopCurve.SHAPE or (opens and curve == LoopCurve.LEVEL):
         least = limits[Limit.LEAST, number]
-        return level - np.log(max(ω, least)), -chain if ω >= least else 0.0
+        x = np.log(max(ω, least) / limits[Limit.BANDWIDTH, number])
+        level, slope = level - x, 1.0 if ω >= least else 0.0
+        if opens and curve == LoopCurve.SHAPE and x < np.log(OPEN):
+            room = limits[curve, number] + HALF_POWER
+            level += room * (1.0 - max(x, 0.0) / np.log(OPEN))
+            slope += room / np.log(OPEN) if x >= 0.0 else 0.0
+        return level, -slope * chain
     if curve == LoopCurve.KS or curve == LoopCurve.T:
         at = Limit.KS_ZERO if curve == LoopCurve.KS else Limit.T_ZERO
         a = ω * ω + limits[at, number] ** 2
