@@ -111,7 +111,8 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
         if bounds.shape_ends is ShapeEnd.CROSSING:
             found["SHAPE"] = (size / (bounds.shape * x))[below].max()
         else:
-            found["SHAPE"] = (size / (x * bounds.shape ** np.clip(np.log2(x), 0.0, 1.0))).max()
+            rising = bounds.shape * x - (bounds.shape - 1.0) / x
+            found["SHAPE"] = (size / np.where(x < 1.0, x, rising)).max()
     if bounds.weighted_level is not None and bounds.weights is not None:
         v = bounds.weights
         W_KS = v.c_K / v.M_K * (s + v.omega_K) / (s + v.c_K * v.omega_K)

@@ -7,7 +7,6 @@ from math import log, nan
 
 import numpy as np
 
-from ccd_casadi.kernels.limits import OPEN
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
@@ -86,7 +85,7 @@ class Bounds:
 
         |S(jω)| <= S_max,   |S(jω_low)| <= S_low
         |S(jω)| <= (ω/ω_b)/√2                       for ω <= ω_b
-        |S(jω)| <= shape^min(1, log₂ ω/ω_b) (ω/ω_b)/√2  for ω > ω_b
+        |S(jω)| <= (shape x - (shape - 1)/x)/√2     for ω > ω_b, x = ω/ω_b
         |W_KS KS|, |W_T T| <= weighted_level        with W_KS, W_T of `weights`
         |GS| <= compliance_max                      m/N
 
@@ -94,9 +93,9 @@ class Bounds:
     |S| <= shape (ω/ω_b)/√2.
 
     The shape makes ω_b a bandwidth: a narrow filter at ω_b could hold |S| at 1/√2 up to there and
-    let it leap to S_max above. Its room opens from ω_b to 2 ω_b: a template with a step at ω_b, of
-    whatever height, pays for a dip of |S| there. Without an integrator S does not fall to zero: the
-    shape then counts from ω_low on.
+    let it leap to S_max above. Its room opens from ω_b on, three quarters of it up to 2 ω_b: a
+    template with a step at ω_b, of whatever height, pays for a dip of |S| there. Without an
+    integrator S does not fall to zero: the shape then counts from ω_low on.
 
     Parameters
     ----------
@@ -152,16 +151,16 @@ class Bounds:
     def room(self, x: Array) -> Array:
         """How far above the line |S| = x/√2 through ω_b, x = ω/ω_b, the shape lets |S| be."""
         assert self.shape is not None
-        share = np.clip(np.log(x) / np.log(OPEN), 0.0, 1.0) if self.opens else np.ones_like(x)
-        return np.asarray(self.shape**share)
+        closed = (self.shape - 1.0) / np.maximum(x, 1.0) ** 2 if self.opens else 0.0 * x
+        return np.asarray(self.shape - closed)
 
     def reached(self, s: Array) -> Array:
         """The least ω/ω_b at which the shape lets √2|S| be s."""
         assert self.shape is not None
         if not self.opens:
             return s / self.shape
-        rise = 1.0 + np.log(self.shape) / np.log(OPEN)
-        return np.maximum(np.minimum(s, s ** (1.0 / rise)), s / self.shape)
+        root = np.sqrt(s * s + 4.0 * self.shape * (self.shape - 1.0))
+        return np.asarray(np.where(s <= 1.0, s, 0.5 * (s + root) / self.shape))
 
     def of_channel(self, number: int) -> "Bounds":
         """The bounds of a channel that is not coupled to the others, ω_b being its bandwidth."""

@@ -166,6 +166,13 @@ def hessians(
     c_xy = np.concatenate([c_xz, c_xk], axis=1)
     shift = c_xy / np.where(top, -c_xx, np.inf)[:, None]
     out[:, :-1, :-1] += shift[:, :, None] * c_xy[:, None, :]
+    # The room of a shape opens with ω/ω_b: c_ττ, and c_xτ = -c_ττ but for the warped frequency.
+    closed = problem.closed(rows, tau)
+    bent = 4.0 * closed / (1.0 - closed) ** 2
+    c_xt = -bent * problem.plants.chain(rows.v)
+    out[:, -1, :-1] += c_xt[:, None] * shift
+    out[:, :-1, -1] += c_xt[:, None] * shift
+    out[:, -1, -1] += bent + c_xt**2 / np.where(top, -c_xx, np.inf)
     if end.any():
         chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
         out[end, :-1, -1] = out[end, -1, :-1] = chain[:, None] * c_xy[end]

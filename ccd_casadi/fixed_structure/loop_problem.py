@@ -1,12 +1,12 @@
 """What is asked of the loops of a set, as constraints on logarithms of gains over their bounds.
 
     S_max   ln|S| - ln S_max                    every local peak
-    level   ln|S| + ½ ln 2 - x                  every local peak on ω <= ω_b, and ω_b itself
-    shape   ln|S| + ½ ln 2 - x - ln shape min(1, x/ln OPEN)      every local peak on ω >= ω_b
+    level   ln|S| + ½ ln 2 - ln x               every local peak on ω <= ω_b, and ω_b itself
+    shape   ln|S| + ½ ln 2 - ln(shape x - (shape - 1)/x)    every local peak on ω >= ω_b
     S_low   ln|S(jω_low)| - ln S_low
     KS, T   ln|W_KS KS|, ln|W_T T| - ln weighted_level,   GS   ln|GS| - ln compliance_max
 
-A constraint is c(κ, τ) <= 0 with τ = ln ω_b and x = ln ω - τ; without a shape, or where it ends at
+A constraint is c(κ, τ) <= 0 with τ = ln ω_b and x = ω/ω_b; without a shape, or where it ends at
 ω_b, the level has no x (`kernels.limits`). Of several channels |M| stands for every singular
 value: row number i + kP is the k-th of plant i of P. After those of the whole, p of them, come the
 rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u and w of `ChannelBounds`.
@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.limits import HALF_POWER, OPEN, Limit, LoopCurve
+from ccd_casadi.kernels.limits import HALF_POWER, Limit, LoopCurve
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.modes import responses
 from ccd_casadi.lti.grid import root_flanks
@@ -213,19 +213,21 @@ class LoopProblem:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
         return [LoopCurve(int(code)).name for code in constraints.curve]
 
-    def beyond(self, at: "Places", tau: float) -> Array:
-        """ln ω/ω_i of rows (M,)."""
+    def closed(self, at: "Places", tau: float) -> Array:
+        """The share of shape ω/ω_i that is not open yet at rows (M,) of the shape; 0 of others."""
+        if not self.bounds.opens or self.bounds.shape is None:
+            return np.zeros(len(at.v))
         lead = self.leads[at.plant // self.plants.count]
-        return np.asarray(np.log(self.plants.frequency(at.v)) - tau - lead)
+        x = self.plants.frequency(at.v) * np.exp(-tau - lead)
+        own = at.curve == LoopCurve.SHAPE
+        return np.where(own, (1.0 - 1.0 / self.bounds.shape) / np.maximum(x, 1.0) ** 2, 0.0)
 
     def to_tau(self, at: "Places", tau: float) -> Array:
         """∂c/∂τ of rows at a fixed frequency (M,)."""
         opens, shape = self.bounds.opens, at.curve == LoopCurve.SHAPE
         found = np.where(shape | (opens & (at.curve == LoopCurve.LEVEL)), 1.0, 0.0)
-        if opens and self.bounds.shape is not None:
-            rising = shape & (self.beyond(at, tau) < np.log(OPEN))
-            found[rising] += np.log(self.bounds.shape) / np.log(OPEN)
-        return found
+        closed = self.closed(at, tau)
+        return np.asarray(found + 2.0 * closed / (1.0 - closed))
 
     def loop(self, kappa: Array, tau: float) -> LoopArrays:
         """What the kernels take at κ and τ."""

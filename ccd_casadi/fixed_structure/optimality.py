@@ -14,7 +14,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.figures import to_theta
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
-from ccd_casadi.kernels.limits import OPEN, LoopCurve
+from ccd_casadi.kernels.limits import LoopCurve
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.support.arrays import Array
 
@@ -60,7 +60,7 @@ class Optimality:
     `rows` (M, n + 1) are slopes to (κ, τ): first of the `active` bounds, each named in `kinds`,
     then of the ends of κ's box, (name, "lower" or "upper"), and of a least τ. `multipliers` (M,):
     change of the goal per ln of what a row is held against, of which a bound is `shares`: all, but
-    for a shape whose room is not all open; `residual` is over ‖goal‖∞; `violation`: by how much a
+    for a shape whose room is not open yet; `residual` is over ‖goal‖∞; `violation`: by how much a
     bound is passed (logarithm). `near`: what all but binds, which counts for none of this.
     """
 
@@ -112,10 +112,10 @@ def optimality(
                 ends.append((name, word))
     if abs(point.tau - floor) <= ACTIVE:
         rows.append(-unit[n:])
-    shares, opening = np.ones(sum(map(len, rows))), active.curve == LoopCurve.SHAPE
-    if problem.bounds.opens:
-        open_ = np.clip(problem.beyond(active, point.tau) / np.log(OPEN), 0.0, 1.0)
-        shares[: len(open_)] = np.where(opening, open_, 1.0)
+    shares, closed = np.ones(sum(map(len, rows))), problem.closed(active, point.tau)
+    if problem.bounds.opens and problem.bounds.shape is not None:  # ∂ ln(shape x - (shape - 1)/x)
+        opening = (1.0 - closed / (1.0 - 1.0 / problem.bounds.shape)) / (1.0 - closed)
+        shares[: len(closed)] = np.where(active.curve == LoopCurve.SHAPE, opening, 1.0)
     matrix, goal = np.concatenate(rows), unit[n] if goal is None else goal
     return Optimality(
         active, near, tuple(problem.kinds_of(active)), tuple(ends), matrix, goal,

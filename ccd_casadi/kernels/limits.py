@@ -3,9 +3,9 @@
     c = ln σ + offset(ω),   a constraint c <= 0
 
     S_max   -ln S_max,   S_low   -ln S_low,   GS   -ln compliance_max
-    level   ½ ln 2 - x for x < 0,   shape   ½ ln 2 - x - ln shape min(1, x/ln OPEN) for x >= 0,
-            with x = ln ω/ω_i,  ω_i = lead ω_b; where the shape ends at ω_b
-            ½ ln 2  and  ½ ln 2 - x - ln shape,  both for x < 0
+    level   ½ ln 2 - ln x for x < 1,  shape   ½ ln 2 - ln(shape x - (shape - 1)/x) for x > 1,
+            with x = ω/ω_i,  ω_i = lead ω_b; where the shape ends at ω_b
+            ½ ln 2  and  ½ ln 2 - ln(shape x),  both for x < 1
     KS, T   ln|W| - ln weighted_level
 
 The gains of a matrix are numbered: its p singular values first, then the rows that single channels
@@ -21,9 +21,6 @@ import numpy as np
 from ccd_casadi.kernels.compiled import compiled
 
 HALF_POWER = 0.5 * np.log(2.0)
-# ω/ω_b at which all the room of a shape is open. A step of it at ω_b would be worth as much
-# bandwidth to any pair of a zero and a pole there, wide or narrow.
-OPEN = 2.0
 
 
 class LoopCurve(IntEnum):
@@ -68,13 +65,14 @@ def offset(curve, number, ω, chain, limits):
     opens = limits[Limit.OPENS, number] > 0.0
     if curve == LoopCurve.SHAPE or (opens and curve == LoopCurve.LEVEL):
         least = limits[Limit.LEAST, number]
-        x = np.log(max(ω, least) / limits[Limit.BANDWIDTH, number])
-        level, slope = level - x, 1.0 if ω >= least else 0.0
-        if opens and curve == LoopCurve.SHAPE and x < np.log(OPEN):
-            room = limits[curve, number] + HALF_POWER
-            level += room * (1.0 - max(x, 0.0) / np.log(OPEN))
-            slope += room / np.log(OPEN) if x >= 0.0 else 0.0
-        return level, -slope * chain
+        x = max(ω, least) / limits[Limit.BANDWIDTH, number]
+        slope = 1.0 if ω >= least else 0.0
+        if opens and curve == LoopCurve.SHAPE:
+            shape = np.exp(limits[curve, number] + HALF_POWER)
+            closed = (1.0 - 1.0 / shape) / max(x, 1.0) ** 2  # share of shape x that is not open yet
+            level -= np.log(1.0 - closed)
+            slope += 2.0 * closed / (1.0 - closed) if x >= 1.0 else 0.0
+        return level - np.log(x), -slope * chain
     if curve == LoopCurve.KS or curve == LoopCurve.T:
         at = Limit.KS_ZERO if curve == LoopCurve.KS else Limit.T_ZERO
         a = ω * ω + limits[at, number] ** 2
