@@ -80,8 +80,7 @@ def removals(task: Task, design: SectionsDesign) -> Iterator[Removal]:
         without = replace(task, structure=fewer, frequencies=design.frequencies)
         made = without.designed(STARTS_WITHOUT, [design.kappa[~own]])
         wz, dz, wp, dp = np.exp(design.kappa[own]).tolist()
-        pair = (wz / design.bandwidth, dz), (wp / design.bandwidth, dp)
-        left = (np.nan, np.nan)
+        pair, left = ((wz / design.bandwidth, dz), (wp / design.bandwidth, dp)), (np.nan, np.nan)
         if made.certified:
             left = made.bandwidth / design.bandwidth, peak_of(made) / peak_of(design)
         yield Removal(*pair, *left)

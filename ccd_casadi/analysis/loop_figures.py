@@ -76,7 +76,7 @@ def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, 
 
 
 def bandwidth_dip(loops: Sequence[Loop], bandwidth: float) -> float:
-    """By which factor the largest σ_max(S) is above the line ω/(√2 ω_b) on both sides of ω_b, within
+    """By which factor the largest σ_max(S) is above the line ω/(√2 ω_b) on both sides of it, within
     an octave; at least 1."""
     return _dip([np.linalg.norm(one.sensitivity(bandwidth * AROUND), 2, (1, 2)) for one in loops])
 

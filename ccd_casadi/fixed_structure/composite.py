@@ -116,10 +116,10 @@ class CompositeProblem(LoopProblem):
             out[at] = part.problem.gains_of(own) + np.array([one, 0])
         return out
 
-    def closed(self, at: Places, tau: float) -> Array:
+    def inverse_square(self, at: Places, tau: float) -> Array:
         out = np.zeros(len(at.v))
         for part, which, own in self.split(at):
-            out[which] = part.problem.closed(own, tau + part.lead)
+            out[which] = part.problem.inverse_square(own, tau + part.lead)
         return out
 
     def plants_of(self, constraints: Constraints) -> np.ndarray:

@@ -213,14 +213,16 @@ class LoopProblem:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
         return [LoopCurve(int(code)).name for code in constraints.curve]
 
-    def closed(self, at: "Places", tau: float) -> Array:
-        """The share of shape ω/ω_i that is not open yet at rows (M,) of the shape; 0 of others."""
-        if not self.bounds.opens or self.bounds.shape is None:
-            return np.zeros(len(at.v))
+    def inverse_square(self, at: "Places", tau: float) -> Array:
+        """(ω_i/ω)² at rows (M,) of a shape whose room opens from ω_b on; 0 of others."""
         lead = self.leads[at.plant // self.plants.count]
         x = self.plants.frequency(at.v) * np.exp(-tau - lead)
-        own = at.curve == LoopCurve.SHAPE
-        return np.where(own, (1.0 - 1.0 / self.bounds.shape) / np.maximum(x, 1.0) ** 2, 0.0)
+        own = self.bounds.opens & (at.curve == LoopCurve.SHAPE)
+        return np.where(own, 1.0 / np.maximum(x, 1.0) ** 2, 0.0)
+
+    def closed(self, at: "Places", tau: float) -> Array:
+        """The share of shape ω/ω_i that is not open yet at rows (M,)."""
+        return (1.0 - 1.0 / (self.bounds.shape or 1.0)) * self.inverse_square(at, tau)
 
     def to_tau(self, at: "Places", tau: float) -> Array:
         """∂c/∂τ of rows at a fixed frequency (M,)."""

@@ -14,7 +14,6 @@ import numpy as np
 from ccd_casadi.fixed_structure.figures import to_theta
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
-from ccd_casadi.kernels.limits import LoopCurve
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.support.arrays import Array
 
@@ -113,9 +112,9 @@ def optimality(
     if abs(point.tau - floor) <= ACTIVE:
         rows.append(-unit[n:])
     shares, closed = np.ones(sum(map(len, rows))), problem.closed(active, point.tau)
-    if problem.bounds.opens and problem.bounds.shape is not None:  # ∂ ln(shape x - (shape - 1)/x)
-        opening = (1.0 - closed / (1.0 - 1.0 / problem.bounds.shape)) / (1.0 - closed)
-        shares[: len(closed)] = np.where(active.curve == LoopCurve.SHAPE, opening, 1.0)
+    # ∂ ln(shape x - (shape - 1)/x)/∂ ln shape
+    shares[: len(closed)] -= problem.inverse_square(active, point.tau)
+    shares[: len(closed)] /= 1.0 - closed
     matrix, goal = np.concatenate(rows), unit[n] if goal is None else goal
     return Optimality(
         active, near, tuple(problem.kinds_of(active)), tuple(ends), matrix, goal,
