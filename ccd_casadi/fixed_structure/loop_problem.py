@@ -57,8 +57,8 @@ class LoopProblem:
 
     @cached_property
     def base(self) -> Array:
-        """v from far below ω_low and every root to far above, logarithmic; without an integrator
-        the first is all but rest, where gains may be largest."""
+        """v from far below ω_low and every root to far above, logarithmic; the first is all but
+        rest, where gains, or with an integrator |S|/ω, may be largest."""
         sizes = np.abs(self.plants.poles[(self.plants.residues != 0.0).any(axis=(2, 3))])
         sizes = np.append(sizes[sizes > 0.0], 1.0)  # of a free body ω₀
         bottom = 0.03 * min(self.low, float(sizes.min()))
@@ -69,7 +69,7 @@ class LoopProblem:
         if self.plants.period is not None:
             top = 100.0 / self.plants.period
         v = np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
-        return v if self.structure.integrator else np.append(REST * bottom, v)
+        return np.append(REST * bottom, v)
 
     @cached_property
     def fixed(self) -> Array:
