@@ -141,7 +141,9 @@ class Table:
         if shape is not None:
             room = np.minimum.accumulate(shape * w * np.sqrt(0.5 * m), axis=1)
             if self.loop.bounds.shape_ends is ShapeEnd.S_MAX:
-                room[:] = room[:, -1:]
+                s = np.sqrt(2.0 / m)  # shape x - (shape - 1)/x above ω_b, and x below
+                above = 0.5 * (s + np.sqrt(s * s + 4.0 * shape * (shape - 1.0))) / shape
+                room[:] = (w / np.where(s < 1.0, s, above)).min(axis=1, keepdims=True)
         bad = (m < 2.0) | (room < w)
         i = np.argmax(bad, axis=1)
         rows = np.arange(len(m))

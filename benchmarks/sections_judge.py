@@ -107,8 +107,12 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
     size = np.abs(S) * np.sqrt(2.0)
     found["LEVEL"] = size[below].max()
     if bounds.shape is not None:
-        shaped = below if bounds.shape_ends is ShapeEnd.CROSSING else slice(None)
-        found["SHAPE"] = (size / (bounds.shape * counted / bandwidth))[shaped].max()
+        x = counted / bandwidth
+        if bounds.shape_ends is ShapeEnd.CROSSING:
+            found["SHAPE"] = (size / (bounds.shape * x))[below].max()
+        else:
+            rising = bounds.shape * x - (bounds.shape - 1.0) / x
+            found["SHAPE"] = (size / np.where(x < 1.0, x, rising)).max()
     if bounds.weighted_level is not None and bounds.weights is not None:
         v = bounds.weights
         W_KS = v.c_K / v.M_K * (s + v.omega_K) / (s + v.c_K * v.omega_K)

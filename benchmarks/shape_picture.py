@@ -40,9 +40,9 @@ def main() -> None:
         axes.loglog(hz, np.max(S, axis=0), color=colour, label=label)
         axes.plot([ω_b], [2.0**-0.5], "o", color=colour)
         if part == "case1":
-            limit = np.minimum(bounds.S_max, bounds.shape * hz / ω_b / np.sqrt(2.0))
+            limit = np.minimum(bounds.S_max, bounds.room(hz / ω_b) * hz / ω_b / np.sqrt(2.0))
             axes.fill_between(hz, limit, 10.0, color="#8896a0", alpha=0.25, lw=0.0)
-            axes.plot(hz, limit, color="#5b666e", lw=1.0, label="min(S_max, 1.1 (ω/ω_b)/√2)")
+            axes.plot(hz, limit, color="#5b666e", lw=1.0, label="S_max and the shape")
     axes.set(ylim=(0.05, 3.0), xlim=(5.0, 1000.0), xlabel="frequency (Hz)",
              ylabel="|S|, largest on all plants of the set")  # fmt: skip
     axes.axhline(2.0**-0.5, color="#8896a0", lw=0.8, ls=":")

@@ -184,7 +184,9 @@ def draw(name: str, folder: Path, target: Path) -> None:
     nyquist.plot(turn.real, turn.imag, "0.7", lw=0.6)
     nyquist.set(xlim=(-3.0, 2.0), ylim=(-2.5, 2.5), aspect="equal", title="L (eigenvalues)")
     shape = np.geomspace(0.02 * hz, 20.0 * hz, 200)
-    size.loglog(shape, np.minimum(S_max, 1.1 * shape / hz / np.sqrt(2.0)), "k--", lw=0.8)
+    x = shape / hz
+    room = np.where(x < 1.0, 1.0, 1.1 - 0.1 / x**2)
+    size.loglog(shape, np.minimum(S_max, room * x / np.sqrt(2.0)), "k--", lw=0.8)
     size.axvline(hz, color="0.6", lw=0.6)
     size.set(title=f"|S|, bandwidth {hz:.2f} Hz", xlabel="Hz", ylim=(1e-3, 3.0))
     for axis, words in ((step, "step of reference"), (force, "1 N: |e| in um")):

@@ -69,7 +69,7 @@ class Judge:
         self.K = (self.C @ states + self.D)[:, 0, 0]
         weights = np.abs(bounds.weights.responses(omega)) / bounds.weighted_level
         below = omega <= band
-        shape = bounds.shape * 0.5**0.5 / band * np.maximum(omega, bounds.omega_low)
+        shape = 0.5**0.5 / band * np.maximum(omega, bounds.omega_low)  # no room below ω_b
         self.over = {"S_MAX": 1.0 / bounds.S_max, "LEVEL": below * 2.0**0.5, "SHAPE": below / shape}
         self.W_KS, self.W_T = weights[1], weights[2]
 

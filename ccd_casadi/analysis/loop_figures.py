@@ -24,6 +24,7 @@ from ccd_casadi.synthesis.classical_margins import (
 )
 
 PERIODS = 160.0  # of ω_b that a step is followed for
+AROUND = 2.0 ** np.linspace(-1.0, 1.0, 201)  # ω/ω_b, 0.7 % apart
 PER_PERIOD = 100  # points of a continuous loop's step
 BAND = 0.02  # about its end, in which a step has settled
 SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
@@ -32,6 +33,7 @@ LIGHT = 0.1 * (
     1.0 - 1e-6
 )  # damping of a root of K worth a word within NEAR of ω_b; not a bound on it
 NEAR = 0.2
+BOUGHT = 0.03  # of ω_b that a dip of |S| is worth a word for
 RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
 
 
@@ -73,6 +75,22 @@ def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, 
     ))  # fmt: skip
 
 
+def bandwidth_dip(loops: Sequence[Loop], bandwidth: float) -> float:
+    """By which factor the largest σ_max(S) is above the line ω/(√2 ω_b) on both sides of it, within
+    an octave; at least 1."""
+    return _dip([np.linalg.norm(one.sensitivity(bandwidth * AROUND), 2, (1, 2)) for one in loops])
+
+
+def _dip(sizes: Sequence[Array]) -> float:
+    """The same of σ_max(S) of every loop `AROUND` ω_b.
+
+    A pair of a zero and a pole beside ω_b makes such a dip: without it ω_b is lower by about that
+    factor. |S| that rises more slowly than ω throughout, or faster, has none.
+    """
+    slope, middle = np.sqrt(2.0) * np.max(sizes, axis=0) / AROUND, len(AROUND) // 2
+    return max(1.0, min(float(slope[:middle].max()), float(slope[middle + 1 :].max())))
+
+
 def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> tuple[Array, Array]:
     """Times (k,) in s and y (k, p) after a unit step of the reference in `direction` (p,).
 
@@ -100,12 +118,13 @@ def force_step(loop: Loop, times: Array) -> tuple[Array, Array]:
 
 
 def loop_warnings(
-    growth: float, controller: StateSpace, bandwidth: float,
+    growth: float, dip: float, controller: StateSpace, bandwidth: float,
     rings: tuple[float, float] | None = None,
 ) -> list[str]:  # fmt: skip
     """By name, what an engineer would not build: ω_b that is held by something narrow, or rings.
 
     `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
+    `dip`: as `bandwidth_dip` has it.
     """
     hz = bandwidth / HZ
     words = []
@@ -113,6 +132,11 @@ def loop_warnings(
         words.append(
             f"|S| grows by a factor of {growth:.3g} within a tenth of an octave above "
             f"{hz:.4g} Hz: the bandwidth is held by something narrow"
+        )
+    if dip > 1.0 + BOUGHT:
+        words.append(
+            f"|S|/frequency dips by {100.0 * (1.0 - 1.0 / dip):.2g} % at the bandwidth: a filter "
+            f"there buys it, and {hz / dip:.4g} Hz would be left without"
         )
     words += [
         f"the controller has a {word} at {w / HZ:.4g} Hz with damping {d:.3g}, within 20 % of the "
@@ -133,7 +157,7 @@ def measured_entry(
 ) -> dict[str, Any]:  # fmt: skip
     """The same of loops L (k,) known on lines ω (k,) in rad/s: between them ln|L| and its phase are
     straight over ln ω. There are no steps."""
-    margins, growth = [], 1.0
+    margins, growth, sizes = [], 1.0, []
     for omega, L in loops:
         x, ln_L = np.log(omega), np.log(np.abs(L)) + 1j * np.unwrap(np.angle(L))
 
@@ -143,8 +167,9 @@ def measured_entry(
         margins.append(classical_margins(response, omega))
         S = np.abs(1.0 / (1.0 + response(bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30))))
         growth = max(growth, float((S / S[0]).max()))
+        sizes.append(np.abs(1.0 / (1.0 + response(bandwidth * AROUND))))
     return _entry(least_of(margins), sensitivity_peak) | {
-        "loop_warnings": loop_warnings(growth, controller, bandwidth)
+        "loop_warnings": loop_warnings(growth, _dip(sizes), controller, bandwidth)
     }
 
 
@@ -188,5 +213,7 @@ def loop_entry(
         "step_overshoot": overshoot,
         "settling_ms": 1e3 * settling,
         "force_step_max": by_force,
-        "loop_warnings": loop_warnings(growth, controller, bandwidth, rings),
+        "loop_warnings": loop_warnings(
+            growth, bandwidth_dip(loops, bandwidth), controller, bandwidth, rings
+        ),
     }

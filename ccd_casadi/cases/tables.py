@@ -134,13 +134,14 @@ class InnerTable:
         check=checks.choice("search", "sweep"),
     )
     shape: float | None = key(
-        "sections: |S| stays below this times (ω/ω_b)/√2 at every frequency; absent: 1.1",
+        "sections: |S| stays below (ω/ω_b)/√2 up to ω_b, and below this times that far above, with "
+        "room that opens from ω_b on; absent: 1.1",
         None,
         check=checks.number(1.0, 10.0, "give 1 to 10", closed=True),
     )
     shape_ends: str = key(
-        "with sections: the shape holds up to S_max, or up to ω_b only, which lets a narrow "
-        "filter at ω_b buy bandwidth",
+        "with sections: the shape holds up to S_max, or up to ω_b only with all of its room there, "
+        "which lets a narrow filter at ω_b buy bandwidth",
         ShapeEnd.S_MAX.value,
         check=checks.choice(*ShapeEnd),
     )

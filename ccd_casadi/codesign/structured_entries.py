@@ -22,7 +22,7 @@ from ccd_casadi.support.units import HZ, counted
 BINDS = {
     "S_MAX": "S_max",
     "SHAPE": "shape",
-    "LEVEL": "-3 dB below omega_b",
+    "LEVEL": "|S| below omega_b",
     "S_LOW": "S_low",
     "KS": "weighted_level of KS",
     "T": "weighted_level of T",

@@ -5,6 +5,9 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import log, nan
 
+import numpy as np
+
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
 
@@ -43,8 +46,8 @@ class LoopPeaks(ChannelPeaks):
 class ShapeEnd(StrEnum):
     """Up to where the shape bounds |S|."""
 
-    S_MAX = "S_max"  # at every frequency: up to where it meets S_max
-    CROSSING = "crossing"  # below ω_b only
+    S_MAX = "S_max"  # at every frequency, up to where it meets S_max; its room opens from ω_b on
+    CROSSING = "crossing"  # below ω_b only, where all of its room is open
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class ChannelBounds:
     `output` u makes its error uᵀe of the plant's, `force` w its force wᵀf. For references of
     length 1 in any direction, with ω_i = bandwidth_ratio ω_b,
 
-        ‖uᵀS(jω)‖ <= S_max,   ‖uᵀS(jω)‖ <= shape (ω/ω_i)/√2,   ‖uᵀS(jω)‖ <= 1/√2 for ω <= ω_i
+        ‖uᵀS(jω)‖ <= S_max,   ‖uᵀS(jω)‖ within the shape with ω_i in place of ω_b
         |W_KS| ‖wᵀKS‖ <= weighted_level,   W_KS with this M_K, N/m
     """
 
@@ -81,14 +84,18 @@ class Bounds:
     """Bounds that hold on every plant; SI, None: no such bound.
 
         |S(jω)| <= S_max,   |S(jω_low)| <= S_low
-        |S(jω)| <= 1/√2                             for ω <= ω_b
-        |S(jω)| <= shape (ω/ω_b)/√2                 for all ω; or for ω <= ω_b by `shape_ends`
+        |S(jω)| <= (ω/ω_b)/√2                       for ω <= ω_b
+        |S(jω)| <= (shape x - (shape - 1)/x)/√2     for ω > ω_b, x = ω/ω_b
         |W_KS KS|, |W_T T| <= weighted_level        with W_KS, W_T of `weights`
         |GS| <= compliance_max                      m/N
 
+    Without a shape, or where it ends at ω_b (`shape_ends`), |S| <= 1/√2 for ω <= ω_b, and there
+    |S| <= shape (ω/ω_b)/√2.
+
     The shape makes ω_b a bandwidth: a narrow filter at ω_b could hold |S| at 1/√2 up to there and
-    let it leap to S_max above. Without an integrator S does not fall to zero: the shape then counts
-    from ω_low on.
+    let it leap to S_max above. Its room opens from ω_b on, three quarters of it up to 2 ω_b: a
+    template with a step at ω_b, of whatever height, pays for a dip of |S| there. Without an
+    integrator S does not fall to zero: the shape then counts from ω_low on.
 
     Parameters
     ----------
@@ -135,6 +142,25 @@ class Bounds:
             if own.M_K is not None and self.weights and not 0.0 < own.M_K <= self.weights.M_K:
                 words = f"M_K of channel {own.name} is {own.M_K}"
                 raise ValueError(f"{words}; give more than 0, at most that of the weights")
+
+    @property
+    def opens(self) -> bool:
+        """Whether the room of a shape opens from ω_b on."""
+        return self.shape is not None and self.shape_ends is ShapeEnd.S_MAX
+
+    def room(self, x: Array) -> Array:
+        """How far above the line |S| = x/√2 through ω_b, x = ω/ω_b, the shape lets |S| be."""
+        assert self.shape is not None
+        closed = (self.shape - 1.0) / np.maximum(x, 1.0) ** 2 if self.opens else 0.0 * x
+        return np.asarray(self.shape - closed)
+
+    def reached(self, s: Array) -> Array:
+        """The least ω/ω_b at which the shape lets √2|S| be s."""
+        assert self.shape is not None
+        if not self.opens:
+            return s / self.shape
+        root = np.sqrt(s * s + 4.0 * self.shape * (self.shape - 1.0))
+        return np.asarray(np.where(s <= 1.0, s, 0.5 * (s + root) / self.shape))
 
     def of_channel(self, number: int) -> "Bounds":
         """The bounds of a channel that is not coupled to the others, ω_b being its bandwidth."""

@@ -192,15 +192,13 @@ def _within_shape(
 ) -> Array:
     """The largest ω_b of plants `which` (P,) that keeps the shape below |S|.
 
-    Every dip of the room h(ω) = shape ω/(√2|S|) is closed in on: ω_b <= h(ω) for all ω, or only
-    for all ω <= ω_b.
+    Every dip of the room h(ω), the ω_b that |S(jω)| alone allows, is closed in on: ω_b <= h(ω) for
+    all ω, or only for all ω <= ω_b.
     """
     bounds = table.bounds
-    assert bounds.shape is not None
-    scale = bounds.shape * HALF_POWER
 
     def room(x: Array, S: Array) -> Array:
-        return np.asarray(scale * counted(table, x) / S)
+        return np.asarray(counted(table, x) / bounds.reached(S / HALF_POWER))
 
     short = bounds.shape_ends is ShapeEnd.CROSSING
     ends = crossing if short else grid[:, -1]

@@ -62,7 +62,7 @@ def synthesise_sections(
     """max ω_b over the parameters of a structure, with every bound on every plant of a set.
 
         max ω_b   s.t.  on each plant: stable, |S| <= S_max, |S(jω_low)| <= S_low,
-                        |S(jω)| <= 1/√2 for ω <= ω_b, |S(jω)| <= shape (ω/ω_b)/√2,
+                        |S(jω)| <= (ω/ω_b)/√2 for ω <= ω_b, and within the shape above (`Bounds`),
                         |W_KS KS|, |W_T T| <= weighted_level, |GS| <= compliance_max
 
     Parameters

@@ -116,6 +116,12 @@ class CompositeProblem(LoopProblem):
             out[at] = part.problem.gains_of(own) + np.array([one, 0])
         return out
 
+    def inverse_square(self, at: Places, tau: float) -> Array:
+        out = np.zeros(len(at.v))
+        for part, which, own in self.split(at):
+            out[which] = part.problem.inverse_square(own, tau + part.lead)
+        return out
+
     def plants_of(self, constraints: Constraints) -> np.ndarray:
         """Of all."""
         out = np.zeros(len(constraints.v), int)

@@ -307,12 +307,13 @@ class LoopFamily:
         if b.shape is not None:
             until = below if b.shape_ends is ShapeEnd.CROSSING else inside
             until = np.where(low >= self.corner * (1.0 - 1e-12), np.inf, until)
-            top = b.shape * np.sqrt(0.5) / self.bandwidth
+            ends = [np.clip(omega / self.bandwidth, 1e-300, ENDLESS) for omega in (low, high)]
+            room = [b.room(x) * np.sqrt(0.5) / self.bandwidth * until for x in ends]
             # |y| <= ω/unit, so that near 0 |S|/ω is bounded with an integrator
             rising = over / self.unit if self._integrator else S[0] / np.maximum(low, b.omega_low)
             rising = np.minimum(rising, S[0] / np.maximum(low, 1e-300))
             least = S[1] / np.maximum(high, b.omega_low)
-            found.append(("SHAPE", rising / (top * until), least / (top * until)))
+            found.append(("SHAPE", rising / room[0], least / room[1]))
         return found
 
     def _weighted(
@@ -331,7 +332,9 @@ class LoopFamily:
     def corner(self) -> float:
         """The ω in rad/s from which on the shape is above S_max; infinite without a shape."""
         b = self.bounds
-        return np.inf if b.shape is None else b.S_max * np.sqrt(2.0) / b.shape * self.bandwidth
+        if b.shape is None:
+            return np.inf
+        return float(b.reached(np.array(np.sqrt(2.0) * b.S_max))) * self.bandwidth
 
 
 def _lengths(rows: np.ndarray) -> Array:

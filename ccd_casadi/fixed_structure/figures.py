@@ -68,13 +68,17 @@ def assess(
     end = np.where(problem.short[:, None], crossing, np.inf)
     every = np.arange(P)
     value = levels(np.tile(curves, (P, 1)), every, v, loop, min(depth, -within), answers)
-    value = np.where(v[..., None, None] <= end, value, -np.inf)
-    peaks = local_peaks(loop, curves, v, value, depth, end)
+    begin = np.where(problem.late[:, None], crossing, 0.0)
+    counts = (begin <= v[..., None, None]) & (v[..., None, None] <= end)
+    value = np.where(counts, value, -np.inf)
+    peaks = local_peaks(loop, curves, v, value, depth, begin, end)
     peaks = peaks.and_those(hidden := hidden_peaks(curves, v, value))
     top, closed = closed_on_peaks(loop, peaks)
-    # An open end at ω_b is the crossing; one at the lowest frequency is a row of its own.
+    # An open end at ω_b is the crossing, from either side; one at the lowest frequency is a row.
     low_end = peaks.start < 0.1 * crossing[peaks.row // P]
-    whole = closed | ~np.isin(peaks.curve, curves[problem.short]) | low_end
+    above = peaks.low <= np.where(np.isin(peaks.curve, curves[problem.late]),
+                                  crossing[peaks.row // P], 0.0)  # fmt: skip
+    whole = closed | ~(above | np.isin(peaks.curve, curves[problem.short])) | low_end
     sought = np.arange(len(whole)) >= len(whole) - len(hidden.row)
     whole = np.where(sought, closed, whole)
     curve, row, at = [peaks.curve[whole]], [peaks.row[whole]], [top[whole]]
@@ -93,7 +97,7 @@ def assess(
 def constraints(problem: LoopProblem, kappa: Array, tau: float, at: Places) -> Constraints:
     """Values and derivatives of these rows."""
     value, slope, to_kappa, *_ = evaluate_rows(problem, kappa, tau, at)
-    to_tau = np.where(at.curve == LoopCurve.SHAPE, 1.0, 0.0)
+    to_tau = problem.to_tau(at, tau)
     end = at.curve == LoopCurve.CROSSING
     to_tau[end] = slope[end] / problem.plants.chain(at.v[end])
     return Constraints(at.curve, at.plant, at.v, value + problem.margin, to_kappa, to_tau)
@@ -162,6 +166,13 @@ def hessians(
     c_xy = np.concatenate([c_xz, c_xk], axis=1)
     shift = c_xy / np.where(top, -c_xx, np.inf)[:, None]
     out[:, :-1, :-1] += shift[:, :, None] * c_xy[:, None, :]
+    # The room of a shape opens with ω/ω_b: c_ττ, and c_xτ = -c_ττ but for the warped frequency.
+    closed = problem.closed(rows, tau)
+    bent = 4.0 * closed / (1.0 - closed) ** 2
+    c_xt = -bent * problem.plants.chain(rows.v)
+    out[:, -1, :-1] += c_xt[:, None] * shift
+    out[:, :-1, -1] += c_xt[:, None] * shift
+    out[:, -1, -1] += bent + c_xt**2 / np.where(top, -c_xx, np.inf)
     if end.any():
         chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
         out[end, :-1, -1] = out[end, -1, :-1] = chain[:, None] * c_xy[end]

@@ -220,7 +220,9 @@ def _(
     codes = np.array(problem.curves, np.int64)
     every = np.arange(lines)
     value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT, NONE)[:, 0]
-    value = np.where(problem.short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
+    beyond = v[:lines, None, None] > crossing
+    idle = np.where(beyond, problem.short[:, None], problem.late[:, None])
+    value = np.where(idle, -np.inf, value)
     i, c, k = np.nonzero(value > RELEVANT)
     at_low = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.S_LOW]))
     low = (at_low[:, None] * P + np.arange(lines, P)).ravel()

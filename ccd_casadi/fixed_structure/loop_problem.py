@@ -1,12 +1,13 @@
 """What is asked of the loops of a set, as constraints on logarithms of gains over their bounds.
 
     S_max   ln|S| - ln S_max                    every local peak
-    level   ln|S| + ½ ln 2                      every local peak on ω <= ω_b, and ω_b itself
-    shape   ln|S| + ½ ln 2 - ln(shape ω/ω_b)    every local peak, or those on ω <= ω_b
+    level   ln|S| + ½ ln 2 - ln x               every local peak on ω <= ω_b, and ω_b itself
+    shape   ln|S| + ½ ln 2 - ln(shape x - (shape - 1)/x)    every local peak on ω >= ω_b
     S_low   ln|S(jω_low)| - ln S_low
     KS, T   ln|W_KS KS|, ln|W_T T| - ln weighted_level,   GS   ln|GS| - ln compliance_max
 
-A constraint is c(κ, τ) <= 0 with τ = ln ω_b. Of several channels |M| stands for every singular
+A constraint is c(κ, τ) <= 0 with τ = ln ω_b and x = ω/ω_b; without a shape, or where it ends at
+ω_b, the level has no x (`kernels.limits`). Of several channels |M| stands for every singular
 value: row number i + kP is the k-th of plant i of P. After those of the whole, p of them, come the
 rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u and w of `ChannelBounds`.
 """
@@ -56,8 +57,8 @@ class LoopProblem:
 
     @cached_property
     def base(self) -> Array:
-        """v from far below ω_low and every root to far above, logarithmic; without an integrator
-        the first is all but rest, where gains may be largest."""
+        """v from far below ω_low and every root to far above, logarithmic; the first is all but
+        rest, where gains, or with an integrator |S|/ω, may be largest."""
         sizes = np.abs(self.plants.poles[(self.plants.residues != 0.0).any(axis=(2, 3))])
         sizes = np.append(sizes[sizes > 0.0], 1.0)  # of a free body ω₀
         bottom = 0.03 * min(self.low, float(sizes.min()))
@@ -68,7 +69,7 @@ class LoopProblem:
         if self.plants.period is not None:
             top = 100.0 / self.plants.period
         v = np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
-        return v if self.structure.integrator else np.append(REST * bottom, v)
+        return np.append(REST * bottom, v)
 
     @cached_property
     def fixed(self) -> Array:
@@ -109,6 +110,11 @@ class LoopProblem:
         """Which of the curves are bounded on ω <= ω_b only."""
         ends = self.bounds.shape_ends is ShapeEnd.CROSSING
         return np.isin(self.curves, [LoopCurve.LEVEL, *[LoopCurve.SHAPE] * ends])
+
+    @cached_property
+    def late(self) -> np.ndarray:
+        """Which of the curves are bounded on ω >= ω_b only."""
+        return np.isin(self.curves, [LoopCurve.SHAPE] * self.bounds.opens)
 
     @property
     def first(self) -> int:
@@ -156,7 +162,7 @@ class LoopProblem:
 
     @cached_property
     def limits(self) -> Array:
-        """What gains are held against at ω_b = ω₀, (Limit.COUNT, numbers), see `kernels.limits`."""
+        """What gains are held against but for ω_b, (Limit.COUNT, numbers); see `kernels.limits`."""
         b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
         found = np.zeros((Limit.COUNT, self.first + len(b.channels)))
         found[: len(LoopCurve)] = np.inf
@@ -164,6 +170,7 @@ class LoopProblem:
         whole[[LoopCurve.S_MAX, LoopCurve.S_LOW]] = np.log([[b.S_max], [b.S_low]])
         whole[[LoopCurve.CROSSING, LoopCurve.LEVEL]] = -HALF_POWER
         found[Limit.LEAST] = 0.0 if self.structure.integrator else self.low
+        found[Limit.OPENS] = float(b.opens)
         if b.shape is not None:
             whole[LoopCurve.SHAPE] = np.log(b.shape) - HALF_POWER
         if b.compliance_max is not None:
@@ -173,15 +180,15 @@ class LoopProblem:
             whole[LoopCurve.KS] = level - np.log(w.c_K / w.M_K * force)
             whole[LoopCurve.T] = level + np.log(w.A_u)
             ends = (w.omega_K, w.c_K * w.omega_K, w.omega_T / w.A_l, w.omega_T / w.A_u)
-            found[Limit.KS_ZERO : Limit.COUNT] = np.array(ends)[:, None] / w0
+            found[Limit.KS_ZERO : Limit.BANDWIDTH] = np.array(ends)[:, None] / w0
         for i, one in enumerate(b.channels):
             if one.S_max is not None:
                 alone[LoopCurve.S_MAX, i] = np.log(one.S_max)
             if one.M_K is not None and b.weights is not None:
                 alone[LoopCurve.KS, i] = whole[LoopCurve.KS, 0] + np.log(one.M_K / b.weights.M_K)
             if one.lead > 0.0:
-                alone[[LoopCurve.CROSSING, LoopCurve.LEVEL], i] = -HALF_POWER
-                alone[LoopCurve.SHAPE, i] = whole[LoopCurve.SHAPE, 0] - one.lead
+                for curve in (LoopCurve.CROSSING, LoopCurve.LEVEL, LoopCurve.SHAPE):
+                    alone[curve, i] = whole[curve, 0]
         return found
 
     @cached_property
@@ -206,10 +213,28 @@ class LoopProblem:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
         return [LoopCurve(int(code)).name for code in constraints.curve]
 
+    def inverse_square(self, at: "Places", tau: float) -> Array:
+        """(ω_i/ω)² at rows (M,) of a shape whose room opens from ω_b on; 0 of others."""
+        lead = self.leads[at.plant // self.plants.count]
+        x = self.plants.frequency(at.v) * np.exp(-tau - lead)
+        own = self.bounds.opens & (at.curve == LoopCurve.SHAPE)
+        return np.where(own, 1.0 / np.maximum(x, 1.0) ** 2, 0.0)
+
+    def closed(self, at: "Places", tau: float) -> Array:
+        """The share of shape ω/ω_i that is not open yet at rows (M,)."""
+        return (1.0 - 1.0 / (self.bounds.shape or 1.0)) * self.inverse_square(at, tau)
+
+    def to_tau(self, at: "Places", tau: float) -> Array:
+        """∂c/∂τ of rows at a fixed frequency (M,)."""
+        opens, shape = self.bounds.opens, at.curve == LoopCurve.SHAPE
+        found = np.where(shape | (opens & (at.curve == LoopCurve.LEVEL)), 1.0, 0.0)
+        closed = self.closed(at, tau)
+        return np.asarray(found + 2.0 * closed / (1.0 - closed))
+
     def loop(self, kappa: Array, tau: float) -> LoopArrays:
         """What the kernels take at κ and τ."""
         limits = self.limits.copy()
-        limits[LoopCurve.SHAPE] -= tau
+        limits[Limit.BANDWIDTH] = np.exp(tau + self.leads)
         plants = self.plants
         factors, channel = self._factors
         return LoopArrays(factors, np.exp(kappa), channel, plants.into, plants.out, *plants.modes,

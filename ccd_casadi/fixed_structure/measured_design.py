@@ -1,7 +1,7 @@
 """The largest bandwidth of a fixed structure on measured responses, without a model.
 
     max ω_b   s.t.  det(I + GK) winds as a stable loop's does on every response, and on every line
-                    |S| <= S_max,  |S| <= 1/√2 below ω_b,  |S| <= shape (ω/ω_b)/√2,
+                    |S| <= S_max,  |S| within the shape (`Bounds`),
                     |S(jω_low)| <= S_low,
                     |W_KS KS|, |W_T T| <= weighted_level,  |GS| <= compliance_max
 

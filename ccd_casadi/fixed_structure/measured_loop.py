@@ -391,7 +391,7 @@ def bandwidth_within(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool
     if bounds.shape is None:
         return crossing
     counted = omega if integrator else np.maximum(omega, bounds.omega_low)
-    allowed = bounds.shape * counted * np.exp(level - ln_S)
+    allowed = counted / bounds.reached(np.exp(ln_S - level))
     if bounds.shape_ends is ShapeEnd.CROSSING:
         allowed = allowed[omega <= crossing]
     return float(min(crossing, allowed.min()))

@@ -58,7 +58,8 @@ class Optimality:
 
     `rows` (M, n + 1) are slopes to (κ, τ): first of the `active` bounds, each named in `kinds`,
     then of the ends of κ's box, (name, "lower" or "upper"), and of a least τ. `multipliers` (M,):
-    change of the goal per ln of a bound; `residual` is over ‖goal‖∞; `violation`: by how much a
+    change of the goal per ln of what a row is held against, of which a bound is `shares`: all, but
+    for a shape whose room is not open yet; `residual` is over ‖goal‖∞; `violation`: by how much a
     bound is passed (logarithm). `near`: what all but binds, which counts for none of this.
     """
 
@@ -71,6 +72,7 @@ class Optimality:
     multipliers: Array
     residual: float
     violation: float
+    shares: Array
 
     @property
     def ends(self) -> tuple[tuple[str, str, float], ...]:
@@ -81,7 +83,7 @@ class Optimality:
     def named(self) -> dict[str, float]:
         """The multipliers by kind of bound, summed over plants and peaks."""
         found: dict[str, float] = {}
-        for name, mu in zip(self.kinds, self.multipliers, strict=False):
+        for name, mu in zip(self.kinds, self.multipliers * self.shares, strict=False):
             if mu > 0.0:
                 found[name] = found.get(name, 0.0) + float(mu)
         return found
@@ -109,10 +111,14 @@ def optimality(
                 ends.append((name, word))
     if abs(point.tau - floor) <= ACTIVE:
         rows.append(-unit[n:])
+    shares, closed = np.ones(sum(map(len, rows))), problem.closed(active, point.tau)
+    # ∂ ln(shape x - (shape - 1)/x)/∂ ln shape
+    shares[: len(closed)] -= problem.inverse_square(active, point.tau)
+    shares[: len(closed)] /= 1.0 - closed
     matrix, goal = np.concatenate(rows), unit[n] if goal is None else goal
     return Optimality(
         active, near, tuple(problem.kinds_of(active)), tuple(ends), matrix, goal,
-        *non_negative(matrix, goal), point.assessment.violation,
+        *non_negative(matrix, goal), point.assessment.violation, shares,
     )  # fmt: skip
 
 

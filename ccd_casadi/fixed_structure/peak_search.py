@@ -57,17 +57,19 @@ def frequency_grid(
 
 
 def local_peaks(
-    loop: LoopArrays, curves: np.ndarray, v: Array, value: Array, depth: float, end: Array
-) -> Brackets:
+    loop: LoopArrays, curves: np.ndarray, v: Array, value: Array, depth: float, begin: Array,
+    end: Array,
+) -> Brackets:  # fmt: skip
     """The local maxima above `depth` of the levels `value` at v (P, k).
 
-    Brackets stop at `end` (C, numbers) in v; those near their bounds are narrowed where singular
-    values may cross.
+    Brackets start at `begin` and stop at `end` (C, numbers) in v; those near their bounds are
+    narrowed where singular values may cross.
     """
     P, first = len(v), loop.out.shape[1]
     places, beside = maxima(value, v, end, depth)
     i, at, c, k = places.T
-    found = Brackets(curves[c], i + k * P, v[i, at], *beside.T)
+    low = np.maximum(beside[:, 0], begin[c, k])
+    found = Brackets(curves[c], i + k * P, v[i, at], low, beside[:, 1])
     if first == 1:
         return found
     near = np.flatnonzero((value[i, at, c, k] > -CLOSE) & (found.low < found.high))

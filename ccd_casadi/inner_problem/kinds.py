@@ -168,12 +168,14 @@ class FixedStructure(InnerKind):
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
         """The shape, and weighted_level/|W| of KS (N/m) and T."""
         inner, structured = self.problem.inner, structured_of(self.problem)
-        level, shape = (value or np.nan for value in (structured.weighted_level, structured.shape))
+        level, bounds = structured.weighted_level or np.nan, bounds_of(self.problem)
 
         def over(hz: Array) -> Array:
             size = np.abs(self.problem.weights.responses(HZ * hz))
             below = hz <= bandwidth_hz
-            rising = shape * hz / bandwidth_hz * 2.0**-0.5
+            x = hz / bandwidth_hz
+            room = np.nan if bounds.shape is None else bounds.room(x)
+            rising = room * x * 2.0**-0.5
             most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
             counts = below | (structured.shape_ends is ShapeEnd.S_MAX)
             holds = counts & (most <= inner.S_max)

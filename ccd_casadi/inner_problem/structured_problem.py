@@ -1,7 +1,7 @@
 """The second kind of inner problem: a controller of fixed structure on a set of plants.
 
     ω_b*(θ) = max ω_b over κ  s.t. on every plant: stable, ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low,
-              |S(jω)| <= 1/√2 below ω_b, |S(jω)| <= shape (ω/ω_b)/√2 at every ω, or below ω_b,
+              |S| within the shape (`fixed_structure.bounds.Bounds`),
               |W_KS KS| and |W_T T| <= weighted_level, |GS| <= compliance_max
 
 Everything is plain values, as in `problem`: it is hashed, sent to workers and kept in the store.
@@ -171,6 +171,8 @@ class StructuredProblem(ControllerProblem):
             del found["uncertainty"]["ranges"]
         if self.shape_ends is not ShapeEnd.CROSSING:  # which stores knew first
             found["shape_ends"] = self.shape_ends.value
+            if self.shape is not None and self.shape > 1.0:  # which was all open once
+                found["room"] = "opens from the bandwidth on"
         if self.channels:
             found["channels"] = [channel.identity() for channel in self.channels]
         if self.figure is not BANDWIDTH:

@@ -2,7 +2,7 @@
 
 With T = 1 - S all bounds of a loop are |S| <= m_S and |T| <= m_T:
 
-    m_S = min(S_max, 1/√2 up to ω_b, shape (ω/ω_b)/√2, compliance_max/|G|)
+    m_S = min(S_max, 1/√2 up to ω_b, the shape, compliance_max/|G|)
     m_T = min(weighted_level/|W_T|, |G| weighted_level/|W_KS|)
 
 Of several channels S and T are uᵀSu and uᵀTu, and |G| is ‖uᵀG‖, for a unit direction u of outputs:
@@ -160,7 +160,8 @@ class Limits:
             counts = first >= (0.0 if self.integrator else bounds.omega_low)
             if bounds.shape_ends is ShapeEnd.CROSSING:
                 counts &= last <= own
-            m_S = np.where(counts, np.minimum(m_S, bounds.shape * ROOT_HALF * last / own), m_S)
+            x = last / own
+            m_S = np.where(counts, np.minimum(m_S, bounds.room(x) * ROOT_HALF * x), m_S)
         if bounds.compliance_max is not None and self.free is not None:
             least = self.free.range(first, last)[0]
             m_S = np.minimum(m_S, bounds.compliance_max / least)

@@ -45,7 +45,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
         mu = kink["multipliers"]
     v = problem.figure
     most = HZ * result["bandwidth_hz"] if v is BANDWIDTH else result[f"{v.entry}_of_set"]
-    names = {"S_MAX": "The peak of S", "SHAPE": "The shape of S", "LEVEL": "-3 dB below ω_b",
+    names = {"S_MAX": "The peak of S", "SHAPE": "The shape of S", "LEVEL": "|S| below ω_b",
              "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "The compliance"}  # fmt: skip
     over_kappa = []

@@ -89,8 +89,8 @@ def tune(
 ) -> Tuned:
     """The largest bandwidth of integrator, lead, notches and a second-order roll-off.
 
-        max ω_b   s.t.  on each plant: stable, |S| <= S_max, |S(jω)| <= 1/√2 for ω <= ω_b,
-                        |S(jω)| <= shape (ω/ω_b)/√2,   |KS| <= effort/|G| about ω_b
+        max ω_b   s.t.  on each plant: stable, |S| <= S_max, |S(jω)| <= (ω/ω_b)/√2 for ω <= ω_b,
+                        |S(jω)| within the shape above,   |KS| <= effort/|G| about ω_b
 
     Parameters
     ----------

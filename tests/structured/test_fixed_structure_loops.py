@@ -151,12 +151,15 @@ def test_peaks_are_the_suprema_of_dense_grids(
     v = np.geomspace(problem.base[0], problem.base[-1], 60001)
     curves = (*problem.curves, LoopCurve.CROSSING)
     short = dict(zip(problem.curves, problem.short, strict=True))
+    late = dict(zip(problem.curves, problem.late, strict=True))
     dense = by_curve(problem, kappa, tau, curves, np.tile(v, (2, 1)))
     for i in range(2):
         for curve in curves:
             kinds, values = [curve], dense[curve][i] + problem.margin
             if short.get(curve, True):
                 values, kinds = values[v <= edge], [curve, LoopCurve.LEVEL, LoopCurve.CROSSING]
+            if late.get(curve, False):
+                values, kinds = values[v >= edge], [curve, LoopCurve.CROSSING]
             own = (found.plant == i) & np.isin(found.curve, kinds)
             assert found.value[own].max() >= values.max() - 1e-9
             if not short.get(curve, True):

@@ -27,7 +27,7 @@ def test_every_maximum_lies_in_a_bracket(seed: int) -> None:
     v, value = np.exp(x)[None], two_maxima(x, *curve)[None, :, None, None]
     loop: Any = SimpleNamespace(out=np.eye(1))
     curves = np.array([LoopCurve.S_MAX])
-    shown = local_peaks(loop, curves, v, value, -1.0, np.full((1, 1), np.inf))
+    shown = local_peaks(loop, curves, v, value, -1.0, np.zeros((1, 1)), np.full((1, 1), np.inf))
     found = shown.and_those(hidden_peaks(curves, v, value))
     fine = np.linspace(-0.3, 0.3, 6001)
     y = two_maxima(fine, *curve)

@@ -42,7 +42,7 @@ def test_the_error_of_a_set_has_its_gradient() -> None:
 
 def test_the_least_error_keeps_bounds_and_bandwidth_and_is_stationary() -> None:
     plants = [plant(0.01)]
-    problem, kappa = loop(3, PID, FAST)
+    problem, kappa = loop(0, PID, FAST)
     initial = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
     first = synthesise_sections(plants, PID, KEPT, sampling=FAST, initial=[initial],
                                 only_initial=True)  # fmt: skip
@@ -67,7 +67,7 @@ def test_a_search_at_the_end_climbs_from_its_design_beside_the_warm_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     plants = [plant(0.01)]
-    problem, kappa = loop(3, PID, FAST)
+    problem, kappa = loop(0, PID, FAST)
     initial = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
     first = synthesise_sections(plants, PID, KEPT, sampling=FAST, initial=[initial],
                                 only_initial=True)  # fmt: skip
