@@ -99,7 +99,8 @@ def _holds(item: Solution) -> bool:
     """Whether the design keeps its constraints on the whole set, whatever else is said of it."""
     checks = item.result.get("checks", {})
     return bool(checks) and all(
-        checks.get(name, True) for name in ("certificate", "constraints", "second_engine", "robust")
+        checks.get(name, True)
+        for name in ("certificate", "constraints", "judge", "second_engine", "robust")
     )
 
 

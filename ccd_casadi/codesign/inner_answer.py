@@ -10,6 +10,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.design_entries import budget_entry, controller_dict, mixed_dict, move_entry
+from ccd_casadi.codesign.judgement import judge_on_model, judgement_of
 from ccd_casadi.codesign.second_check import second_on_set, second_on_weighted
 from ccd_casadi.codesign.structured_entries import (
     active_of,
@@ -105,6 +106,7 @@ def mixed_answer(
         head["design_at"] = problem.robust.design_at
     plant, made = scaled_plant(problem, theta), final_design(problem, theta, point)
     feasible = problem.inner.feasible(made.figures)
+    judged = judge_on_model(problem, theta, made.controller)
     second = second_on_weighted(problem, theta, made)
     answer = head | {
         **json_values(mixed_dict(problem, theta, made)),
@@ -119,9 +121,10 @@ def mixed_answer(
         **move_entry(problem, theta, made.controller),
         "syntheses": syntheses,
         "objective": objective(problem, theta, np.nan_to_num(made.figures.bandwidth)),
+        "judge": judged.entry,
         "second_engine": second.entry,
     }
-    good = made.figures.certified and second.agrees is not False
+    good = made.figures.certified and judged.passed and second.agrees is not False
     status = "verified" if good else "not_verified"
     return InnerAnswer(status, answer, controller_dict(made.controller), rows)
 
@@ -171,6 +174,7 @@ def structured_answer(
         "objective": objective(problem, theta, value),
         "robust": robust_dict(wide, checked, worst),
         "proof": proof_dict(proof),
+        "judge": judgement_of(wide, checked).entry,
         "second_engine": second.entry,
         "syntheses": 1,
         **budget_entry(asked, theta, made.controller),

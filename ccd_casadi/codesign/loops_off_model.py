@@ -81,10 +81,11 @@ class LoopsOffModel:
         """
         k, d = np.diag(self.plant.K), np.diag(self.plant.D)
         strength = np.linalg.norm(self.plant.B, axis=1) * np.linalg.norm(self.plant.C, axis=0)
+        flexible = np.flatnonzero(~self.plant.rigid)
         natural = np.sqrt(k)
-        gain = np.linalg.norm(self.run.swept(natural), axis=(1, 2))
-        gain = gain * strength / np.maximum(natural * d, 1e-300)
-        modes = np.flatnonzero(~self.plant.rigid & (gain > WEAK))
+        gain = np.linalg.norm(self.run.swept(natural[flexible]), axis=(1, 2))
+        gain *= strength[flexible] / np.maximum((natural * d)[flexible], 1e-300)
+        modes = flexible[gain > WEAK]
         zeros = self.run.zeros(float(np.abs(self.run.poles).max(initial=0.0)))
         roots = np.concatenate([self.run.rates, self.run.rates_of(zeros)])
         roots, omega = roots[(roots.imag >= 0.0) & np.isfinite(roots), None], natural[modes]

@@ -75,6 +75,7 @@ def result_dict(
     checks: dict[str, bool | None] = {  # None: it could not be made, or there is nothing to check
         "certificate": verified.certified,
         "constraints": verified.feasible,
+        "judge": verified.judgement.passed,
         "second_engine": verified.second.agrees,
         "prediction": None if learnt or judged is None else bool(error <= tolerance),
         "inner_optimum": None if np.isnan(verified.inner_gap) else verified.inner_gap <= tolerance,
@@ -106,6 +107,7 @@ def result_dict(
         # a vertex has no second-order figure, and says so
         "kkt": {**vars(verified.kkt), "vertex": verified.kkt.second_order == math.inf},
         "globality": outcome.outer or OuterSolution((), 0),
+        "judge": verified.judgement.entry,
         "second_engine": verified.second.entry,
         "box_look": {} if look is None else look.entry,
         "notes": list(plant_of(problem).notes(verified.theta)),

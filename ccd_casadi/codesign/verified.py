@@ -14,6 +14,7 @@ import numpy as np
 
 from ccd_casadi.codesign.design_entries import controller_dict
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
+from ccd_casadi.codesign.judgement import Judgement
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence, survives
@@ -125,6 +126,11 @@ class Verified(ABC):
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
         return search_evidence(starts, optima, look, self.bound_words)
+
+    @property
+    @abstractmethod
+    def judgement(self) -> Judgement:
+        """On the plants as their function returned them."""
 
     @property
     def bound_words(self) -> str:

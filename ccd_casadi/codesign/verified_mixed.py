@@ -5,6 +5,7 @@ from math import isfinite
 from typing import Any, ClassVar
 
 from ccd_casadi.codesign.design_entries import mixed_dict
+from ccd_casadi.codesign.judgement import Judgement
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
@@ -19,11 +20,13 @@ from ccd_casadi.synthesis.synthesis import Design
 class VerifiedDesign(Verified):
     """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
 
-    `references`: on closer models of the plant; `robust`: all along the case's own set.
+    `judged`: on the model as it was written; `references`: on closer models of the plant; `robust`:
+    all along the case's own set.
     """
 
     x: Array
     design: Design
+    judged: Judgement
     references: tuple[ReferenceCheck, ...] = ()
     robust: RobustCheck | None = None
 
@@ -31,7 +34,11 @@ class VerifiedDesign(Verified):
 
     @property
     def certified(self) -> bool:
-        return self.design.figures.certified
+        return self.design.figures.certified and self.judged.passed
+
+    @property
+    def judgement(self) -> Judgement:
+        return self.judged
 
     @property
     def bandwidth(self) -> float:

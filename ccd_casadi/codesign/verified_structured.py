@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
+from ccd_casadi.codesign.judgement import Judgement, judgement_of
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
@@ -88,6 +89,10 @@ class VerifiedStructured(Verified):
     # and differences of two such say nothing of a small curvature.
     kkt_level: ClassVar[float] = 1e-2
     saddle: ClassVar[float] = -math.inf
+
+    @property
+    def judgement(self) -> Judgement:
+        return judgement_of(self.wide, self.checked)
 
     @property
     def set_is_met(self) -> bool:

@@ -34,6 +34,7 @@ from ccd_casadi.support.units import counted
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
 AT_ONCE = 16  # plants: the last ones keep all workers busy
 ROUNDING = 1e3 * float(np.finfo(float).eps)  # of a balanced matrix; 31 eps were seen at a pole
+HALF_WIDTHS, FINE = 3.0, 30  # around a resonance beyond half the rate, and points in each
 REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
 
 
@@ -180,6 +181,9 @@ def judged(
         values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
     tops = peaks(table, grid, values)
+    if sampling is not None and bounds.compliance_max is not None:
+        beyond = _compliance_beyond(table, [free[i] for i in good])
+        tops["GS"] = np.maximum(tops["GS"][0], beyond), tops["GS"][1]
     loops = [loops[i] for i in good]
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"])
     norm, confirmed = norms(loops, table.period, *tops["S"])
@@ -213,6 +217,18 @@ def judged(
             confirmed=bool(confirmed[k]),
             channels=tuple(channels[k]),
         )
+    return found
+
+
+def _compliance_beyond(table: LoopTable, plants: Sequence[StateSpace]) -> Array:
+    """|S G| of every plant (P,) beyond half the rate, at its resonances there: a force of such a
+    frequency moves it by G, and its samples are those of a slower one."""
+    found = np.zeros(len(plants))
+    for i, G in enumerate(plants):
+        poles = np.linalg.eigvals(G.A)
+        for p in poles[poles.imag > np.pi / (table.period or np.inf)]:
+            around = p.imag + abs(p.real) * np.linspace(-HALF_WIDTHS, HALF_WIDTHS, 8 * FINE + 1)
+            found[i] = max(found[i], float(table.at(np.array([i]), around[None])["GS"].max()))
     return found
 
 

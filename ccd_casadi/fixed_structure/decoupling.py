@@ -46,10 +46,11 @@ class Decoupling:
 
 
 def find_decoupling(plant: ScaledPlant) -> Decoupling:
-    """The channels of a square plant, numbered by falling static gain.
+    """The channels of a square plant, numbered by falling static gain, free bodies suspended.
 
     Raises PlantError where the plant is not square or cannot be moved in some direction.
     """
+    plant = plant.design_plant
     p, m = plant.C.shape[0], plant.B.shape[1]
     if p != m:
         words = f"has {p} outputs and {m} inputs; sections need as many of one as of the other"

@@ -50,6 +50,12 @@ class Response:
     def range(self, low: Array, high: Array) -> tuple[Array, Array]:
         """The least and the largest that |g| can be on the intervals, FAITHFUL included."""
         least, most = (np.full(low.shape, np.log(abs(self.value))) for _ in range(2))
+        with np.errstate(divide="ignore"):  # of a pole or zero on the axis: from 0 or to infinity
+            self._widen(least, most, low, high)
+        return np.exp(least) * (1.0 - FAITHFUL), np.exp(most) * (1.0 + FAITHFUL)
+
+    def _widen(self, least: Array, most: Array, low: Array, high: Array) -> None:
+        """Adds the ranges of all factors' logarithms."""
         for roots, sign in ((self.zeros, 1.0), (self.poles, -1.0)):
             for r in roots:
                 near = np.maximum(np.maximum(low - r.imag, r.imag - high), 0.0)
@@ -60,7 +66,6 @@ class Response:
                 )
                 least += np.minimum(one, two)
                 most += np.maximum(one, two)
-        return np.exp(least) * (1.0 - FAITHFUL), np.exp(most) * (1.0 + FAITHFUL)
 
 
 def response_of(system: StateSpace) -> Response | None:

@@ -27,6 +27,7 @@ from ccd_casadi.inner_problem import structured_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.sampling import sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -98,7 +99,7 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 def test_the_value_is_that_of_the_controller(run: Run) -> None:
     """Recomputed from its matrices and the plant's own M, D and K, over frequency."""
     theta = tuple(run.result["theta"].values())
-    G, K = reference_plant(mechanics(model(), theta)), run.controller
+    G, K = reference_plant(mechanics(model(), theta), FREE), run.controller
     hz = np.geomspace(0.1, 1e3, 4000)
     found = first_crossing(lambda w: sensitivity_gain(G, K, w), HZ * hz, np.sqrt(0.5)) / HZ
     # ω_b is the largest that the shape allows

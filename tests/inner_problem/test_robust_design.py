@@ -87,8 +87,11 @@ def test_total_derivatives_over_a_set(robust: RobustSet) -> None:
     assert design.figures.certified
     exact = np.hstack([design.to_theta, design.to_break_frequencies])
     for i in range(4):
-        e = 1e-4 * np.eye(4)[i] * max(1.0, abs(x[i]) / 10.0)
-        numeric = (at(x + e).values - at(x - e).values) / (2.0 * e[i])
+        e = 5e-4 * np.eye(4)[i] * max(1.0, abs(x[i]) / 10.0)
+        # gamma_opt is known to 5e-11, so that steps are long, and their own error is taken off
+        near, far = ((at(x + n * e).values - at(x - n * e).values) / (2.0 * n * e[i])
+                     for n in (1.0, 2.0))  # fmt: skip
+        numeric = (4.0 * near - far) / 3.0
         assert exact[:, i] == pytest.approx(numeric, rel=2e-5, abs=1e-6 * np.abs(exact).max())
 
 
