@@ -156,9 +156,9 @@ def test_the_result_has_the_same_keys_and_checks(run: Run, schema: dict[str, Any
     assert {"certificate", "constraints", "inner_optimum", "optimality", "second_engine"} <= {
         name for name, passed in result["checks"].items() if passed
     }
-    nothing_predicted = result["formulation"] == "direct"
-    assert (result["checks"]["prediction"] is None) == nothing_predicted
-    assert (result["verdict"]["predicted"]["state"] == "unknown") == nothing_predicted
+    line, nothing = result["verdict"]["predicted"], not result["surrogate_quality"]
+    assert (line["state"] == "unknown") == nothing
+    assert (result["checks"]["prediction"] is None) == (nothing or line.get("learnt", False))
 
 
 def test_what_the_schema_refuses(schema: dict[str, Any]) -> None:
