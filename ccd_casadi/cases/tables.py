@@ -161,10 +161,10 @@ class InnerTable:
 
 @dataclass(frozen=True)
 class SuspensionTable:
-    """[suspension]: where rigid-body poles are put, and how many there must be (default: any)."""
+    """[suspension]: where a mixed synthesis puts rigid-body poles, and how many there must be."""
 
     frequency_hz: float = key(
-        "frequency of the soft suspension that keeps rigid-body poles off the axis", 0.1
+        "frequency of the soft suspension that free bodies have in a mixed synthesis", 0.1
     )
     damping_ratio: float = key("of these poles", 0.7)
     rigid_modes: int | None = key("required number of rigid-body modes; absent: any number", None)
