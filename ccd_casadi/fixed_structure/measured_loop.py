@@ -245,12 +245,12 @@ def _room_beside_a_pole(x: Array, G: np.ndarray) -> Array:
     for own in G.T:
         g = own[lines]
         basis = np.stack([t**0, t, t**2, -t * g], axis=-1)
-        Q, R = np.linalg.qr(basis)
+        Q = np.linalg.qr(basis).Q
 
         def beside(v: np.ndarray, Q: np.ndarray = Q) -> np.ndarray:
             return np.asarray(v - (Q @ (Q.conj().swapaxes(1, 2) @ v[..., None]))[..., 0])
 
-        pole = np.linalg.solve(R, Q.conj().swapaxes(1, 2) @ g[..., None])[:, 3]
+        pole = (np.linalg.pinv(basis) @ g[..., None])[:, 3]
         left = np.linalg.norm(beside(g), axis=1)
         tails = [np.linalg.norm(beside((1.0 + pole * t) / (t - at)), axis=1) for at in INSIDE]
         room += (SAFETY * left / np.min(tails, axis=0)) ** 2

@@ -16,6 +16,8 @@ BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25
 DERIVATIVES = {1: "a mobility (velocity over force); divide it by j 2π f",
                2: "an accelerance (acceleration over force); divide it by -(2π f)²"}  # fmt: skip
+LASTING = PLACES // 10  # places over which it has to, since both turn sharply at a resonance
+UNCLEAR = 2.0  # rad between two lines: from there on whether the angle rises or falls is not known
 RISES = 0.35  # of slope, and rad: so far from those of a derivative
 FIRST = 1.5  # times the first line: up to there its slope says how many poles lie at 0
 LEAST_DAMPING = 5e-4  # of a resonance, where nothing else is known
@@ -130,8 +132,11 @@ class MeasuredResponse:
         x, F = np.log(self.hz[used]), np.linalg.det(self.matrix[used])
         places = np.linspace(x[0], x[-1], PLACES)
         least = least_phase(np.interp(places, x, np.log(np.abs(F))), places)
-        risen = np.interp(places, x, np.unwrap(np.angle(F))) - least
-        return float((risen - risen[0]).max() / np.pi)
+        turns = np.angle(F[1:] / F[:-1])
+        turns = np.where(np.abs(turns) > UNCLEAR, -np.abs(turns), turns)  # an unclear one falls
+        risen = np.interp(places, x, np.append(0.0, np.cumsum(turns))) - least
+        lasting = np.lib.stride_tricks.sliding_window_view(risen - risen[0], LASTING).min(axis=1)
+        return float(lasting.max() / np.pi)
 
     @cached_property
     def followed(self) -> "MeasuredResponse":

@@ -19,6 +19,7 @@ from ccd_casadi.support.errors import PlantError
 
 ROUNDING = 1e-13  # relative: of C Aⁿ B
 ON_AXIS = 1e-9  # |Re p| over |p| up to which no frequency is put on p
+ASIDE = 1e-10  # relative: but so far beside it
 FLANKS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])  # in half widths of a root
 
 
@@ -214,6 +215,6 @@ def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     wide = np.maximum(np.abs(roots.real), 1e-9 * roots.imag) + 1j * roots.imag
     grid = frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS))
     axis = system.poles[np.abs(system.poles.real) < ON_AXIS * np.abs(system.poles)].imag
-    on_pole = np.abs(grid[:, None] - np.abs(axis)) < 0.5 * ON_AXIS * grid[:, None]
-    grid = np.ascontiguousarray(grid[~on_pole.any(axis=1)])
+    on_pole = (np.abs(grid[:, None] - np.abs(axis)) < ASIDE * grid[:, None]).any(axis=1)
+    grid = np.ascontiguousarray(np.where(on_pole, (1.0 + ASIDE) * grid, grid))
     return grid, plant_gain(A, B, C, grid)

@@ -6,7 +6,6 @@ end it is a model again: the poles of the sampled loop and ‖S‖∞ by a Hamil
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.measured_design import NEGATIVE, MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import bandwidth_within
 from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.kernels.limits import HALF_POWER
 from ccd_casadi.lti.closed_loop import closed_loop, sigma_max
 from ccd_casadi.lti.grid import FLANKS, frequency_grid, local_maxima, root_flanks, zoomed
 from ccd_casadi.lti.hold import delay_parts, delayed, sampled, tustin
@@ -212,21 +212,25 @@ def _loop_on(G: StateSpace, K: StateSpace, bounds: Bounds, integrator: bool) -> 
         low, top, int(FINE * np.log10(top / low)), root_flanks(roots), apart=APART
     )
 
-    def level(omega: np.ndarray, slope: float = 0.0) -> np.ndarray:
-        size = sigma_max(S.swept(omega.ravel())).reshape(omega.shape)
-        return np.asarray(np.log(size) - slope * np.log(omega))
+    def level(omega: np.ndarray) -> np.ndarray:
+        return np.log(sigma_max(S.swept(omega.ravel()))).reshape(omega.shape)
 
-    for slope in (0.0, 1.0):  # of the bound of |S|: constant, and the shape
-        top_at = local_maxima(level(omega, slope))
+    def held(omega: np.ndarray) -> np.ndarray:
+        """-ln of the ω_b that the shape allows."""
+        if bounds.shape is None:
+            return level(omega)
+        return np.log(bounds.reached(np.exp(level(omega) + HALF_POWER)) / omega)
+
+    for curve in (level, held):
+        top_at = local_maxima(curve(omega))
         ends = omega[top_at - 1], omega[top_at + 1]
-        omega = np.union1d(omega, zoomed(partial(level, slope=slope), *ends)[0])
+        omega = np.union1d(omega, zoomed(curve, *ends)[0])
     found = bandwidth_within(omega, level(omega), bounds, integrator)
     for _ in range(2):  # it lies at a crossing, or by the shape at a maximum that is there already
         i = int(np.clip(np.searchsorted(omega, found), 1, len(omega) - 1))
         omega = np.union1d(omega, np.linspace(omega[i - 1], omega[i], CLOSER))
         found = bandwidth_within(omega, level(omega), bounds, integrator)
-    held = omega[np.argmax(level(omega, 1.0))]
-    return LoopOnModel(norm, peak, found, (found, float(held)))
+    return LoopOnModel(norm, peak, found, (found, float(omega[np.argmax(held(omega))])))
 
 
 def _on_models(

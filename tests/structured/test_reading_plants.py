@@ -49,7 +49,9 @@ def true_bandwidth(plant: object, K: StateSpace, rate: float) -> float:
     omega = np.unique(omega[(omega > 1e-4 * rate) & (omega < np.pi * rate)])
     size = np.abs(S(np.exp(1j * omega / rate)))
     crossing = omega[np.argmax(size > np.sqrt(0.5))]
-    return float(min(crossing, (1.1 * omega / (np.sqrt(2.0) * size)).min()))
+    y = np.sqrt(2.0) * size  # at most x up to ω_b, then 1.1 x - 0.1/x
+    x = np.where(y <= 1.0, y, (y + np.sqrt(y**2 + 4.0 * 1.1 * 0.1)) / 2.2)
+    return float(min(crossing, (omega / x).min()))
 
 
 @pytest.mark.parametrize("seed", range(5))
