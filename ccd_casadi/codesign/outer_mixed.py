@@ -12,7 +12,6 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.judgement import judge_on_model
 from ccd_casadi.codesign.kinked import SETTLED, descend, polish
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import End, Outer, Place
@@ -136,7 +135,6 @@ class MixedOuter(Outer):
             robust=robust,
             damping=other_damping(problem, loops),
             survival=found,
-            judged=judge_on_model(problem, theta, final.controller),
             second=second_on_weighted(problem, theta, final),
         )
 

@@ -8,13 +8,14 @@ else. `Solution` is what a whole run leaves.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ccd_casadi.codesign.design_entries import controller_dict
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
-from ccd_casadi.codesign.judgement import Judgement
+from ccd_casadi.codesign.judgement import Judgement, judge_on_model
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence, survives
@@ -127,10 +128,10 @@ class Verified(ABC):
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
         return search_evidence(starts, optima, look, self.bound_words)
 
-    @property
-    @abstractmethod
+    @cached_property
     def judgement(self) -> Judgement:
         """On the plants as their function returned them."""
+        return judge_on_model(self.problem, self.theta, self.controller)
 
     @property
     def bound_words(self) -> str:

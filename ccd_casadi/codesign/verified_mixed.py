@@ -5,7 +5,6 @@ from math import isfinite
 from typing import Any, ClassVar
 
 from ccd_casadi.codesign.design_entries import mixed_dict
-from ccd_casadi.codesign.judgement import Judgement
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
@@ -20,13 +19,11 @@ from ccd_casadi.synthesis.synthesis import Design
 class VerifiedDesign(Verified):
     """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
 
-    `judged`: on the model as it was written; `references`: on closer models of the plant; `robust`:
-    all along the case's own set.
+    `references`: on closer models of the plant; `robust`: all along the case's own set.
     """
 
     x: Array
     design: Design
-    judged: Judgement
     references: tuple[ReferenceCheck, ...] = ()
     robust: RobustCheck | None = None
 
@@ -34,11 +31,7 @@ class VerifiedDesign(Verified):
 
     @property
     def certified(self) -> bool:
-        return self.design.figures.certified and self.judged.passed
-
-    @property
-    def judgement(self) -> Judgement:
-        return self.judged
+        return self.design.figures.certified and self.judgement.passed
 
     @property
     def bandwidth(self) -> float:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 from ccd_casadi.analysis.yield_bound import Yield
@@ -90,7 +91,7 @@ class VerifiedStructured(Verified):
     kkt_level: ClassVar[float] = 1e-2
     saddle: ClassVar[float] = -math.inf
 
-    @property
+    @cached_property
     def judgement(self) -> Judgement:
         return judgement_of(self.wide, self.checked)
 
