@@ -1,4 +1,4 @@
-"""A controller of fixed structure on one plant of its box, judged without the package: NumPy alone.
+"""A controller of fixed structure on one plant of its box, judged without the package.
 
 The plant from the chain's matrices, hold and delay by modes, K by the formula of
 docs/fixed_structure.md (the state space has to agree with it), poles of the loop rebuilt, S, KS, T
@@ -8,6 +8,7 @@ and GS on grids through every pole. Of the package there are but the types of it
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import expm
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -36,15 +37,19 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
     a, k_b, k_c = controller.A, controller.B[:, 0], controller.C[0]
     k_d = float(controller.D[0, 0])
     A, b, c = chain_at(asked, point)
-    poles, V = np.linalg.eig(A)
-    left, right = np.linalg.solve(V, b + 0j), c @ V
+    n = len(A) // 2
+    rest = np.setdiff1d(np.arange(len(A)), [0, n])  # the first mode is the free body, b c/s²
+    body = float(c[0] * b[n])
+    poles, V = np.linalg.eig(A[np.ix_(rest, rest)])
+    left, right = np.linalg.solve(V, b[rest] + 0j), c[rest] @ V
     T = None if asked.sampling is None else asked.sampling.period
     if T is None:
         closed = np.block([[A - np.outer(b, c) * k_d, np.outer(b, k_c)], [-np.outer(k_b, c), a]])
         loop_poles = np.linalg.eigvals(closed)
         if not (loop_poles.real < 0.0).all():
             return {"STABLE": np.inf}
-        top, roots = 1e3 * max(np.abs(poles).max(), np.abs(loop_poles).max()), loop_poles
+        fastest = max(np.abs(poles).max(initial=0.0), np.abs(loop_poles).max())
+        top, roots = 1e3 * fastest, loop_poles
     else:
         assert asked.sampling is not None
         age = int(np.ceil(1e-6 * asked.sampling.delay_us / T - 1e-9))
@@ -52,16 +57,17 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
         late = np.expm1(poles * h) / poles * left if h > 1e-12 else np.zeros_like(left)
         early = np.exp(poles * h) * np.expm1(poles * (T - h)) / poles * left
         n, m = len(A), len(a)
-        Ad = (V * np.exp(poles * T)) @ np.linalg.inv(V)
+        newer, Ad = driven(A, b, h), expm(A * T)
+        older = expm(A * h) @ driven(A, b, T - h)
         inverse = np.linalg.inv(np.eye(m) - 0.5 * T * a)
         a_z, b_z = inverse @ (np.eye(m) + 0.5 * T * a), inverse @ k_b * T
         c_z, d_z = k_c @ inverse, k_d + 0.5 * T * k_c @ inverse @ k_b
         size = n + age + m
         closed = np.zeros((size, size))
-        closed[:n, :n] = Ad.real
+        closed[:n, :n] = Ad
         # e = -c x, u = d_z e + c_z x_K; the force is u_{k-age} at first, then u_{k-age+1}
         command = np.concatenate([-d_z * c, np.zeros(age), c_z])
-        vectors = [(V @ early).real, (V @ late).real]
+        vectors = [older, newer]
         for back, vector in zip((age, age - 1), vectors, strict=True):
             if back <= 0:
                 closed[:n] += np.outer(vector, command)
@@ -86,13 +92,15 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
     w = np.unique(np.concatenate([*omega, [bandwidth, bounds.omega_low], rest]))
     w = w[(w > 0.0) & (w <= top)]
     s = 1j * w
-    free = (right * left / (s[:, None] - poles)).sum(1)
+    free = (right * left / (s[:, None] - poles)).sum(1) + body / s**2
     if T is None:
         G, x = free, s
     else:
         z = np.exp(s * T)
         terms = (early + late * z[:, None]) * right / (z[:, None] - np.exp(poles * T))
-        G = np.exp(-s * T * age) * terms.sum(1)
+        first = h**2 / 2.0 * z + (T**2 - h**2) / 2.0
+        coasted = (first + T * (h * z + T - h) / (z - 1.0)) / (z - 1.0)
+        G = np.exp(-s * T * age) * (terms.sum(1) + body * coasted)
         x = 2.0 / T * (z - 1.0) / (z + 1.0)
     k = product(asked.structure, design.kappa, x)
     few = np.array([0, len(w) // 2, int(np.argmin(np.abs(w - bandwidth)))])
@@ -144,6 +152,12 @@ def product(structure: Structure, kappa: np.ndarray, s: np.ndarray) -> np.ndarra
     return K / (1.0 + s / value["roll-off real"]) if structure.roll_off % 2 else K
 
 
+def driven(A: np.ndarray, b: np.ndarray, t: float) -> np.ndarray:
+    """What a constant force does to the states in a time."""
+    n = len(A)
+    return np.asarray(expm(np.block([[A, b[:, None]], [np.zeros((1, n + 1))]]) * t)[:n, n])
+
+
 def chain_at(asked: Case, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(A, b, c) of the chain at a point of the box, in modal coordinates."""
     values = dict(zip(asked.uncertain.names, point.tolist(), strict=True))
@@ -151,11 +165,11 @@ def chain_at(asked: Case, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     lam, modes = np.linalg.eigh(root[:, None] * asked.stiffness * root)
     omega = np.sqrt(np.maximum(lam, 0.0)) * (1.0 + values.get("resonance_shift", 0.0))
     zeta = np.full(len(lam), asked.zeta * values.get("damping", 1.0))
-    omega[0], zeta[0] = 0.1 * HZ, 0.7  # the suspension of the free chain
-    n = len(lam)
+    omega[0], n = 0.0, len(lam)  # the free chain
+    rate = np.where(omega > 0.0, omega, 1.0)
     A = np.zeros((2 * n, 2 * n))
-    A[:n, n:] = np.diag(omega)
+    A[:n, n:] = np.diag(rate)
     A[n:, :n], A[n:, n:] = -np.diag(omega), -np.diag(2.0 * zeta * omega)
     shape = root[:, None] * modes
     b = np.concatenate([np.zeros(n), shape[0]]) * (1.0 + values.get("gain", 0.0))
-    return A, b, np.concatenate([shape[asked.sensor] / omega, np.zeros(n)])
+    return A, b, np.concatenate([shape[asked.sensor] / rate, np.zeros(n)])

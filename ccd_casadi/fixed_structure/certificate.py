@@ -11,6 +11,7 @@ its hold and delay exact, K by Tustin's rule; what happens between samples is no
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import expm, matrix_balance
@@ -26,10 +27,12 @@ from ccd_casadi.fixed_structure.certificate_curves import (
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable, norms
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace, balanced
-from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.units import counted
+
+if TYPE_CHECKING:
+    from ccd_casadi.plants.scaling import ScaledPlant
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
 AT_ONCE = 16  # plants: the last ones keep all workers busy
@@ -77,7 +80,7 @@ class SetCertificate:
 
 
 def certify(
-    plants: Sequence[ScaledPlant | StateSpace],
+    plants: "Sequence[ScaledPlant | StateSpace]",
     controller: StateSpace,
     bounds: Bounds,
     sampling: Sampling | None = None,

@@ -106,7 +106,8 @@ class DesignOnBox:
         points = [*lattice(uncertain, CHECKED, structured.seed + 1000), (worst.option, worst.point)]
         if not uncertain.names:
             points = uncertain.corners()[: 1 + len(structured.uncertainty.options)]
-        points += [(option, np.array(point)) for option, point in structured.scenarios]
+        else:
+            points += [(option, np.array(point)) for option, point in structured.scenarios]
         K = self.design.controller
         assert K is not None
         return _judged(self.problem, uncertain.as_written(points), K, workers), len(points)

@@ -54,7 +54,7 @@ class TrueQuantities(VectorCallback):
     >>> quantities = ccd.TrueQuantities(ccd.problem_of(ccd.load_case(ccd.TWO_MASS)))
     >>> x = [60.0, 60.0, *np.log([800.0 * ccd.HZ, 40.0 * ccd.HZ])]
     >>> round(float(quantities(x)[0]) / ccd.HZ, 2)
-    55.66
+    55.56
     """
 
     def __init__(

@@ -128,8 +128,7 @@ def modal_plant(
 
     D_given = perturbation.damping * to_modal(system.D)
     size = np.abs(modes).T @ np.abs(system.D) @ np.abs(modes)
-    undamped = (rigid[:, None] | rigid) & (np.abs(D_given) <= NONE * perturbation.damping * size)
-    D_given[undamped] = 0.0
+    D_given[np.abs(D_given) <= NONE * perturbation.damping * size] = 0.0  # what is apart stays so
     dM, dD, dK, dB, dC = system.derivatives
     dM, dK = to_modal(dM), to_modal(dK)
     dA = dK - dM * lam  # M⁻¹K moves by dK - dM Λ where M = I

@@ -119,12 +119,12 @@ def driven_and_measured(B: Array, C: Array) -> tuple[Array, Array]:
     measured = int((s > HIDDEN).sum())
     both = np.linalg.svd(Vt[:measured] @ U[:, :driven], compute_uv=False)
     known = int((both > HIDDEN).sum())
-    for count, words in (
-        (driven, "driven and not measured: it drifts away; add an output that sees it"),
-        (measured, "measured and not driven: no force holds it; add an input that moves it"),
-    ):
-        if count > known:
-            raise PlantError(f"a rigid-body motion is {words}, or a spring in the model")
+    if driven > known:
+        words = "it drifts away; add an output that sees it, or a spring that holds it"
+        raise PlantError(f"a rigid-body motion is driven and not measured: {words}")
+    if measured > known:
+        words = "no force holds it; add an input that moves it, or a spring that holds it"
+        raise PlantError(f"a rigid-body motion is measured and not driven: {words}")
     if known == len(B):
         return np.eye(known), np.eye(known)
     T = np.hstack([U[:, :known], Vt[known:].T])

@@ -155,7 +155,7 @@ def test_a_wrong_plant_function_is_told(
 @pytest.mark.parametrize(
     ("function", "words"),
     [
-        ("broken", "plant.function: broken raised ZeroDivisionError: division by zero; correct it"),
+        ("broken", "the plant function raised ZeroDivisionError: division by zero in line"),
         ("absent", "defines no function absent; check plant.function"),
         ("not_callable", "defines no function not_callable; check plant.function"),
     ],

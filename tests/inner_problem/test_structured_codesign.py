@@ -1,5 +1,6 @@
 """Co-design with a fixed structure: a PID with roll-off climbs in a fraction of a second."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -234,4 +235,6 @@ def test_few_starts_that_miss_are_not_the_last_word() -> None:
     impossible = with_structured(quick(), weighted_level=1e-3, starts=1)
     made = prepared(impossible)[1]
     assert not made.certified
-    assert made.words.startswith(f"none found from {ENOUGH} starts")
+    found = re.match(r"none found from (\d+) starts", made.words)
+    assert found is not None
+    assert int(found[1]) >= ENOUGH

@@ -134,7 +134,7 @@ def test_a_users_plant_is_used(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ('raise ValueError("two\\nlines \\x1b[31m")\n', "cannot be loaded: ValueError: two lines"),
         ("g = 1\n", "defines no function f; check plant.function"),
         ("f = 1\n", "defines no function f; check plant.function"),
-        ("def f(): pass\n", "does not take its options"),
+        ("def f(): pass\n", "f() takes 0 positional arguments but 1 was given"),
         (model('t["m3"]'), "m3"),
         (model("1 / 0"), "ZeroDivisionError"),
         (model("undefined"), "NameError"),

@@ -241,9 +241,10 @@ def test_what_cannot_be_had_is_said(design) -> None:
 
 def test_a_set_of_unlike_plants_is_brought_to_common_units(design) -> None:
     """A plant scaled with another M_K, or given as a state space, is the same plant."""
-    other = scale_plant(modal_plant(mechanics(two_mass_model(), (55.0, 55.0)), SUSPENSION), 3e6)
-    again = scale_state_space(plant().plant_si(), 1e7)
-    problem = problem_for([plant(), other, again], SMALL, EASY)
+    modal = modal_plant(mechanics(two_mass_model(), (55.0, 55.0)), SUSPENSION)
+    one, other = (scale_plant(modal, M_K) for M_K in (WEIGHTS.M_K, 3e6))
+    again = scale_state_space(one.plant_si(), 1e7)
+    problem = problem_for([one, other, again], SMALL, EASY)
     kappa = in_problem_units(problem, design.kappa)
     found = assess(problem, kappa, float(np.log(design.bandwidth / problem.plants.omega_0))).peaks
     assert found is not None
