@@ -1,4 +1,4 @@
-"""The rib stage's table and sentences in docs/rib_stage.md, from the figures that are kept.
+"""The rib stage's table and sentences in docs/development/rib_stage_built.md, from the figures that are kept.
 
     python benchmarks/rib_stage_conclusions.py [--write]
 
@@ -17,7 +17,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 
 ROOT = Path(__file__).resolve().parent.parent
-CASE, PAGE = ROOT / "runs" / "rib_stage.toml", ROOT / "docs" / "rib_stage.md"
+CASE, PAGE = ROOT / "runs" / "rib_stage.toml", ROOT / "docs/development/rib_stage_built.md"
 BEGIN, END = "<!-- computed by benchmarks/rib_stage_conclusions.py -->", "<!-- end -->"
 
 

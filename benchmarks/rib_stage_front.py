@@ -12,7 +12,7 @@ With `--whole` the whole loop climbs from there on all three models, the worst p
 are searched and added, and the judge sees the plants that it ends with: some minutes for each θ.
 `--write` keeps what was found in benchmarks/rib_stage_on_the_set.json (`--whole` then
 begins at the channels kept there), from which `benchmarks/rib_stage_conclusions.py` writes the
-tables and sentences of docs/rib_stage.md.
+tables and sentences of docs/development/rib_stage_built.md.
 """
 
 import argparse

@@ -29,6 +29,7 @@ from surrogates import design
 LOOKED_AT = 64  # θ whose hardware cost is computed, for its range
 FLAT = 1e-9  # relative: a hardware cost that moves less over the box is constant
 EXTREME = 1e-3  # share of the range of one that counts as much as all of the other, at the ends
+ROUNDED = 1e-9  # relative: a design that is faster by less is as fast
 GAIN = 1e-3  # of the triangle between two neighbours: a lesser one is none
 
 
@@ -137,7 +138,9 @@ def hull(points: Sequence[FrontPoint]) -> list[FrontPoint]:
     """In order of cost, the points that are the best of all for some weights."""
     kept: list[FrontPoint] = []
     for point in sorted(points, key=lambda point: (point.hardware_cost, -point.worth)):
-        if not np.isfinite(point.worth) or (kept and point.worth <= kept[-1].worth):
+        if not np.isfinite(point.worth):
+            continue
+        if kept and point.worth - kept[-1].worth <= ROUNDED * abs(point.worth):
             continue
         while len(kept) > 1 and _slope(kept[-2], kept[-1]) <= _slope(kept[-1], point):
             kept.pop()

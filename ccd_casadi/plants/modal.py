@@ -127,8 +127,9 @@ def modal_plant(
         return modes.T @ matrix @ modes
 
     D_given = perturbation.damping * to_modal(system.D)
-    size = np.abs(modes).T @ np.abs(system.D) @ np.abs(modes)
-    D_given[np.abs(D_given) <= NONE * perturbation.damping * size] = 0.0  # what is apart stays so
+    size = np.sqrt(np.einsum("ij,ik,kj->j", np.abs(modes), np.abs(system.D), np.abs(modes)))
+    apart = np.abs(D_given) <= NONE * perturbation.damping * np.outer(size, size)
+    D_given[apart] = 0.0  # of modes that no damper connects, and of a body that none brakes
     dM, dD, dK, dB, dC = system.derivatives
     dM, dK = to_modal(dM), to_modal(dK)
     dA = dK - dM * lam  # M⁻¹K moves by dK - dM Λ where M = I

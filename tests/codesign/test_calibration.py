@@ -14,10 +14,10 @@ ROOT = Path(__file__).parents[2]
 HZ = 2.0 * np.pi
 # Ours at the published designs, (m1, m2) in kg: bandwidth in Hz, and J where one is published.
 OURS = {
-    (60.0, 60.0): (60.73, None),
-    (67.56, 67.56): (55.24, -331.89),
-    (58.33, 55.0): (67.35, -409.78),
-    (55.0, 55.0): (71.67, -437.13),  # the true optimum; published -437.6 at (58.33, 55)
+    (60.0, 60.0): (60.61, None),
+    (67.56, 67.56): (55.14, -331.25),
+    (58.33, 55.0): (67.20, -408.85),
+    (55.0, 55.0): (71.56, -436.42),  # the true optimum; published -437.6 at (58.33, 55)
 }
 
 
@@ -46,8 +46,8 @@ def test_every_published_figure_is_within_the_reported_residual(case: CoDesignPr
     figures = study.figures(case, setting)
     assert len(figures) == 8
     residuals = {key: ours / published - 1.0 for key, (ours, published) in figures.items()}
-    assert max(map(abs, residuals.values())) == pytest.approx(0.0654, abs=5e-4)
-    assert residuals["A bandwidth"] == pytest.approx(0.0654, abs=5e-4)
+    assert max(map(abs, residuals.values())) == pytest.approx(0.0678, abs=5e-4)
+    assert residuals["A bandwidth"] == pytest.approx(0.0634, abs=5e-4)
     assert residuals["B bandwidth"] == pytest.approx(-0.0648, abs=5e-4)
     assert residuals["co-design J"] == pytest.approx(-0.0636, abs=5e-4)
     # With the co-design's omega_S in a range of its own all eight come within 0.4 %.

@@ -95,7 +95,7 @@ def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
         (down,), (up,) = first.gradient, second.gradient
         return (first.bandwidth - second.bandwidth + up * b - down * a) / (up - down)
 
-    (thin, _), (thick, _) = at(0.0205), at(0.0225)
+    (thin, _), (thick, _) = at(0.0185), at(0.0215)
     assert thin.gradient[0] > 0.0 > thick.gradient[0]
     while thick.theta[0] - thin.theta[0] > 2e-6:
         middle = at(0.5 * (thin.theta[0] + thick.theta[0]))[0]

@@ -161,7 +161,9 @@ def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
         change = rng.standard_normal(H0.shape)
         change *= size * np.linalg.norm(H0) / np.linalg.norm(change)
         moved.append(root(H0 + change)[0] / level - 1.0)
-    assert np.std(moved) == pytest.approx(told * size / gamma.BACKWARD, rel=0.4)
+    # by the median: of 300 changes one lost the subspace, whichever rounding chooses
+    spread = 1.4826 * np.median(np.abs(moved))
+    assert spread == pytest.approx(told * size / gamma.BACKWARD, rel=0.4)
 
 
 @pytest.mark.parametrize("seed", [81, 45])

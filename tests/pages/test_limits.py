@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers import HZ, problem, two_mass
+from helpers import HZ, problem
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.limits import limit_sentences, shares, table_limits
 from ccd_casadi.support.units import display_unit
 from ccd_casadi.synthesis.synthesis import synthesise
@@ -13,7 +14,7 @@ from ccd_casadi.synthesis.synthesis import synthesise
 
 @pytest.fixture(scope="module")
 def loop() -> LoopView:
-    plant, weights = two_mass(60.0, 60.0), problem().weights.at(HZ * 800.0, HZ * 40.0)
+    plant, weights = scaled_plant(problem(), (60.0, 60.0)), problem().weights.at(HZ * 800.0, HZ * 40.0)
     design = synthesise(plant, weights, omega_low=HZ)
     return design_view(
         problem(), (60.0, 60.0), design.controller, weights=weights, gamma=design.figures.gamma,
@@ -29,7 +30,7 @@ def test_no_share_exceeds_the_certified_norm(loop: LoopView) -> None:
 
 def test_the_words_name_the_zero_that_limits_case_a(loop: LoopView) -> None:
     words = " ".join(limit_sentences(loop))
-    assert "At ω_b = 55.66 Hz |S| is at 98 % of its bound" in words
+    assert "At ω_b = 55.56 Hz |S| is at 98 % of its bound" in words
     assert "nearest transmission zero is at 147.9 Hz" in words
     table = table_limits(loop)
     places = [row[0] for row in table.rows]

@@ -271,6 +271,7 @@ def dense_grid(*systems: StateSpace, per_decade: int = 100) -> Array:
     """Frequencies over all poles of the systems, crowded around each, rad/s."""
     poles = np.concatenate([np.linalg.eigvals(system.A) for system in systems])
     size = np.abs(poles)
+    size = size[size > 1e-9 * size.max()]  # but of free bodies
     low, high = np.log10(0.01 * size.min()), np.log10(10.0 * size.max())
     pieces = [np.logspace(low, high, int(per_decade * (high - low)))]
     flanks = np.linspace(-4.0, 4.0, 41)
