@@ -1,4 +1,4 @@
-"""The rib stage's table and sentences in docs/development/rib_stage_built.md, from the figures that are kept.
+"""The rib stage's table and sentences in docs/development/rib_stage_built.md, from kept figures.
 
     python benchmarks/rib_stage_conclusions.py [--write]
 

@@ -36,10 +36,11 @@ def test_no_input_breaks_a_command(bench: Bench, tmp_path: Path, first: int) -> 
 def test_what_double_precision_cannot_judge_is_judged_in_sixty_digits(
     bench: Bench, seed: str
 ) -> None:
-    """A mass that is singular to twelve digits; a stiffness so small that all modes are rigid."""
+    """A mass that is singular to ten digits; a stiffness of 1e-22 N/m. The tool's own engines may
+    differ there: then nothing is claimed, and the command does not end as verified."""
     verdict = bench.judged(seed)
-    assert verdict["judged"]
     assert verdict["wrong"] == []
+    assert verdict["judged"] or verdict["code"] != 0
 
 
 def test_a_false_claim_is_refuted(two_mass_run: Path) -> None:

@@ -14,7 +14,8 @@ from ccd_casadi.synthesis.synthesis import synthesise
 
 @pytest.fixture(scope="module")
 def loop() -> LoopView:
-    plant, weights = scaled_plant(problem(), (60.0, 60.0)), problem().weights.at(HZ * 800.0, HZ * 40.0)
+    plant = scaled_plant(problem(), (60.0, 60.0))
+    weights = problem().weights.at(HZ * 800.0, HZ * 40.0)
     design = synthesise(plant, weights, omega_low=HZ)
     return design_view(
         problem(), (60.0, 60.0), design.controller, weights=weights, gamma=design.figures.gamma,
