@@ -3,7 +3,7 @@
 >>> import ccd_casadi as ccd
 >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
 >>> round(ccd.true_inner(problem, (60.0, 60.0)).bandwidth / ccd.HZ, 1)
-58.2
+58.1
 
 Names are imported when they are first used: this module alone loads neither numba nor CasADi.
 """
