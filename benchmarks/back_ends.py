@@ -5,13 +5,17 @@ OPENBLAS_NUM_THREADS=1 python benchmarks/back_ends.py [two masses, 40] [stages, 
 
 import sys
 from collections import Counter
+from pathlib import Path
 
-import lmi
 import numpy as np
 from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 
 from ccd_casadi.studies.backends import SOLVERS, TITLES, synthesise_with, verdicts
 from ccd_casadi.support.worker_process import Runner
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from oracles import lmi
 
 SEED = 0
 SOLVERS["lmi"] = lmi.solve

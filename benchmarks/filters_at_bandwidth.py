@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import random_sections
 
 from ccd_casadi.analysis.loop_figures import bandwidth_dip
 from ccd_casadi.cases.case import load_case, parse_theta
@@ -28,6 +27,10 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from oracles import random_sections
 
 COSTS, LOWER, CANCELS = 0.03, 1e-3, 0.1  # of ω_b, of the peak of S, of a frequency
 STARTS, STARTS_WITHOUT = 12, 4

@@ -15,6 +15,7 @@ verdict that failed.
 
 import argparse
 import json
+import sys
 from collections import Counter
 from dataclasses import replace
 from itertools import count, islice
@@ -24,12 +25,15 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from chain_plants import chain_problem
 
 import ccd_casadi as ccd
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, true_inner
 from ccd_casadi.plants.plant import hardware_cost
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from oracles.chain_plants import chain_problem
 
 AGREE = 1e-3  # relative
 SIDE = 15  # points a side of the grid over θ

@@ -17,8 +17,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+
 ROOT = Path(__file__).parent.parent
-sys.path += [str(folder) for folder in (ROOT / "tests").iterdir()]
 DEADLINE = 120.0  # s for one input
 FRESH = 400  # inputs after which a process is exchanged for a new one
 MEMORY = 6 << 30  # bytes of address space of a process
@@ -26,7 +28,7 @@ MEMORY = 6 << 30  # bytes of address space of a process
 
 def serve(pipe: Connection, seed: int) -> None:
     """A process that runs inputs one after the other and sends what became of each."""
-    from fuzz_bench import Bench
+    from oracles.fuzz_bench import Bench
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     with tempfile.TemporaryDirectory(prefix="fuzz_") as place:
@@ -105,7 +107,7 @@ def main() -> None:
     parser.add_argument("--only", type=int)
     options = parser.parse_args()
     if options.only is not None:
-        from fuzz_bench import Bench
+        from oracles.fuzz_bench import Bench
 
         with tempfile.TemporaryDirectory(prefix="fuzz_") as place:
             found = Bench(Path(place)).judged(f"{options.seed}-{options.only}", keep=True)

@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).parent
+ORACLES = HERE.parent / "tests"
 EQUAL = 1e-3  # relative: bandwidths of one optimum
 CODE = """
 import json, sys, time
 sys.path.insert(0, sys.argv[1])
-from random_sections import case
 from ccd_casadi.fixed_structure import synthesise_sections
+from oracles.random_sections import case
 assert sys.modules["ccd_casadi"].__file__.startswith(sys.argv[2])
 for line in sys.stdin:
     seed = int(line)
@@ -42,7 +43,7 @@ for line in sys.stdin:
 def process(tree: Path) -> subprocess.Popen[str]:
     """One that answers seeds with the package of a tree."""
     return subprocess.Popen(
-        [sys.executable, "-c", CODE, str(HERE), str(tree)], stdin=subprocess.PIPE,
+        [sys.executable, "-c", CODE, str(ORACLES), str(tree)], stdin=subprocess.PIPE,
         stdout=subprocess.PIPE, text=True, cwd=tree, env=os.environ | {"PYTHONPATH": str(tree)},
     )  # fmt: skip
 

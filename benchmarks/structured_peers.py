@@ -17,15 +17,13 @@ all.
 
 import argparse
 import json
+import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from random_sections import case
 from scipy.optimize import minimize
-from sections_judge import Case
 
 from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.fixed_structure.design import _pool, problem_for
@@ -34,9 +32,12 @@ from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.race import at_its_bandwidth, started
 from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
-from ccd_casadi.limitations.bound import forbids
-from ccd_casadi.limitations.limits import limits_of
 from ccd_casadi.plants.scaling import ScaledPlant
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from oracles.random_sections import case, impossible
+from oracles.sections_judge import Case
 
 STARTS = 12
 STEPS = 300  # of SLSQP from one start
@@ -125,18 +126,6 @@ def peer(
                 soon = best
         turn += 1
     return soon, best, used, time.process_time() - began
-
-
-def impossible(asked: Case, near: float) -> bool:
-    """Whether no controller of any order keeps the bounds on the corners, at any ω_b down to a
-    thousandth of ω_low; `near` (rad/s): where they are tight."""
-    uncertain = asked.uncertain
-    each = [limits_of(uncertain.plant(point).plant_si(), asked.bounds, asked.sampling,
-                      integrator=asked.structure.integrator)
-            for _, point in uncertain.corners()]  # fmt: skip
-    sets = [replace(own, others=tuple(other for other in each if other is not own))
-            for own in each]  # fmt: skip
-    return any(forbids(limits, 1e-3 * asked.bounds.omega_low, near) for limits in sets)
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -5,10 +5,12 @@ chains of two or three masses with one or two parameters in a small box and solv
 command, as mixed sensitivity (alone, on a set, with a bound of the compliance, with disturbances)
 or sections (bandwidth, least RMS error; continuous, sampled, on a set), by `nested`, `lifted` or
 `direct`. `verdicts_judge`, which shares no code with the package, then looks at every claim of the
-run; tests/support/contradictions.py at its figures among each other. A run that is not verified,
+run; tests/oracles/contradictions.py at its figures among each other. A run that is not verified,
 or found nothing, is solved again by another formulation: verified there at the same J, it is
 falsely not verified. What FILE holds already is not run again. One in twenty is a measured
-response.
+response. `--hard` makes every plant one that design models of ours once mistook: damping of 0.02 to
+0.1 %, a speck of mass on a stiff link, loops of a tenth of a hertz to two, modes 0.5 to 3 % apart;
+half of these stand on a spring and have no free body.
 """
 
 import argparse
@@ -22,13 +24,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from verdicts_judge import HZ, Chain, Loop, wrong
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests/support"))
-from contradictions import contradictions
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from oracles.contradictions import contradictions
+from oracles.verdicts_judge import HZ, Chain, Loop, wrong
 
 SAME = 1e-6  # relative: two values of J that are one optimum
 KINDS = {
@@ -45,7 +48,7 @@ PLANT = """
 import casadi as ca
 
 
-def chain(theta, mass, spring, power, sensor, zeta, price, mass_limit):
+def chain(theta, mass, spring, power, sensor, zeta, price, mass_limit, ground=0.0):
     p = theta["p"]
     q = theta["q"] if "q" in theta else p**power
     n = len(mass)
@@ -54,6 +57,8 @@ def chain(theta, mass, spring, power, sensor, zeta, price, mass_limit):
         e = ca.DM.zeros(n, 1)
         e[i], e[i + 1] = 1.0, -1.0
         K = K + k * q * (e @ e.T)
+    if ground:
+        K[0, 0] += ground
     B, C = ca.DM.zeros(n, 1), ca.DM.zeros(1, n)
     B[0], C[sensor] = 1.0, 1.0
     return {
@@ -68,7 +73,35 @@ def chain(theta, mass, spring, power, sensor, zeta, price, mass_limit):
 """
 
 
-def drawn(seed: int) -> tuple[str, str, Chain, dict[str, Any]]:
+TRAITS = ("light", "link", "slow", "close")
+
+
+def hardened(seed: int, chain: Chain) -> tuple[Chain, str]:
+    """The chain with a trait that a design model may lose, and the trait's name."""
+    rng = np.random.default_rng([seed, 67])
+    mass, spring, zeta = chain.mass, chain.spring, chain.zeta
+    trait = str(rng.choice(TRAITS))
+    if trait == "light":
+        zeta = float(np.exp(rng.uniform(np.log(2e-4), np.log(1e-3))))
+    elif trait == "link":
+        mass = np.append(mass, np.exp(rng.uniform(np.log(1e-6), np.log(1e-4))))
+        spring = np.append(spring, np.exp(rng.uniform(np.log(1e8), np.log(1e10))))
+    elif trait == "slow":
+        spring = spring * np.exp(rng.uniform(np.log(1e-3), np.log(2e-2))) ** 2
+    else:  # two equal arms on a heavy middle: modes apart by their small difference alone
+        apart = 1.0 + float(rng.uniform(0.01, 0.06))
+        mass = mass[0] * np.array([0.1, 2.0, 0.1])
+        spring = spring[0] * np.array([0.1, 0.1 * apart])
+    ground = 0.0
+    if rng.random() < 0.5:
+        first = float(
+            np.sort(np.abs(np.linalg.eigvals(Chain(mass, spring, zeta, 0).at(1.0, 1.0)[0])))[2]
+        )
+        ground = float(mass.sum() * (rng.uniform(0.01, 0.1) * first) ** 2)
+    return Chain(mass, spring, zeta, min(chain.sensor, len(mass) - 1), ground), trait
+
+
+def drawn(seed: int, hard: bool = False) -> tuple[str, str, Chain, dict[str, Any]]:
     """Kind, formulation, plant and case of a seed."""
     rng = np.random.default_rng([seed, 34])
     kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
@@ -78,6 +111,10 @@ def drawn(seed: int) -> tuple[str, str, Chain, dict[str, Any]]:
     spring = mass[:-1] * (HZ * np.exp(rng.uniform(np.log(60.0), np.log(300.0), n - 1))) ** 2
     sensor = 0 if rng.random() < 0.7 else int(rng.integers(n))
     chain = Chain(mass, spring, float(np.exp(rng.uniform(-7.0, -3.5))), sensor)
+    if hard:
+        chain, trait = hardened(seed, chain)
+        kind_and_trait = f"{kind}, {trait}" + (", on a spring" if chain.ground else "")
+    mass, spring, sensor = chain.mass, chain.spring, chain.sensor
     first = float(np.sort(np.abs(np.linalg.eigvals(chain.at(1.0, 1.0)[0])))[2])
     total, crossing = float(mass.sum()), first * float(rng.uniform(0.15, 0.6))
     reach = np.exp(rng.uniform(np.log(0.01), np.log(0.4), (2, 2)))
@@ -97,6 +134,7 @@ def drawn(seed: int) -> tuple[str, str, Chain, dict[str, Any]]:
             "zeta": chain.zeta,
             "price": total * float(rng.uniform(0.0, 2.0)),
             "mass_limit": total * float(rng.uniform(1.0, 1.3)),
+            "ground": chain.ground,
         },
         "theta": theta,
         "objective": {"w1": float(rng.uniform(0.0, 2.0)) * crossing / total, "w2": -1.0},
@@ -132,7 +170,7 @@ def drawn(seed: int) -> tuple[str, str, Chain, dict[str, Any]]:
         case["weights"]["disturbance"] = case["weights"]["M_K"] * float(rng.uniform(1.0, 30.0))
     elif kind != "h_infinity":
         _with_sections(rng, kind, case, crossing)
-    return kind, formulation, chain, case
+    return (kind_and_trait if hard else kind), formulation, chain, case
 
 
 def _with_sections(
@@ -233,13 +271,13 @@ def measured(folder: Path, chain: Chain, case: dict[str, Any], seconds: float) -
     return row
 
 
-def judged(seed: int, seconds: float) -> dict[str, Any]:
+def judged(seed: int, seconds: float, hard: bool = False) -> dict[str, Any]:
     """The row of a seed."""
-    kind, formulation, chain, case = drawn(seed)
+    kind, formulation, chain, case = drawn(seed, hard)
     row: dict[str, Any] = {"seed": seed, "kind": kind, "formulation": formulation}
     began = time.monotonic()
     with TemporaryDirectory() as place:
-        if kind == "measured":
+        if kind.startswith("measured"):
             return row | measured(Path(place), chain, case, seconds)
         path = written(Path(place), case)
         found = ran(path, formulation, seconds)
@@ -298,6 +336,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=5.0, help="of one solve at most")
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--hard", action="store_true", help="plants that a design model may lose")
     options = parser.parse_args()
     rows: dict[int, dict[str, Any]] = {}
     if options.out.exists():
@@ -305,7 +344,7 @@ def main() -> None:
     for seed in range(options.first, options.first + options.cases):
         if seed in rows:
             continue
-        rows[seed] = judged(seed, 60.0 * options.minutes)
+        rows[seed] = judged(seed, 60.0 * options.minutes, options.hard)
         print(json.dumps(rows[seed]), flush=True)
         ordered = [rows[number] for number in sorted(rows)]
         text = json.dumps({"summed": summed(ordered), "rows": ordered}, indent=1)

@@ -53,7 +53,7 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
     def solve(formulation: str) -> Path:
-        from commands import run
+        from oracles.commands import run
 
         folder, making = base / f"two_mass_{formulation}", base / f"making_{formulation}"
         with (base / f"{formulation}.lock").open("a") as lock:
@@ -74,7 +74,7 @@ def two_mass_run(solved: Callable[[str], Path]) -> Path:
 
 @pytest.fixture(scope="module")
 def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    from dask_processes import Processes
+    from oracles.dask_processes import Processes
 
     processes = Processes(tmp_path_factory.mktemp("dask"))
     try:
@@ -96,7 +96,7 @@ def shared(lasting: Any) -> Any:
 @pytest.fixture
 def nannies(tmp_path: Path) -> Iterator[Any]:
     """The same with nannies, which restart workers."""
-    from dask_processes import Processes
+    from oracles.dask_processes import Processes
 
     processes = Processes(tmp_path, nanny=True)
     try:

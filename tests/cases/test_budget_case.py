@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from case_documents import TWO_MASS
+from oracles.case_documents import TWO_MASS
 
 from ccd_casadi.budget import Kind, ShapedSpectrum, TabulatedSpectrum
 from ccd_casadi.budget.frequency import integrate

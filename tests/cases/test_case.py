@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from case_documents import DROP, PLANT, TWO_MASS, edited, message
+from oracles.case_documents import DROP, PLANT, TWO_MASS, edited, message
 
 from ccd_casadi.cases import plant_tables
 from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta

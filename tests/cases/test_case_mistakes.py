@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from case_documents import DOCUMENT, DROP, edited, message
+from oracles.case_documents import DOCUMENT, DROP, edited, message
 
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.support.errors import UserError

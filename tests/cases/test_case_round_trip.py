@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from case_documents import DOCUMENT, PLANT, TWO_MASS, again, edited, message, verdict
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.case_documents import DOCUMENT, PLANT, TWO_MASS, again, edited, message, verdict
+from oracles.helpers import few
 
 from ccd_casadi.cases.case import load_case, parse_case
 from ccd_casadi.cases.tables import Case

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
+from oracles import published_figures as study
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -40,7 +40,6 @@ def test_the_shipped_case_has_the_reported_bandwidths(
 
 
 def test_every_published_figure_is_within_the_reported_residual(case: CoDesignProblem) -> None:
-    study = benchmark("calibration")
     S_hi, T = case.inner.omega_S[1] / HZ, np.array(case.inner.omega_T) / HZ
     setting = study.Setting(case.inner.S_max, T[0], T[1], S_hi, case.inner.gamma_backoff)
     figures = study.figures(case, setting)

@@ -10,9 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import few, problem
 from scipy.optimize import lsq_linear
 
 from ccd_casadi.cases.case import load_case

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import problem
+from oracles.helpers import problem
 
 from ccd_casadi.codesign import outer_mixed, outer_structured
 from ccd_casadi.codesign import verdict as v

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import few, problem
 
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.kkt import TrueDesign

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contradictions import contradictions
-from helpers import problem
+from oracles.contradictions import contradictions
+from oracles.helpers import problem
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of

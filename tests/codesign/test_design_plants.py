@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import problem
+from oracles.helpers import problem
 
 from ccd_casadi.codesign.design_plants import remedies, search_words, widen
 from ccd_casadi.codesign.kkt import TrueDesign

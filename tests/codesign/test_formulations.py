@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import HZ, problem
+from oracles.helpers import HZ, problem
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.codesign import run

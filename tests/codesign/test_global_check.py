@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from helpers import problem
+from oracles.helpers import problem
 
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.global_check import _starts, global_check

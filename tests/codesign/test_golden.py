@@ -3,9 +3,8 @@
 import json
 
 import pytest
-from benchmark_scripts import benchmark
+from oracles import golden
 
-golden = benchmark("golden")
 TABLE = json.loads(golden.FILE.read_text())
 CI = {  # about a second each
     "mixed, direct", "sections, nested", "sections, sampled, lifted", "two_mass, lifted",

@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from helpers import few, problem
 from hypothesis import example, given
 from hypothesis import strategies as st
+from oracles.helpers import few, problem
 
 from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.verdict import State, optimal

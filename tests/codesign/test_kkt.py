@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import HZ, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import HZ, few, problem
 
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer_problem import OuterSolution, outer_program, solve_program

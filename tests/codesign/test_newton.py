@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers import few, problem
 from hypothesis import example, given
 from hypothesis import strategies as st
+from oracles.helpers import few, problem
 from scipy.linalg import null_space
 from test_kkt import MODEL, point
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import HZ, problem
+from oracles.helpers import HZ, problem
 
 import ccd_casadi as ccd
 from ccd_casadi.inner_problem.problem import plant_of

@@ -3,9 +3,9 @@
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import HZ, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import HZ, few, problem
 from test_kinks import pieces
 
 from ccd_casadi.codesign.kinked import descend

@@ -7,9 +7,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import HZ, INNER, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import HZ, INNER, few, problem
 from scipy.optimize import lsq_linear
 
 from ccd_casadi.codesign.outer_problem import (

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import HZ, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import HZ, few, problem
 
 from ccd_casadi.codesign import peak_constraints
 from ccd_casadi.codesign.global_check import global_check

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from busy import HANGS
+from oracles.busy import HANGS
 
 import ccd_casadi as ccd
 from ccd_casadi.codesign.outer_mixed import MixedOuter

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from busy import HANGS
+from oracles.busy import HANGS
 
 from surrogates.retrain import main
 

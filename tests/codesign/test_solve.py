@@ -11,8 +11,8 @@ from typing import Any
 import control
 import numpy as np
 import pytest
-from commands import TWO_MASS, changed, own_plant, read, run
-from helpers import (
+from oracles.commands import TWO_MASS, changed, own_plant, read, run
+from oracles.helpers import (
     HZ,
     dense_grid,
     first_crossing,

@@ -6,7 +6,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from helpers import problem
+from oracles.helpers import problem
 
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue

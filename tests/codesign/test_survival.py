@@ -6,9 +6,9 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from helpers import problem
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from oracles.helpers import problem
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.robust_check import OtherDamping, survived

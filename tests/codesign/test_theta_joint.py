@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oracles.shipped_designs import RESULTS
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -32,7 +33,7 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 
 ROOT = Path(__file__).parents[2]
-STORED = json.loads((ROOT / "benchmarks" / "shipped_designs.json").read_text())["two_mass_built"]
+STORED = json.loads(RESULTS.read_text())["two_mass_built"]
 
 
 def built(start: tuple[float, float] = (55.0, 55.0)) -> CoDesignProblem:

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import few
 
 from ccd_casadi.optim.quadratic import AT_FIRST, damped_bfgs, symmetric_rank_one
 from ccd_casadi.optim.trust_region import (

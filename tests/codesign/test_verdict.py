@@ -1,7 +1,6 @@
 """The verdict: states follow their figures; what is not optimal is never verified; kinks count."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
-from helpers import HZ, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.chain_plants import chain_problem
+from oracles.helpers import HZ, problem
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -34,7 +33,7 @@ from ccd_casadi.fixed_structure import SetCertificate
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.figure import BANDWIDTH
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
+from ccd_casadi.inner_problem.problem import scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
@@ -281,14 +280,7 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
     np.testing.assert_array_equal(through, end)
 
 
-@pytest.fixture(scope="module")
-def chain_problem() -> Callable[[int], CoDesignProblem]:
-    """The random chains of `benchmarks/formulations_agree.py`."""
-    found: Callable[[int], CoDesignProblem] = benchmark("chain_plants").chain_problem
-    return found
-
-
-def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:
+def test_descents_along_a_shelf_reach_its_end() -> None:
     """Where the bandwidth would jump is an edge like another: no start stops on the way along it.
 
     A margin of 10 (share of the box)² to the edge left ends 0.2 to 1.7 % apart after 30 steps.

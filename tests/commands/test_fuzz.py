@@ -5,11 +5,11 @@ import random
 from pathlib import Path
 
 import pytest
-from fuzz_bench import Bench
-from fuzz_cases import case_file, theta
-from fuzz_judge import Ending, misbehaviour
-from fuzz_plants import plant
-from fuzz_refute import refuted
+from oracles.fuzz_bench import Bench
+from oracles.fuzz_cases import case_file, theta
+from oracles.fuzz_judge import Ending, misbehaviour
+from oracles.fuzz_plants import plant
+from oracles.fuzz_refute import refuted
 
 QUICK = 120  # seeds; those whose command is neither inner nor a reading of a folder are left out
 AT_A_TIME = 40

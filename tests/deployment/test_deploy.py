@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import (
+from oracles.helpers import (
     OMEGA_LOW,
     PAPER,
     flexible_case,
@@ -21,7 +21,7 @@ from helpers import (
     scaled,
     two_mass_model,
 )
-from sampled_simulation import measure_set
+from oracles.sampled_simulation import measure_set
 from scipy.linalg import block_diag
 
 from ccd_casadi.cases.case import load_case

@@ -7,9 +7,9 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from oracles.helpers import few
 
 from ccd_casadi.deployment.anti_windup import with_anti_windup
 from ccd_casadi.deployment.channels import LoopChannel

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
-from sampled_simulation import measure_set, simulate
+from oracles.helpers import few
+from oracles.sampled_simulation import measure_set, simulate
 from scipy.linalg import expm
 
 from ccd_casadi.deployment.discretise import Conversion, Target, discretise, needed_rate, nice_rate

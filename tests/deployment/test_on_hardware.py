@@ -5,11 +5,11 @@ from dataclasses import replace
 import control
 import numpy as np
 import pytest
-from helpers import few, well_conditioned
 from hypothesis import given
 from hypothesis import strategies as st
-from sampled_simulation import simulate
-from structured_text import run as run_text
+from oracles.helpers import few, well_conditioned
+from oracles.sampled_simulation import simulate
+from oracles.structured_text import run as run_text
 from test_deploy_code import of_one_channel, random_controller
 
 from ccd_casadi.analysis.feedforward import feedforward

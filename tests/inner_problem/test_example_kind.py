@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import HZ, INNER, problem
+from oracles.helpers import HZ, INNER, problem
 from scipy import signal
 
 from ccd_casadi.analysis.loop_view import Bounded

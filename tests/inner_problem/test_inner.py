@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
-from helpers import HZ, INNER, PAPER, log_uniform, problem, two_mass
+from oracles.chain_plants import chain_problem
+from oracles.helpers import HZ, INNER, PAPER, log_uniform, problem, two_mass
 
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant, true_inner
@@ -129,7 +129,7 @@ def test_search_goes_on_beside_uncertified_designs(seed: int) -> None:
 
     A search that ended at the first uncertified design was 1 to 22 % below it on these chains.
     """
-    drawn = benchmark("chain_plants").chain_problem(seed)
+    drawn = chain_problem(seed)
     shift = float(np.random.default_rng([seed, 9]).uniform(0.005, 0.04))
     case = replace(drawn, robust=RobustSet(shift, 3, (0.7, 1.5), -shift))
     plant, inner = scaled_plant(case, case.start), replace(case.inner, sweep_points=(12, 12))

@@ -9,11 +9,10 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from helpers import HZ, first_crossing, reference_plant, sensitivity_gain, state_response
-from helpers import two_mass_model as model
-from kinds import kinds
-from test_measured_case import written
-from test_structured_error import CABLES
+from oracles.helpers import HZ, first_crossing, reference_plant, sensitivity_gain, state_response
+from oracles.helpers import two_mass_model as model
+from oracles.kinds import CABLES, kinds
+from oracles.measured_files import written
 
 from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case

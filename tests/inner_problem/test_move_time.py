@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
-from case_documents import TWO_MASS
-from differences import slopes
+from oracles import random_moves as moves
+from oracles.case_documents import TWO_MASS
+from oracles.differences import slopes
 
 from ccd_casadi.analysis.driven_plant import with_motion
 from ccd_casadi.analysis.motor import STEP, UNLIMITED, Motion, Motor, cycle_of
@@ -33,7 +33,6 @@ from ccd_casadi.plants.plant import (
     mechanics,
 )
 
-moves = benchmark("random_moves")
 EXAMPLE = Path(__file__).parents[2] / "examples" / "linear_motor_axis" / "case.toml"
 BANG = MoveLimits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a motor reaches
 MOTOR = Motor((30.0,), (4.0,), (10.0,), (2.0,), 50.0)

@@ -5,7 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import HZ, OMEGA_LOW, SUSPENSION, log_uniform, problem, random_plant, two_mass_model
+from oracles.helpers import (
+    HZ,
+    OMEGA_LOW,
+    SUSPENSION,
+    log_uniform,
+    problem,
+    random_plant,
+    two_mass_model,
+)
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of

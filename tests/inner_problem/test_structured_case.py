@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from case_documents import TWO_MASS
-from helpers import random_plant
+from oracles.case_documents import TWO_MASS
+from oracles.helpers import random_plant
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of

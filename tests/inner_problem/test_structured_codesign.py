@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import problem
+from oracles.kinds import PID, quick
 
 from ccd_casadi.codesign import stored_searches
 from ccd_casadi.codesign.formulations import Direct
@@ -28,18 +28,6 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
-
-PID = StructuredProblem(
-    structure=Structure(biquads=0),
-    weighted_level=8.426,
-    uncertainty=Uncertainty(resonance_shift=0.03),
-    starts=4,
-)
-
-
-def quick(sections: StructuredProblem = PID) -> CoDesignProblem:
-    case = problem(controller=sections, start=(60.0, 60.0))
-    return replace(case, inner=replace(case.inner, S_low=0.2))
 
 
 @pytest.fixture(scope="module")

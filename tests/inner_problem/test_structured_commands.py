@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from case_documents import SECTIONS_TABLES
-from contradictions import contradictions
-from helpers import problem
+from oracles.case_documents import SECTIONS_TABLES
+from oracles.contradictions import contradictions
+from oracles.helpers import problem
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from case_documents import TWO_MASS
-from helpers import HZ
-from test_structured_codesign import PID, quick
+from oracles.case_documents import TWO_MASS
+from oracles.helpers import HZ
+from oracles.kinds import CABLES, SLOW, least
 
-from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
+from ccd_casadi.budget import ErrorBudget, ShapedSpectrum
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import Direct
@@ -23,28 +23,13 @@ from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
-from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 from surrogates.retrain import main as retrain
-
-CABLES = ErrorBudget((
-    Source("cables", Kind.FORCE, ShapedSpectrum(1e-2, (), ((20.0,),))),
-    Source("encoder", Kind.SENSOR_NOISE, ShapedSpectrum(2.5e-21)),
-))  # fmt: skip
-SLOW = 8.0 * HZ
-
-
-def least(sampling: Sampling | None = None, **changes: object) -> CoDesignProblem:
-    sections = replace(
-        PID, uncertainty=Uncertainty(), starts=2, sampling=sampling, minimise="rms_error",
-        bandwidth_least=SLOW,
-    )  # fmt: skip
-    case = replace(quick(replace(sections, **changes)), budget=CABLES)  # type: ignore[arg-type]
-    return replace(case, w1=0.01, w2=1e6, lower=(58.0, 58.0), upper=(62.0, 62.0))
 
 
 def anchored(case: CoDesignProblem, folder: Path) -> CoDesignProblem:

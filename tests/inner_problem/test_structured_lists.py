@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from test_structured_codesign import PID, quick
+from oracles.kinds import PID, quick
 
 from ccd_casadi.codesign import stored_searches, structured_lists
 from ccd_casadi.codesign.catalogue import restricted

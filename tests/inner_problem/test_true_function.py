@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import HZ, INNER, problem
+from oracles.helpers import HZ, INNER, problem
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design

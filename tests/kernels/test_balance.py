@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bound_error import gamma_error
-from helpers import OMEGA_LOW, PAPER, flexible_case, stack_gain, two_mass
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from oracles.bound_error import gamma_error
+from oracles.helpers import OMEGA_LOW, PAPER, flexible_case, stack_gain, two_mass
 
 from ccd_casadi.kernels import design as module
 from ccd_casadi.kernels.balance import balancing, rounding_noise

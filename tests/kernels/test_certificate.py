@@ -3,7 +3,9 @@
 import control
 import numpy as np
 import pytest
-from helpers import (
+from hypothesis import example, given
+from hypothesis import strategies as st
+from oracles.helpers import (
     HZ,
     OMEGA_LOW,
     PAPER,
@@ -16,8 +18,6 @@ from helpers import (
     stack_system,
     two_mass,
 )
-from hypothesis import example, given
-from hypothesis import strategies as st
 
 from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import weighted_loop

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
 from numba.core import event, types
+from oracles.helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
 
 from ccd_casadi.kernels import compilation
 from ccd_casadi.kernels.gamma import plant_gain

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from bound_error import bound_error, gamma_error
-from helpers import PAPER, few, flexible_case, two_mass
 from hypothesis import example, given
 from hypothesis import strategies as st
+from oracles.bound_error import bound_error, gamma_error
+from oracles.helpers import PAPER, few, flexible_case, two_mass
 
 from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
-from kernel_draws import WEIGHTS
+from oracles.helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
+from oracles.kernel_draws import WEIGHTS
 
 from ccd_casadi.kernels import design, gamma, riccati
 from ccd_casadi.kernels.generalized_plant import generalized_plant

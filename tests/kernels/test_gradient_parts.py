@@ -4,10 +4,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from differences import difference
-from helpers import HZ, PAPER, few, flexible_case, random_plant, scaled
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.differences import difference
+from oracles.helpers import HZ, PAPER, few, flexible_case, random_plant, scaled
 
 from ccd_casadi.kernels import bound_peak, pullback
 from ccd_casadi.kernels.frequency import prepare

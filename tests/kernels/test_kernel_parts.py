@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers import few, state_response
 from hypothesis import example, given
 from hypothesis import strategies as st
-from kernel_draws import complex_matrix, random_system, seeds
+from oracles.helpers import few, state_response
+from oracles.kernel_draws import complex_matrix, random_system, seeds
 
 from ccd_casadi.kernels import frequency, small
 from ccd_casadi.kernels.frequency import _vertex, narrow, next_trial, promised

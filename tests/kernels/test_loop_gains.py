@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
-from differences import difference
-from helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles.differences import difference
+from oracles.helpers import (
     HZ,
     OMEGA_LOW,
     PAPER,
@@ -16,9 +18,7 @@ from helpers import (
     state_response,
     two_mass,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from kernel_draws import WEIGHTS, random_system, seeds
+from oracles.kernel_draws import WEIGHTS, random_system, seeds
 
 from ccd_casadi.kernels import certificate, frequency, sensitivity
 from ccd_casadi.kernels.closed_loop import loop_matrices, reachable_loop, weighted_loop

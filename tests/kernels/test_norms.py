@@ -3,9 +3,9 @@
 import control
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import few
 
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace

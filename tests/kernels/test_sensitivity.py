@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers import (
+from hypothesis import example, given
+from hypothesis import strategies as st
+from oracles.helpers import (
     HZ,
     OMEGA_LOW,
     PAPER,
@@ -18,8 +20,6 @@ from helpers import (
     state_response,
     two_mass,
 )
-from hypothesis import example, given
-from hypothesis import strategies as st
 from scipy.linalg import matrix_balance
 from scipy.optimize import brentq
 

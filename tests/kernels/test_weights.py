@@ -5,9 +5,18 @@ from dataclasses import astuple
 import control
 import numpy as np
 import pytest
-from helpers import HZ, PAPER, control_weights, few, random_plant, relative, scaled, state_response
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import (
+    HZ,
+    PAPER,
+    control_weights,
+    few,
+    random_plant,
+    relative,
+    scaled,
+    state_response,
+)
 
 from ccd_casadi.kernels.generalized_plant import (
     first_order_weights,

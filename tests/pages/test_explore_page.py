@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from kept_pictures import picture
+from oracles.kept_pictures import picture
 
 from ccd_casadi import explore
 from ccd_casadi.cases.case import load_case

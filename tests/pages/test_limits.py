@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import HZ, problem
+from oracles.helpers import HZ, problem
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.inner_problem.design_loops import design_view

@@ -9,7 +9,7 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
-from helpers import HZ, problem
+from oracles.helpers import HZ, problem
 
 import ccd_casadi as ccd
 from ccd_casadi.cases.run_folder import FinishedRun, read_run

@@ -6,7 +6,7 @@ import shutil
 from io import BytesIO
 
 import pytest
-from kept_pictures import picture
+from oracles.kept_pictures import picture
 from PIL import Image
 
 from ccd_casadi.deploy import main as deploy

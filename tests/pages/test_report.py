@@ -11,8 +11,8 @@ from tempfile import mkdtemp
 
 import numpy as np
 import pytest
-from commands import changed
-from html_document import Document
+from oracles.commands import changed
+from oracles.html_document import Document
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of

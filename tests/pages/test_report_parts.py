@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from html_document import Document
+from oracles.html_document import Document
 
 from ccd_casadi.drawing.content import (
     Chapter,

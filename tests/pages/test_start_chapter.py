@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import problem
+from oracles.helpers import problem
 
 from ccd_casadi.drawing.content import Chapter, Figure
 from ccd_casadi.drawing.numbers import tables_of

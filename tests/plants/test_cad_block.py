@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_kernel import CELLS, Block, draw
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.block_kernel import CELLS, Block, draw
+from oracles.helpers import few
 
 from ccd_casadi.plants.cad import draw_morph, solid
 from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved_points, volumes

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
+from oracles import guided_beam
 from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
@@ -43,7 +43,6 @@ def test_a_prismatic_beam_has_the_frequencies_of_the_textbook() -> None:
 
 
 def test_the_rule_has_its_gain_at_the_bandwidth() -> None:
-    guided_beam = benchmark("guided_beam")
     w, mass = 80.0, 7.0
     K = guided_beam.their_pid(w, mass)
     at = guided_beam.response(K, np.array([w]))[0]
@@ -57,7 +56,7 @@ def test_a_double_pole_does_not_spoil_the_judge() -> None:
     K = StateSpace(*tf2ss([1.0, 2.0, 5.0], np.polymul([1.0, 0.0], [1.0, 2.0 * a, a**2])))
     s = 1j * np.geomspace(0.1, 1e6, 200)
     expected = (s**2 + 2.0 * s + 5.0) / (s * (s + a) ** 2)
-    found = benchmark("guided_beam").response(K, s.imag)
+    found = guided_beam.response(K, s.imag)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 

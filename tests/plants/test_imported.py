@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import few
 from scipy.io import mmwrite, savemat
 from scipy.linalg import eigh
 from scipy.sparse import coo_array, csc_array, save_npz

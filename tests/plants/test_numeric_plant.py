@@ -7,9 +7,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import example, given
 from hypothesis import strategies as st
+from oracles.helpers import few
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, solve_program
 from ccd_casadi.optim.box import Box

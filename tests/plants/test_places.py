@@ -8,9 +8,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from oracles.helpers import few
 from scipy.linalg import eigh
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case

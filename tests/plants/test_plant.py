@@ -6,8 +6,10 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from differences import difference
-from helpers import (
+from hypothesis import example, given
+from hypothesis import strategies as st
+from oracles.differences import difference
+from oracles.helpers import (
     HZ,
     STIFF_SUSPENSION,
     few,
@@ -20,8 +22,6 @@ from helpers import (
     two_mass,
     two_mass_model,
 )
-from hypothesis import example, given
-from hypothesis import strategies as st
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant

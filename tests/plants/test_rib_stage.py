@@ -6,7 +6,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import HZ
+from oracles.helpers import HZ
 
 from ccd_casadi.case_studies.rib_stage import (
     COARSE,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_scripts import FOLDER, benchmark
+from oracles import rib_stage_built as built
 
 from ccd_casadi.case_studies.rib_stage import NAMES
 from ccd_casadi.case_studies.rib_stage.plant import rib_stage
@@ -22,9 +22,7 @@ from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.errors import UserError
 
-built = benchmark("rib_stage_built")
-conclusions = benchmark("rib_stage_conclusions")
-on_the_set = benchmark("rib_stage_on_the_set")
+RUNS = Path(__file__).parents[2] / "runs"
 
 
 def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
@@ -71,55 +69,13 @@ def test_a_known_controller_is_where_inner_begins(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its parameters are read for the case's structure alone, and for sections alone."""
-    runs = FOLDER.parent / "runs"
-    problem = problem_of(load_case(runs / "rib_stage_built.toml"))
+    problem = problem_of(load_case(RUNS / "rib_stage_built.toml"))
     kappa = sections_kappa(built.DESIGN, structure_of(problem))
     assert len(kappa) == len(structure_of(problem).names)
     with pytest.raises(UserError, match="name a run of this case"):
         sections_kappa(built.DESIGN, Structure())
     asked = ["--theta", "m1=60,m2=60", "--begin-at", str(built.DESIGN), "--quiet"]
-    assert inner_main([str(runs / "two_mass.toml"), *asked]) == 2
+    assert inner_main([str(RUNS / "two_mass.toml"), *asked]) == 2
     assert "--begin-at" in capsys.readouterr().err
     with pytest.raises(UserError):
         sections_kappa(tmp_path, structure_of(problem))
-
-
-def test_the_conclusions_of_the_page_are_those_of_the_stored_figures() -> None:
-    rows = on_the_set.stored_rows()
-    kept = (
-        conclusions.PAGE.read_text(encoding="utf-8")
-        .split(conclusions.BEGIN)[1]
-        .split(conclusions.END)[0]
-        .strip()
-    )
-    assert kept == conclusions.markdown(rows)
-    problem = problem_of(load_case(conclusions.CASE))
-    for words in on_the_set.sentences(on_the_set.stages_of(rows, problem.w1, problem.w2)):
-        assert words in kept
-
-
-def test_another_figure_is_another_conclusion() -> None:
-    """The same stages on a set that the sequential one suffers from, and on one that all do."""
-    problem = problem_of(load_case(conclusions.CASE))
-
-    def said(hz: dict[str, float]) -> list[str]:
-        rows = {name: {"theta": [1e-3], "mass": mass, "apart_hz": {"z": 1.0},
-                       "nominal": {"bandwidth_hz": alone},
-                       "whole": {"certified": True, "bandwidth_hz": hz[name]}}
-                for name, mass, alone in (("sequential", 1.0, 50.0), ("lifted", 0.4, 80.0),
-                                          ("co-designed", 0.6, 70.0))}  # fmt: skip
-        return on_the_set.sentences(on_the_set.stages_of(rows, problem.w1, problem.w2))
-
-    first = said({"sequential": 75.0, "lifted": 45.0, "co-designed": 76.0})
-    assert first[1].endswith("the nominal optimum is 60 % lighter and 60 % faster.")
-    assert "keeps 45.0 of its 80.0 Hz: 60 % lighter and 40 % slower" in first[3]
-    assert "The nominal optimum has the best J nominally and the worst on the set." in first
-    assert first[-1].endswith("on the set: the mass, not the bandwidth.")
-    other = said({"sequential": 50.0, "lifted": 45.0, "co-designed": 70.0})
-    assert "40 % lighter and 40 % faster" in other[-1]
-    assert other[-1].endswith("on the set: all of it.")
-    part = said({"sequential": 50.0, "lifted": 45.0, "co-designed": 55.0})
-    assert part[-1].endswith("on the set: the mass and 36 % of the gain in bandwidth.")
-    nothing = said({"sequential": 75.0, "lifted": 45.0, "co-designed": 60.0})
-    assert "No stage here has a better J on the set than the sequential one." in nothing
-    assert nothing[-1].endswith("nothing is left.")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import responses
+from oracles.helpers import responses
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deployment.given_controller import read_controller, with_controller

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import control
 import numpy as np
 import pytest
-from helpers import HZ, SUSPENSION, random_plant, responses, scaled
+from oracles.helpers import HZ, SUSPENSION, random_plant, responses, scaled
 from scipy.integrate import trapezoid
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run

@@ -6,9 +6,9 @@ from dataclasses import replace
 import control
 import numpy as np
 import pytest
-from helpers import few, random_plant
 from hypothesis import example, given
 from hypothesis import strategies as st
+from oracles.helpers import few, random_plant
 
 from ccd_casadi.analysis.move import mass_feedforward, simulate
 from ccd_casadi.analysis.move_limits import MoveLimits

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from rows import sample
+from oracles.rows import sample
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of

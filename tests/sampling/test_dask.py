@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import changed
-from dask_processes import Processes, both_workers
-from helpers import problem
+from oracles.commands import changed
+from oracles.dask_processes import Processes, both_workers
+from oracles.helpers import problem
 from test_parallel import TaskFailure, failing, square, whereabouts
 from test_sampling import THETAS, TWO_MASS, X, table
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from busy import HANGS
-from dask_processes import Processes, both_workers
-from helpers import problem
+from oracles.busy import HANGS
+from oracles.dask_processes import Processes, both_workers
+from oracles.helpers import problem
 from test_interruptions import command, rows, started, wait_for_rows
 from test_sampling import table
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from busy import HANGS
-from commands import changed, run
+from oracles.busy import HANGS
+from oracles.commands import changed, run
 from test_sampling import ROOT, TWO_MASS, table
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import few, problem
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import few, problem
 
 from ccd_casadi.codesign.outer_theta import pieces_from
 from ccd_casadi.inner_problem.problem import CoDesignProblem

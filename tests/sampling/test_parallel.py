@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from busy import HANGS
+from oracles.busy import HANGS
 
 from ccd_casadi.support import worker_process
 from ccd_casadi.support.options import usable_cores
@@ -214,7 +214,7 @@ def until(condition: Callable[[], bool], seconds: float) -> bool:
 
 PARENT = f"""
 import sys
-sys.path[:0] = {[str(HERE), str(HERE.parent / "support")]!r}
+sys.path[:0] = {[str(HERE), str(HERE.parent)]!r}
 import ccd_casadi.solve  # as the command does: workers import it as they start
 from ccd_casadi.support.command_line import parser, run
 from ccd_casadi.support.interrupts import exit_on_ctrl_c

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import TWO_MASS, changed, run
-from helpers import HZ
+from oracles.commands import TWO_MASS, changed, run
+from oracles.helpers import HZ
 
 from ccd_casadi.inner import main as inner
 from ccd_casadi.sampling import sampler as sampling

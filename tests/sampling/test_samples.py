@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
-from rows import REALS, identical, sample
+from oracles.helpers import few
+from oracles.rows import REALS, identical, sample
 
 from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.store import SampleStore

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import HZ, INNER, problem
+from oracles.helpers import HZ, INNER, problem
 
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.sampling import sampler as module

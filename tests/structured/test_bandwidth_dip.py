@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, FAST, loop, plant
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
 from ccd_casadi.analysis.loop_figures import AROUND, _dip, bandwidth_dip, loop_entry
 from ccd_casadi.fixed_structure import ShapeEnd, Structure, certify, synthesise_sections

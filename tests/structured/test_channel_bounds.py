@@ -6,7 +6,9 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 import pytest
-from fixed_structure_channels import (
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles.fixed_structure_channels import (
     BOUNDS,
     FAST,
     M_K,
@@ -16,9 +18,7 @@ from fixed_structure_channels import (
     plant,
     structure,
 )
-from helpers import HZ, SUSPENSION, few, scaled
-from hypothesis import given
-from hypothesis import strategies as st
+from oracles.helpers import HZ, SUSPENSION, few, scaled
 
 from ccd_casadi.fixed_structure import (
     Bounds,

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from differences import difference
-from fixed_structure_loops import FAST, LATE, SLOW, loop, plant
+from oracles.differences import difference
+from oracles.fixed_structure_loops import FAST, LATE, SLOW, loop, plant
 from scipy.linalg import expm
 from scipy.signal import lfilter
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixed_structure_channels import (
+from oracles.fixed_structure_channels import (
     BOUNDS,
     FAST,
     STRUCTURE,
@@ -21,7 +21,7 @@ from fixed_structure_channels import (
     plant,
     structure,
 )
-from helpers import sensitivity_gain
+from oracles.helpers import sensitivity_gain
 
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
@@ -237,15 +237,16 @@ def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
 
 
 INTERPRETED = """
-import interpreted, json, numpy as np
-from fixed_structure_channels import everything
+import json, numpy as np
+import oracles.interpreted
+from oracles.fixed_structure_channels import everything
 print(json.dumps([part.tolist() for part in everything()]))
 """
 
 
 def test_the_kernels_are_what_they_say_as_plain_python() -> None:
     """Interpreted they have the same constraints, slopes and curvature as compiled."""
-    path = os.pathsep.join(str(ROOT / f) for f in (".", "tests/support", "benchmarks"))
+    path = os.pathsep.join(str(ROOT / f) for f in (".", "tests"))
     out = subprocess.run([sys.executable, "-W", "ignore", "-c", INTERPRETED], check=True,
                          capture_output=True, env=os.environ | {"PYTHONPATH": path})  # fmt: skip
     for one, other in zip(everything(), json.loads(out.stdout), strict=True):

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
-from helpers import HZ, SUSPENSION, random_plant, responses, two_mass_model
+from oracles.fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
+from oracles.helpers import HZ, SUSPENSION, random_plant, responses, two_mass_model
 
 from ccd_casadi.fixed_structure import (
     Bounds,

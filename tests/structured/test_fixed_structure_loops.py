@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from differences import slopes
-from fixed_structure_channels import closed
-from fixed_structure_loops import (
+from oracles.differences import slopes
+from oracles.fixed_structure_channels import closed
+from oracles.fixed_structure_loops import (
     BOUNDS,
     FAST,
     LATE,

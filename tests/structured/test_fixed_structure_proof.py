@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
-from helpers import HZ, two_mass_model
+from oracles.fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
+from oracles.helpers import HZ, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, root, variable

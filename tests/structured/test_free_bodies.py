@@ -6,8 +6,8 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 import pytest
-from fixed_structure_loops import WEIGHTS
-from helpers import HZ
+from oracles.fixed_structure_loops import WEIGHTS
+from oracles.helpers import HZ
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
 from ccd_casadi.fixed_structure.affine import Affine

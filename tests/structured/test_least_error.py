@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from case_documents import TWO_MASS
-from fixed_structure_loops import BOUNDS, FAST, loop, plant
+from oracles.case_documents import TWO_MASS
+from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
 from ccd_casadi.cases.case import CaseError, load_case

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from oracles import random_sections
+from oracles.chain_plants import chain_problem
 from scipy.linalg import block_diag
 
 from ccd_casadi.cases.case import load_case
@@ -36,7 +37,6 @@ from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights
 
-SECTIONS, chain_problem = benchmark("random_sections"), benchmark("chain_plants").chain_problem
 ROOT = Path(__file__).resolve().parents[2]
 BASIS = Basis((3.0, 3.0, 0.5), (0.1 + 2.0j, 0.3 + 7.0j), 20.0, 1, (5.0 + 1.0j, 5.0 - 1.0j))
 finite = st.floats(-3.0, 3.0)
@@ -50,12 +50,11 @@ def lag(zero: float) -> StateSpace:
 
 def test_that_no_bandwidth_at_all_is_possible_is_shown_where_the_bounds_are_tight() -> None:
     """Of a problem that no search solved, and of none that has a certified design."""
-    study = benchmark("structured_peers")
-    assert study.impossible(SECTIONS.case(1053), 16.3 * HZ)
+    assert random_sections.impossible(random_sections.case(1053), 16.3 * HZ)
     for seed in (21, 36):
-        asked, design = SECTIONS.climbed(SECTIONS.case(seed), seed)
+        asked, design = random_sections.climbed(random_sections.case(seed), seed)
         assert design.certified
-        assert not study.impossible(asked, design.bandwidth)
+        assert not random_sections.impossible(asked, design.bandwidth)
 
 
 def test_a_zero_in_the_right_half_plane_gives_poissons_bound() -> None:
@@ -258,7 +257,7 @@ def test_more_delay_never_gives_more() -> None:
 @pytest.mark.parametrize("seed", [7, 12, 28])
 def test_no_climb_of_sections_exceeds_the_bound(seed: int) -> None:
     """Random chains; benchmarks/limitations.py has sixty, and all pairs of their sets."""
-    asked, made = SECTIONS.climbed(SECTIONS.case(seed), seed)
+    asked, made = random_sections.climbed(random_sections.case(seed), seed)
     uncertain = asked.uncertain
     assert made is not None
     limits = limits_of(

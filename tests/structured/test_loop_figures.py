@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from fixed_structure_loops import FAST, LATE, loop, plant
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.fixed_structure_loops import FAST, LATE, loop, plant
 
 from ccd_casadi.analysis.loop_figures import (
     light_roots,

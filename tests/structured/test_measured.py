@@ -6,13 +6,13 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, FAST, loop, plant
+from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
+from oracles.measured_files import measured
 from scipy.io import savemat
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
 from ccd_casadi.fixed_structure.line_problem import line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel
-from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.measured_design import design_on_data
 from ccd_casadi.fixed_structure.measured_loop import judge, winding
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
@@ -23,14 +23,6 @@ from ccd_casadi.support.units import HZ
 
 PID = Structure(biquads=0)
 KEPT = replace(BOUNDS, compliance_max=None)  # which no PID meets
-
-
-def measured(sampling: Sampling | None, lines: int = 2000) -> MeasuredResponse:
-    """Case study 1 as a spectrum analyser would give it, hold and delay in it."""
-    P = plant_set([plant()], sampling)
-    hz = np.geomspace(0.3, 4900.0, lines)
-    G = P.responses(np.zeros(lines, int), P.variable(HZ * hz / P.omega_0))[0][:, 0, 0] / P.force
-    return MeasuredResponse(hz, G)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from case_documents import SECTIONS_TABLES
-from fixed_structure_loops import FAST
+from oracles.fixed_structure_loops import FAST
+from oracles.measured_files import CASE, measured, written
 from scipy.io import savemat
-from test_measured import measured
 
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.measured_case import measured_case
@@ -19,24 +18,6 @@ from ccd_casadi.inner import main as inner
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.units import HZ
-
-CASE = f"""
-[plant]
-model = "measured"
-file = "stage.csv"
-[inner]
-S_max = 2.0
-{SECTIONS_TABLES}
-"""
-
-
-def written(folder: Path, text: str = CASE, sampled: bool = False, lines: int = 1200) -> Path:
-    found = measured(FAST if sampled else None, lines)
-    rows = np.column_stack([found.hz, found.G.real, found.G.imag])
-    np.savetxt(folder / "stage.csv", rows, delimiter=",", header="f_hz,re,im", comments="")
-    path = folder / "case.toml"
-    path.write_text(text)
-    return path
 
 
 @pytest.mark.parametrize("sampled", [False, True])

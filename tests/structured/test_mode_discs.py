@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, LATE, WEIGHTS
-from helpers import HZ
+from oracles.fixed_structure_loops import BOUNDS, LATE, WEIGHTS
+from oracles.helpers import HZ
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine

@@ -5,8 +5,8 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from fixed_structure_loops import LATE, WEIGHTS
-from helpers import HZ, SUSPENSION
+from oracles.fixed_structure_loops import LATE, WEIGHTS
+from oracles.helpers import HZ, SUSPENSION
 
 from ccd_casadi.fixed_structure import Bounds, Structure, certify
 from ccd_casadi.fixed_structure.affine import outputs, variable

@@ -1,8 +1,8 @@
-"""PID by the search against a grid that shares nothing with it: benchmarks/pid_grid.py, coarser."""
+"""PID by the search against a grid that shares nothing with it: oracles/pid_grid, coarser."""
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
+from oracles import pid_grid
 
 from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.plants.modal import Suspension, modal_plant
@@ -10,30 +10,24 @@ from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import scale_plant
 
 
-@pytest.fixture(scope="module")
-def study():
-    """The benchmark."""
-    return benchmark("pid_grid")
-
-
-def test_no_point_of_a_grid_is_better_than_the_search(study, monkeypatch) -> None:
+def test_no_point_of_a_grid_is_better_than_the_search(monkeypatch) -> None:
     """Two masses, force and sensor apart: the search loses nothing to the grid, nor cheats it."""
     small = {"COARSE": (4, 7, 6, 5), "GAINS": 24, "BASINS": 2, "SAMPLES": 100, "BEST": 12}
     for name, value in small.items():
-        monkeypatch.setattr(study, name, value)
-    case = study.CASES["ACC benchmark"]
+        monkeypatch.setattr(pid_grid, name, value)
+    case = pid_grid.CASES["ACC benchmark"]
     system = mechanics(build_plant(case.function, ("k",), {}), np.array([1.0]))
     suspension = Suspension(case.suspended_hz)
     plant = scale_plant(modal_plant(system, suspension), case.M_K)
-    made = synthesise_sections([plant], study.PID, case.bounds, starts=4)
+    made = synthesise_sections([plant], pid_grid.PID, case.bounds, starts=4)
     assert made.certified
-    loop = study.loop_of(system, suspension, (0.0,), case.bounds, case.expected_hz * study.HZ,
+    loop = pid_grid.loop_of(system, suspension, (0.0,), case.bounds, case.expected_hz * pid_grid.HZ,
                          made.frequencies[0])  # fmt: skip
-    own, over = study.judged(loop, made.kappa)
+    own, over = pid_grid.judged(loop, made.kappa)
     assert over <= 1.0 + 1e-4
     assert own == pytest.approx(made.bandwidth, rel=1e-3)
-    _, kappa, looked = study.refined(loop)
-    grid, over = study.judged(loop, kappa)
+    _, kappa, looked = pid_grid.refined(loop)
+    grid, over = pid_grid.judged(loop, kappa)
     assert looked > 10_000
     assert over < 1.01
     assert grid > 0.9 * made.bandwidth  # a grid that finds nothing shows nothing

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, FAST, loop, plant
-from helpers import HZ, scaled, two_mass
+from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
+from oracles.helpers import HZ, scaled, two_mass
 
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.certificate import certify

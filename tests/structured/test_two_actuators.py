@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixed_structure_channels import BOUNDS, FAST, assert_derivatives, plant
+from oracles.fixed_structure_channels import BOUNDS, FAST, assert_derivatives, plant
 from scipy.signal import cont2discrete
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, synthesise

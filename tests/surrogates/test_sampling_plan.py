@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from draws import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.draws import few
 
 from surrogates import corners, design, grid, latin_hypercube, sobol
 

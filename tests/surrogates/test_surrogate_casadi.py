@@ -5,9 +5,9 @@ from time import process_time
 import casadi as ca
 import numpy as np
 import pytest
-from draws import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.draws import few
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 

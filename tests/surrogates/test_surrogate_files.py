@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from draws import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.draws import few
 
 from surrogates import (
     GaussianProcess,

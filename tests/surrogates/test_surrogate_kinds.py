@@ -5,7 +5,7 @@ from time import process_time
 import casadi as ca
 import numpy as np
 import pytest
-from surrogate_family import BOX, DY, T, X, Y
+from oracles.surrogate_family import BOX, DY, T, X, Y
 
 from surrogates import (
     Hyperparameters,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.surrogate_draws import KERNELS, drawn, few, seeds
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-from surrogate_draws import KERNELS, drawn, few, seeds
 
 from surrogates import Hyperparameters, Kernel
 from surrogates.covariance import covariance, observed_covariance, radial

@@ -8,7 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from surrogate_family import LOW, MAKERS, MEMBERS, SPAN, T, X, Y, f, flat, member
+from oracles.surrogate_family import LOW, MAKERS, MEMBERS, SPAN, T, X, Y, f, flat, member
 
 from surrogates import load, save, to_casadi
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from oracles.surrogate_draws import BOX, KERNELS, drawn, few, seeds, smooth
 from scipy.optimize import rosen, rosen_der
-from surrogate_draws import BOX, KERNELS, drawn, few, seeds, smooth
 
 from surrogates import (
     Hyperparameters,

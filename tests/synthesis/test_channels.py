@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from draws import few
-from helpers import HZ
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.draws import few
+from oracles.helpers import HZ
 from scipy.stats import ortho_group
 
 from ccd_casadi.case_studies.rib_stage import COARSE, RibStage

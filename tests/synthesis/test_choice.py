@@ -5,9 +5,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.helpers import few
 
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.plants.modal import ModalPlant

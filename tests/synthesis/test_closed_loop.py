@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import (
+from oracles.helpers import (
     HZ,
     OMEGA_LOW,
     PAPER,

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import HZ, problem
+from oracles.helpers import HZ, problem
 
 from ccd_casadi.codesign.kkt import TrueDesign, first_order
 from ccd_casadi.codesign.outer_problem import outer_program

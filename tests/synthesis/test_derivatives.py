@@ -6,8 +6,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from differences import difference
-from helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles.differences import difference
+from oracles.helpers import (
     HZ,
     OMEGA_LOW,
     PAPER,
@@ -19,8 +21,6 @@ from helpers import (
     two_mass,
     two_mass_model,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant

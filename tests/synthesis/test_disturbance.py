@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from case_documents import TWO_MASS
-from differences import difference
-from hard_plants import close
-from helpers import HZ, PAPER, few, random_plant, scaled, two_mass
 from hypothesis import example, given
 from hypothesis import strategies as st
+from oracles.case_documents import TWO_MASS
+from oracles.differences import difference
+from oracles.hard_plants import close
+from oracles.helpers import HZ, PAPER, few, random_plant, scaled, two_mass
 from scipy.linalg import schur
 
 from ccd_casadi.cases.case import CaseError, load_case

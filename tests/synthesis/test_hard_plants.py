@@ -4,15 +4,14 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from benchmark_scripts import benchmark
-from hard_plants import HARD, close, regularised
+from oracles import lmi
+from oracles.hard_plants import HARD, close, regularised
 
 from ccd_casadi.lti.norms import gains
 from ccd_casadi.studies.backends import solve_slicot
 from ccd_casadi.support.worker_process import Runner
 
 pytest.importorskip("cvxpy")
-lmi = benchmark("lmi")
 LIMIT = 60.0  # seconds a back end: 5 where the machine is idle
 BACKOFF = 1.02
 ADDED = (1e-6, 1e-4, 1e-2)  # disturbances and costs of an irregular plant, relative

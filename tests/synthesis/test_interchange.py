@@ -7,7 +7,7 @@ import control
 import numpy as np
 import pytest
 import scipy.io
-from helpers import FlexibleCase, flexible_case
+from oracles.helpers import FlexibleCase, flexible_case
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.lti.state_space import StateSpace

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import changed, read
+from oracles.commands import changed, read
 
 from ccd_casadi.inner import main as inner
 from ccd_casadi.solve import main as solve

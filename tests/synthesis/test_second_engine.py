@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import HZ, problem
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles.helpers import HZ, problem
 
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.lti.closed_loop import closed_loop

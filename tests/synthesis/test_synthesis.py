@@ -5,7 +5,9 @@ from dataclasses import replace
 import control
 import numpy as np
 import pytest
-from helpers import (
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles.helpers import (
     HZ,
     OMEGA_LOW,
     PAPER,
@@ -24,8 +26,6 @@ from helpers import (
     two_mass,
     two_mass_model,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension

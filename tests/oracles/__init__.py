@@ -1,0 +1,2 @@
+"""What tests and benchmarks judge by: models, simulations
+and searches of their own."""
