@@ -66,7 +66,7 @@ peers: setup-test
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/back_ends.py 10 10
 	$(BIN)/python benchmarks/disk_drive.py
-	$(BIN)/python benchmarks/guided_beam.py
+	$(BIN)/python benchmarks/oracle.py guided_beam
 	$(BIN)/python benchmarks/mathworks.py
 	$(BIN)/python benchmarks/stage_judge.py
 	$(BIN)/python benchmarks/mirror_held_out.py

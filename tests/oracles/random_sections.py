@@ -48,7 +48,8 @@ from ccd_casadi.fixed_structure.race import at_its_bandwidth
 from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.limitations.bound import forbids, limits_of
+from ccd_casadi.limitations.bound import forbids
+from ccd_casadi.limitations.limits import limits_of
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner
