@@ -100,7 +100,7 @@ def test_one_mode_has_the_residual_vibration_of_a_bang_bang_move() -> None:
 
 
 def test_random_moves_settle_at_the_sample_of_another_simulation() -> None:
-    """And the smooth time is none too early; all hundred by benchmarks/random_moves.py."""
+    """And the smooth time is none too early; all hundred by oracles/random_moves."""
     rng = np.random.default_rng(7)
     for number in range(6):
         apart, error, exact, smooth = moves.compared(moves.drawn(rng), number % 2)

@@ -256,7 +256,7 @@ def test_more_delay_never_gives_more() -> None:
 
 @pytest.mark.parametrize("seed", [7, 12, 28])
 def test_no_climb_of_sections_exceeds_the_bound(seed: int) -> None:
-    """Random chains; benchmarks/limitations.py has sixty, and all pairs of their sets."""
+    """Random chains, of which a study had sixty."""
     asked, made = random_sections.climbed(random_sections.case(seed), seed)
     uncertain = asked.uncertain
     assert made is not None
