@@ -72,8 +72,9 @@ class InnerOptions:
 
 
 def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
-    """θ by name, and what the hardware costs."""
+    """θ by name, what the hardware costs, and what a reader must know of the plant there."""
     return {
+        "notes": list(plant_of(problem).notes(theta)),
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": hardware_cost(plant_of(problem), theta),
     }
