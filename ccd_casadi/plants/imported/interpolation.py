@@ -64,9 +64,7 @@ class InterpolatedModes:
     PlantError where samples differ in their number of rigid-body modes, or are too few.
     """
 
-    def __init__(
-        self, table: ModalTable, rigid_below: float, accepted: Accepted = ANY
-    ) -> None:
+    def __init__(self, table: ModalTable, rigid_below: float, accepted: Accepted = ANY) -> None:
         counts = (table.omega < rigid_below).sum(axis=1)
         if np.ptp(counts) > 0:
             s = int(counts.argmin())
