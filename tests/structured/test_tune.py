@@ -123,7 +123,7 @@ def test_lines_are_judged_as_the_poles_of_the_loop_are(
     if integrators:
         pid = pid * control.tf([2.0, 1.0], [0.02, 1.0]) ** integrators
     K = control.append(pid, pid) * np.linalg.inv(mix)
-    loop = control.feedback(control.ss(np.eye(2)), G * K)
+    loop = control.feedback(control.ss([], [], [], np.eye(2)), G * K)
     poles = loop.poles()
     assume(np.abs(poles.real / np.abs(poles)).min() > 1e-3)
     hz = np.geomspace(1e-3, 1e3, 4000) / HZ
