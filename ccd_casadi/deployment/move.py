@@ -1,8 +1,8 @@
 """A move as the machine makes it: sampled, delayed, saturated, quantised, with a jittering delay.
 
-The plant is stepped exactly from each arrival of a force to the next: what was computed at kT reaches
-it at kT + τ + jitter, the jitter rounded to a part of a period. What is read at kT, and what
-the actuator is told, are multiples of a step where one is given.
+The plant is stepped exactly from each arrival of a force to the next: what was computed at kT
+reaches it at kT + τ + jitter, the jitter rounded to a part of a period. What is read at kT, and
+what the actuator is told, are multiples of a step where one is given.
 """
 
 from dataclasses import dataclass

@@ -23,7 +23,7 @@ from ccd_casadi.deployment.reduction import LoopLimits, ReducedController, reduc
 from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_written, members
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.judgement import ENGINE, Judgement, attempted, judge_loops
+from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.closed_loop import closed_loop
@@ -136,7 +136,7 @@ def _judged(run: FinishedRun, found: Deployment) -> Judgement:
     return judge_loops(
         as_written(run), found.realisation.as_coded, bounds,
         Sampling(found.rate_hz, 1e6 * found.delay), target.bandwidth * (1.0 - target.tolerance),
-        on_all=False, integrator=False, engine=ENGINE,
+        on_all=False, integrator=False,
     )  # fmt: skip
 
 

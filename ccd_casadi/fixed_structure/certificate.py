@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     with_crossings,
 )
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable, norms
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.hold import Sampling, delayed
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
@@ -283,7 +283,7 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     whole = int(np.floor(sampling.delay / T + 1e-9))
     rest = max(sampling.delay - whole * T, 0.0)
     if G.period:
-        return _delayed(G, whole)
+        return delayed(G.A, [0.0 * G.B] * whole + [G.B], G.C, G.period)
     held = np.zeros((n + m, n + m))
     held[:n, :n], held[:n, n:] = G.A, G.B
     first, second = expm(held * rest), expm(held * (T - rest))
@@ -298,16 +298,6 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     B[n : n + m] = np.eye(m)
     A[n + m :, n : n + age - m] = np.eye(age - m)
     return StateSpace(A, B, np.hstack([G.C, np.zeros((len(G.C), age))]), np.zeros((len(G.C), m)))
-
-
-def _delayed(G: StateSpace, whole: int) -> StateSpace:
-    """A plant in discrete time with its forces some whole periods later, by a chain of delays."""
-    for _ in range(whole):
-        n, m = G.B.shape
-        A = np.block([[G.A, G.B], [np.zeros((m, n + m))]])
-        B, C = np.vstack([0.0 * G.B, np.eye(m)]), np.hstack([G.C, np.zeros((len(G.C), m))])
-        G = StateSpace(A, B, C, G.D, period=G.period)
-    return G
 
 
 def _tustin(K: StateSpace, period: float) -> StateSpace:

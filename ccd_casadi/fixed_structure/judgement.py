@@ -21,7 +21,6 @@ from ccd_casadi.fixed_structure.certificate import TOLERANCE, SetCertificate, ce
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.units import HZ, counted
 
@@ -30,7 +29,7 @@ OF_A_MODEL = "NumPy, on the matrices as they were given, with the controller's c
 OF_LINES = "NumPy, on the lines as they were given, with the controller's coefficients"
 SLOWER = 2e-3  # relative: what a claimed bandwidth may be above the judge's
 BELOW, PER_DECADE = 4.0, 40  # decades below the first line, where G is (jω)^-n, and points in each
-WHOLE = 0.1  # by which a count of poles may miss a whole number
+UNCLEAR = 0.9 * np.pi  # an angle that turns further between two lines may as well turn back
 
 
 @dataclass(frozen=True)
@@ -66,40 +65,28 @@ def attempted(judge: Callable[..., Judgement], *of: Any) -> Judgement:
 
 
 def judge_loops(
-    plants: Sequence[StateSpace],
-    controller: StateSpace,
-    bounds: Bounds,
-    sampling: Sampling,
-    bandwidth: float,
-    *,
-    on_all: bool = True,
-    integrator: bool = True,
-    engine: str = OF_A_MODEL,
-) -> Judgement:
+    plants: Sequence[StateSpace], controller: StateSpace, bounds: Bounds, sampling: Sampling,
+    bandwidth: float, *, on_all: bool = True, integrator: bool = True,
+) -> Judgement:  # fmt: skip
     """A difference equation (e in, u out) on plants, continuous or in discrete time at its rate.
 
     `bandwidth`: the one claimed, rad/s, on each plant or, not `on_all`, on the first alone.
     """
     found = certify(plants, controller, bounds, sampling, integrator=integrator)
     if not found.worst:
-        return Judgement(len(plants), {}, False, found.words, engine=engine)
+        return Judgement(len(plants), {}, False, found.words, engine=OF_A_MODEL)
     own = found.bandwidth if on_all else found.plants[0].bandwidth
     figures = found.worst | {"bandwidth": bandwidth / own if own > 0.0 else np.inf}
     slow = not own >= bandwidth * (1.0 - SLOWER)
     words = f"the bandwidth is {own / HZ:.6g} Hz, not {bandwidth / HZ:.6g} Hz"
     return Judgement(len(plants), figures, found.passed and not slow,
-                     words if slow and found.passed else found.words, engine=engine)  # fmt: skip
+                     words if slow and found.passed else found.words, engine=OF_A_MODEL)  # fmt: skip
 
 
 def judge_lines(
-    measured: MeasuredResponse,
-    controller: StateSpace,
-    bounds: Bounds,
-    bandwidth: float,
-    *,
-    delay: float = 0.0,
-    integrators: int = 1,
-) -> Judgement:
+    measured: MeasuredResponse, controller: StateSpace, bounds: Bounds, bandwidth: float,
+    *, delay: float = 0.0, integrators: int = 1,
+) -> Judgement:  # fmt: skip
     """A controller, continuous or a difference equation, on a response as its file has it.
 
     `delay`: in s, besides that in the response; `integrators`: of K, in each channel.
@@ -117,16 +104,19 @@ def judge_lines(
     q = (n + integrators) * p
     half = -0.5 * np.pi * q  # the angle of F at 0, but for half turns
     first = half + np.pi * np.round((np.angle(F[0]) - half) / np.pi)
-    grown = np.angle(F[0]) - first + np.angle(F[1:] / F[:-1]).sum() - np.angle(F[-1])
-    unstable = measured.unstable_poles + 0.5 * q - grown / np.pi
-    if abs(unstable - round(unstable)) > WHOLE:
-        words = f"the lines do not close the winding: {unstable:.2f} unstable poles"
+    turns = np.append(np.angle(F[1:] / F[:-1]), -np.angle(F[-1]))
+    if np.abs(turns).max() > UNCLEAR or abs(np.angle(F[0]) - first) > UNCLEAR - 0.5 * np.pi:
+        words = "the angle of det(I + GK) turns too fast from line to line to be followed"
         return Judgement(1, {}, None, words, engine=OF_LINES)
-    if round(unstable) != 0:
-        words = f"unstable: {round(unstable)} poles in the right half plane"
+    grown = np.angle(F[0]) - first + turns.sum()
+    unstable = round(measured.unstable_poles + 0.5 * q - grown / np.pi)
+    if unstable:
+        words = f"unstable: {unstable} poles in the right half plane"
         return Judgement(1, {}, False, words, engine=OF_LINES)
     S = np.linalg.norm(np.linalg.inv(np.eye(p) + L[len(below) :]), 2, axis=(1, 2))
-    shares = S / _template(bounds, HZ * hz, bandwidth * (1.0 - SLOWER), integrators > 0)
+    x = np.maximum(HZ * hz, 0.0 if integrators else bounds.omega_low) / bandwidth * (1.0 + SLOWER)
+    room = np.where(x <= 1.0, 1.0 / x, np.inf) if bounds.shape is None else bounds.room(x)
+    shares = S / np.minimum(np.sqrt(0.5) * x * room, bounds.S_max)
     figures = {"S_max": float(S.max()) / bounds.S_max, "bandwidth": float(shares.max())}
     broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in figures.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
@@ -136,24 +126,14 @@ def judge_lines(
     return Judgement(1, figures, not broken, words, engine=OF_LINES)
 
 
-def _template(bounds: Bounds, omega: Array, bandwidth: float, integrator: bool) -> Array:
-    """What |S| keeps at ω so that ω_b is `bandwidth`."""
-    x = (omega if integrator else np.maximum(omega, bounds.omega_low)) / bandwidth
-    if bounds.shape is None:
-        return np.where(x <= 1.0, np.sqrt(0.5), bounds.S_max)
-    return np.minimum(np.sqrt(0.5) * x * bounds.room(x), bounds.S_max)
-
-
 def together(each: Sequence[Judgement]) -> Judgement:
     """Of one controller on several plants: passed where it is on all, unknown where on one."""
     if len(each) == 1:
         return each[0]
     names = dict.fromkeys(name for one in each for name in one.figures)
     worst = {name: float(np.max([one.figures.get(name, 0.0) for one in each])) for name in names}
-    failed = [f"plant {i}: {one.words}" for i, one in enumerate(each, 1) if not one.passed]
-    passed: bool | None = not failed
-    if failed and not any(one.passed is False for one in each):
-        passed = None
+    first = next((one for one in each if not one.passed), each[0])
+    words = f"of {len(each)} plants: {first.words}"
+    passed = False if any(one.passed is False for one in each) else first.passed
     engine = "; ".join(dict.fromkeys(one.engine for one in each))
-    words = failed[0] if failed else f"stable and within every bound on {len(each)} plants"
     return Judgement(sum(one.plants for one in each), worst, passed, words, engine=engine)

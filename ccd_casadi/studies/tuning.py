@@ -195,32 +195,29 @@ def tune(
         design = _on_models(design, loops, S_max)
         norms = tuple(None if loop is None else loop.norm for loop in loops)
     case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
-    if not design.usable or design.controller is None:
-        return Tuned(case, design, models, norms)
-    raw = [(item, late, one.unstable_poles, one.slope)
-           for (item, late), one in zip(known, responses, strict=True)]  # fmt: skip
-    verdict = together([attempted(_judged, design, bounds, period, *one) for one in raw])
-    if not verdict.passed:
-        words = f"as it was given the plant does not confirm it: {verdict.words}; {design.words}"
-        design = replace(design, usable=False, words=words)
-    return Tuned(case, design, models, norms, verdict)
+    judge, K = NOT_JUDGED, design.controller
+    if design.usable and K is not None:
+        runs = K if period is None else realised(tustin(K, period)).as_coded
+        judge = together([
+            attempted(_judged, plant, late, one, runs, bounds, design.bandwidth,
+                      structure.integrator)
+            for (plant, late), one in zip(known, responses, strict=True)
+        ])  # fmt: skip
+        words = f"as it was given the plant does not confirm it: {judge.words}; {design.words}"
+        design = design if judge.passed else replace(design, usable=False, words=words)
+    return Tuned(case, design, models, norms, judge)
 
 
 def _judged(
-    design: MeasuredDesign, bounds: Bounds, period: float | None, plant: Plant, delay: float,
-    unstable: int, slope: int,
+    plant: Plant, delay: float, stated: MeasuredResponse, runs: StateSpace, bounds: Bounds,
+    bandwidth: float, integrator: bool,
 ) -> Judgement:  # fmt: skip
-    """What runs on a plant as it was read; `unstable` poles and `slope` of a response as stated."""
-    K, integrators = design.controller, int(design.structure.integrator)
-    assert K is not None
-    runs = K if period is None else realised(tustin(K, period)).as_coded
-    if isinstance(plant, MeasuredResponse):
-        stated = replace(plant, unstable_poles=unstable, poles_at_zero=slope)
-        return judge_lines(stated, runs, bounds, design.bandwidth, delay=delay,
-                           integrators=integrators)  # fmt: skip
-    assert period is not None
-    return judge_loops([plant], runs, bounds, Sampling(1.0 / period, 1e6 * delay),
-                       design.bandwidth, integrator=design.structure.integrator)  # fmt: skip
+    """What runs on a plant as it was read; its poles as they are `stated`."""
+    if isinstance(plant, StateSpace):
+        hold = Sampling(1.0 / runs.period, 1e6 * delay)
+        return judge_loops([plant], runs, bounds, hold, bandwidth, integrator=integrator)
+    plant = replace(plant, unstable_poles=stated.unstable_poles, poles_at_zero=stated.poles_at_zero)
+    return judge_lines(plant, runs, bounds, bandwidth, delay=delay, integrators=int(integrator))
 
 
 @dataclass(frozen=True)

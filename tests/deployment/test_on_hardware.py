@@ -114,9 +114,10 @@ def test_a_free_body_needs_no_force_for_its_position_and_velocity(
     F = feedforward(G, PERIOD, DELAY)
     assert F[2].all()
     if held:
-        rigid = np.linalg.inv(C[:, :inputs] @ B[:inputs]) * 25.0
-        np.testing.assert_allclose(F[0] * np.outer(units, units), rigid * np.outer(units, units),
-                                   rtol=1e-3, atol=1e-4 * np.abs(rigid * np.outer(units, units)).max())  # fmt: skip
+        scale = np.outer(units, units)
+        rigid = 25.0 * np.linalg.inv(C[:, :inputs] @ B[:inputs]) * scale
+        most = 1e-3 * np.abs(rigid).max()
+        np.testing.assert_allclose(F[0] * scale, rigid, rtol=0, atol=most)
     else:
         assert not F[0].any()
         assert not F[1].any()

@@ -22,30 +22,21 @@ NEAREST = "the nearest sample as it stands"
 
 
 def modal_table(
-    names: Sequence[str],
-    table: str = "",
-    rigid_below_hz: float = 0.1,
-    frequency_error: float = FREQUENCY_ERROR,
-    response_error: float = RESPONSE_ERROR,
-) -> Plant:
+    names: Sequence[str], table: str = "", rigid_below_hz: float = 0.1,
+    frequency_error: float = FREQUENCY_ERROR, response_error: float = RESPONSE_ERROR,
+) -> Plant:  # fmt: skip
     """The plant interpolated between the modal models of a CSV file (see `modal_table`)."""
     if not table:
         raise PlantError('modal_table needs table = "modes.csv", relative to the case file')
-    accepted = Accepted(frequency_error, response_error)
-    return plant_of_table(
-        read_modal_table(Path(table)), names, rigid_below_hz, Path(table).name, accepted
-    )
+    of, accepted = read_modal_table(Path(table)), Accepted(frequency_error, response_error)
+    return plant_of_table(of, names, rigid_below_hz, Path(table).name, accepted)
 
 
 def sampled_matrices(
-    names: Sequence[str],
-    folder: str = "",
-    modes: int = 10,
-    static_correction: bool = False,
-    rigid_below_hz: float = 0.1,
-    frequency_error: float = FREQUENCY_ERROR,
+    names: Sequence[str], folder: str = "", modes: int = 10, static_correction: bool = False,
+    rigid_below_hz: float = 0.1, frequency_error: float = FREQUENCY_ERROR,
     response_error: float = RESPONSE_ERROR,
-) -> Plant:
+) -> Plant:  # fmt: skip
     """The plant interpolated between M and K given as files (see `matrices`), reduced to modes."""
     if not folder:
         raise PlantError('sampled_matrices needs folder = "fe", relative to the case file')
@@ -55,12 +46,9 @@ def sampled_matrices(
 
 
 def plant_of_table(
-    table: ModalTable,
-    names: Sequence[str],
-    rigid_below_hz: float,
-    source: str,
+    table: ModalTable, names: Sequence[str], rigid_below_hz: float, source: str,
     accepted: Accepted = ACCEPTED,
-) -> Plant:
+) -> Plant:  # fmt: skip
     """Any modal table as the plant that the design loop asks for.
 
     Raises PlantError where the table's parameters are not those of the case.
