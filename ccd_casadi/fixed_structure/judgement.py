@@ -79,8 +79,8 @@ def judge_loops(
     figures = found.worst | {"bandwidth": bandwidth / own if own > 0.0 else np.inf}
     slow = not own >= bandwidth * (1.0 - SLOWER)
     words = f"the bandwidth is {own / HZ:.6g} Hz, not {bandwidth / HZ:.6g} Hz"
-    return Judgement(len(plants), figures, found.passed and not slow,
-                     words if slow and found.passed else found.words, engine=OF_A_MODEL)  # fmt: skip
+    words = words if slow and found.passed else found.words
+    return Judgement(len(plants), figures, found.passed and not slow, words, engine=OF_A_MODEL)
 
 
 def judge_lines(
