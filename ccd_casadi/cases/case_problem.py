@@ -112,8 +112,8 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
             with kept_quiet(True):
                 found = diagnose(problem, case.suspension.rigid_modes)[1]
             for finding in found:
-                passed_over = at_a_sample and finding.topic is Topic.BETWEEN
-                if finding.severity is Severity.ERROR and not passed_over:
+                of_a_sample = at_a_sample and finding.topic is Topic.BETWEEN
+                if finding.severity is Severity.ERROR and not of_a_sample:
                     raise PlantError(finding.words)
     except UserError as error:
         raise CaseError(one_line(f"{case.path}: plant: {error}")) from error

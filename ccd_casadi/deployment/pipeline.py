@@ -128,15 +128,18 @@ def deploy(
 
 def _judged(run: FinishedRun, found: Deployment) -> Judgement:
     """The coefficients of the code on the plants as their function returned them."""
-    target, most = found.target, found.compliance_max
+    target, most, period = found.target, found.compliance_max, 1.0 / found.rate_hz
+    parts = [discretise(one.chosen.controller, found.conversion, period, found.delay)
+             for one in found.orders]  # fmt: skip
+    K = replace(assemble([one.channel for one in found.orders], parts), period=period)
     bounds = Bounds(
         target.peak, target.peak, run.problem.inner.omega_low,
         compliance_max=None if most is None else most * (1.0 + target.excess),
     )  # fmt: skip
     return judge_loops(
-        as_written(run), found.realisation.as_coded, bounds,
+        as_written(run), K, found.realisation.as_coded, bounds,
         Sampling(found.rate_hz, 1e6 * found.delay), target.bandwidth * (1.0 - target.tolerance),
-        on_all=False, integrator=False,
+        integrator=False, on_all=False,
     )  # fmt: skip
 
 

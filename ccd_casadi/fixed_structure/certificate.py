@@ -154,8 +154,7 @@ def judged(
     K = _balanced(controller)
     G, held = free, K
     if sampling is not None:
-        G = [sampled(one, sampling) for one in free]
-        held = K if controller.period else _tustin(K, sampling.period)
+        G, held = [sampled(one, sampling) for one in free], as_run(K, sampling)
     if plants[0].period:  # what acts on it between its instants is not known
         free = G
     loops = [_sensitivity(one, held) for one in G]
@@ -300,12 +299,21 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     return StateSpace(A, B, np.hstack([G.C, np.zeros((len(G.C), age))]), np.zeros((len(G.C), m)))
 
 
-def _tustin(K: StateSpace, period: float) -> StateSpace:
-    """K(z) with s = (2/T)(z - 1)/(z + 1)."""
-    one, half = np.eye(len(K.A)), 0.5 * period
+def as_run(K: StateSpace, sampling: Sampling) -> StateSpace:
+    """K(z) with s = (2/T)(z - 1)/(z + 1); in discrete time it runs as it is."""
+    if K.period:
+        return K
+    one, half = np.eye(len(K.A)), 0.5 * sampling.period
     inverse = np.linalg.inv(one - half * K.A)
-    C = K.C @ inverse
-    return StateSpace(inverse @ (one + half * K.A), period * inverse @ K.B, C, K.D + half * C @ K.B)
+    C, D = K.C @ inverse, K.D + half * K.C @ inverse @ K.B
+    A, B = inverse @ (one + half * K.A), sampling.period * inverse @ K.B
+    return StateSpace(A, B, C, D, period=sampling.period)
+
+
+def holds(G: StateSpace, K: StateSpace, sampling: Sampling) -> bool:
+    """Whether a controller in discrete time makes the loop stable, by its eigenvalues."""
+    loop = _sensitivity(sampled(_balanced(G), sampling), _balanced(K))
+    return bool(np.abs(np.linalg.eigvals(matrix_balance(loop.A)[0])).max() < 1.0)
 
 
 def _balanced(system: StateSpace) -> StateSpace:

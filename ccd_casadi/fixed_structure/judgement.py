@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.certificate import TOLERANCE, SetCertificate, certify
+from ccd_casadi.fixed_structure.certificate import TOLERANCE, SetCertificate, as_run, certify, holds
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
@@ -25,9 +25,9 @@ from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.units import HZ, counted
 
 ENGINE = "NumPy, on the matrices as the plant function returned them, free bodies free"
-OF_A_MODEL = "NumPy, on the matrices as they were given, with the controller's coefficients"
-OF_LINES = "NumPy, on the lines as they were given, with the controller's coefficients"
+AS_GIVEN = "NumPy, on the plants as they were given, with the coefficients of the code"
 SLOWER = 2e-3  # relative: what a claimed bandwidth may be above the judge's
+LOWEST, LINES = 1e-6, 600  # of half the rate, and frequencies, at which they are compared
 BELOW, PER_DECADE = 4.0, 40  # decades below the first line, where G is (jω)^-n, and points in each
 UNCLEAR = 0.9 * np.pi  # an angle that turns further between two lines may as well turn back
 
@@ -65,31 +65,40 @@ def attempted(judge: Callable[..., Judgement], *of: Any) -> Judgement:
 
 
 def judge_loops(
-    plants: Sequence[StateSpace], controller: StateSpace, bounds: Bounds, sampling: Sampling,
-    bandwidth: float, *, on_all: bool = True, integrator: bool = True,
+    plants: Sequence[StateSpace], controller: StateSpace, coded: StateSpace, bounds: Bounds,
+    sampling: Sampling, bandwidth: float, integrator: bool, on_all: bool = True,
 ) -> Judgement:  # fmt: skip
     """A difference equation (e in, u out) on plants, continuous or in discrete time at its rate.
 
-    `bandwidth`: the one claimed, rad/s, on each plant or, not `on_all`, on the first alone.
+    What is `coded` has to be the controller, and hold every plant; figures are the controller's:
+    poles that nearly coincide cost a level test its digits in the form that is coded. `bandwidth`:
+    the one claimed, rad/s, on each plant or, not `on_all`, on the first alone.
     """
+    omega = np.geomspace(LOWEST, 0.999, LINES) * np.pi / sampling.period
+    K, own_K = coded.response(omega), as_run(controller, sampling).response(omega)
+    off = float((np.linalg.norm(K - own_K, 2, (1, 2)) / np.linalg.norm(own_K, 2, (1, 2))).max())
+    if not off <= TOLERANCE:
+        words = f"the coefficients of the code are off the controller by {100.0 * off:.2g} %"
+        return Judgement(len(plants), {"code": off / TOLERANCE}, False, words, engine=AS_GIVEN)
     found = certify(plants, controller, bounds, sampling, integrator=integrator)
-    if not found.worst:
-        return Judgement(len(plants), {}, False, found.words, engine=OF_A_MODEL)
+    if not (found.worst and all(holds(plant, coded, sampling) for plant in plants)):
+        words = "unstable with the coefficients of the code" if found.worst else found.words
+        return Judgement(len(plants), {}, False, words, engine=AS_GIVEN)
     own = found.bandwidth if on_all else found.plants[0].bandwidth
     figures = found.worst | {"bandwidth": bandwidth / own if own > 0.0 else np.inf}
     slow = not own >= bandwidth * (1.0 - SLOWER)
     words = f"the bandwidth is {own / HZ:.6g} Hz, not {bandwidth / HZ:.6g} Hz"
     words = words if slow and found.passed else found.words
-    return Judgement(len(plants), figures, found.passed and not slow, words, engine=OF_A_MODEL)
+    return Judgement(len(plants), figures, found.passed and not slow, words, engine=AS_GIVEN)
 
 
 def judge_lines(
-    measured: MeasuredResponse, controller: StateSpace, bounds: Bounds, bandwidth: float,
-    *, delay: float = 0.0, integrators: int = 1,
+    measured: MeasuredResponse, controller: StateSpace, bounds: Bounds, delay: float,
+    bandwidth: float, integrator: bool,
 ) -> Judgement:  # fmt: skip
     """A controller, continuous or a difference equation, on a response as its file has it.
 
-    `delay`: in s, besides that in the response; `integrators`: of K, in each channel.
+    `delay`: in s, besides that in the response; `integrator`: of K, in each channel.
     """
     hz, n = measured.hz, measured.slope
     if controller.period:
@@ -101,20 +110,20 @@ def judge_lines(
     lag = np.exp(-1j * omega * delay)[:, None, None]
     L = np.concatenate([asymptote, G]) @ controller.response(omega) * lag
     F = np.linalg.det(np.eye(p) + L)
-    q = (n + integrators) * p
+    q = (n + int(integrator)) * p
     half = -0.5 * np.pi * q  # the angle of F at 0, but for half turns
     first = half + np.pi * np.round((np.angle(F[0]) - half) / np.pi)
     turns = np.append(np.angle(F[1:] / F[:-1]), -np.angle(F[-1]))
     if np.abs(turns).max() > UNCLEAR or abs(np.angle(F[0]) - first) > UNCLEAR - 0.5 * np.pi:
         words = "the angle of det(I + GK) turns too fast from line to line to be followed"
-        return Judgement(1, {}, None, words, engine=OF_LINES)
+        return Judgement(1, {}, None, words, engine=AS_GIVEN)
     grown = np.angle(F[0]) - first + turns.sum()
     unstable = round(measured.unstable_poles + 0.5 * q - grown / np.pi)
     if unstable:
         words = f"unstable: {unstable} poles in the right half plane"
-        return Judgement(1, {}, False, words, engine=OF_LINES)
+        return Judgement(1, {}, False, words, engine=AS_GIVEN)
     S = np.linalg.norm(np.linalg.inv(np.eye(p) + L[len(below) :]), 2, axis=(1, 2))
-    x = np.maximum(HZ * hz, 0.0 if integrators else bounds.omega_low) / bandwidth * (1.0 + SLOWER)
+    x = np.maximum(HZ * hz, 0.0 if integrator else bounds.omega_low) / bandwidth * (1.0 + SLOWER)
     room = np.where(x <= 1.0, 1.0 / x, np.inf) if bounds.shape is None else bounds.room(x)
     shares = S / np.minimum(np.sqrt(0.5) * x * room, bounds.S_max)
     figures = {"S_max": float(S.max()) / bounds.S_max, "bandwidth": float(shares.max())}
@@ -123,7 +132,7 @@ def judge_lines(
     words = f"stable and within every bound on {counted(len(hz), 'line')}"
     if broken:
         words = f"exceeds its bound on {', '.join(broken)}"
-    return Judgement(1, figures, not broken, words, engine=OF_LINES)
+    return Judgement(1, figures, not broken, words, engine=AS_GIVEN)
 
 
 def together(each: Sequence[Judgement]) -> Judgement:
@@ -135,5 +144,4 @@ def together(each: Sequence[Judgement]) -> Judgement:
     first = next((one for one in each if not one.passed), each[0])
     words = f"of {len(each)} plants: {first.words}"
     passed = False if any(one.passed is False for one in each) else first.passed
-    engine = "; ".join(dict.fromkeys(one.engine for one in each))
-    return Judgement(sum(one.plants for one in each), worst, passed, words, engine=engine)
+    return Judgement(sum(one.plants for one in each), worst, passed, words, engine=AS_GIVEN)

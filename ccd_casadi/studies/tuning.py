@@ -14,14 +14,9 @@ import scipy
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.deployment.realisation import realised
+from ccd_casadi.fixed_structure import judgement
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.judgement import (
-    Judgement,
-    attempted,
-    judge_lines,
-    judge_loops,
-    together,
-)
+from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.fixed_structure.measured_design import NEGATIVE, MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import bandwidth_within
 from ccd_casadi.fixed_structure.structure import Structure
@@ -197,10 +192,10 @@ def tune(
     case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
     judge, K = NOT_JUDGED, design.controller
     if design.usable and K is not None:
-        runs = K if period is None else realised(tustin(K, period)).as_coded
-        judge = together([
-            attempted(_judged, plant, late, one, runs, bounds, design.bandwidth,
-                      structure.integrator)
+        coded = K if period is None else realised(tustin(K, period)).as_coded
+        judge = judgement.together([
+            judgement.attempted(_judged, plant, late, one, K, coded, bounds, design.bandwidth,
+                                structure.integrator)
             for (plant, late), one in zip(known, responses, strict=True)
         ])  # fmt: skip
         words = f"as it was given the plant does not confirm it: {judge.words}; {design.words}"
@@ -209,15 +204,15 @@ def tune(
 
 
 def _judged(
-    plant: Plant, delay: float, stated: MeasuredResponse, runs: StateSpace, bounds: Bounds,
-    bandwidth: float, integrator: bool,
+    plant: Plant, delay: float, stated: MeasuredResponse, K: StateSpace, coded: StateSpace,
+    bounds: Bounds, bandwidth: float, integrator: bool,
 ) -> Judgement:  # fmt: skip
     """What runs on a plant as it was read; its poles as they are `stated`."""
     if isinstance(plant, StateSpace):
-        hold = Sampling(1.0 / runs.period, 1e6 * delay)
-        return judge_loops([plant], runs, bounds, hold, bandwidth, integrator=integrator)
+        hold = Sampling(1.0 / coded.period, 1e6 * delay)
+        return judgement.judge_loops([plant], K, coded, bounds, hold, bandwidth, integrator)
     plant = replace(plant, unstable_poles=stated.unstable_poles, poles_at_zero=stated.poles_at_zero)
-    return judge_lines(plant, runs, bounds, bandwidth, delay=delay, integrators=int(integrator))
+    return judgement.judge_lines(plant, coded, bounds, delay, bandwidth, integrator)
 
 
 @dataclass(frozen=True)

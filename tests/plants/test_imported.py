@@ -19,7 +19,7 @@ from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.imported.frames import frames
-from ccd_casadi.plants.imported.interpolation import Accepted, InterpolatedModes
+from ccd_casadi.plants.imported.interpolation import ANY, InterpolatedModes
 from ccd_casadi.plants.imported.matrices import modes_of, reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table, write_modal_table
 from ccd_casadi.plants.imported.plant import plant_of_table
@@ -156,7 +156,7 @@ def test_what_samples_do_not_settle_is_refused_but_at_samples() -> None:
     mechanics(plant, tuple(table.theta[3]))
     with pytest.raises(PlantError, match="at a sample, such as t="):
         mechanics(plant, (more,))
-    assert not plant_of_table(table, ("t",), 0.1, "m", Accepted()).unknown_between
+    assert not plant_of_table(table, ("t",), 0.1, "m", ANY).unknown_between
 
 
 def test_one_sample_twice_is_refused() -> None:

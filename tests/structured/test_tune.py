@@ -100,7 +100,7 @@ def test_a_judge_without_an_answer_has_not_passed(monkeypatch: pytest.MonkeyPatc
     def fails(*of: object, **others: object) -> None:
         raise np.linalg.LinAlgError("no eigenvalues")
 
-    monkeypatch.setattr(tuning, "judge_loops", fails)
+    monkeypatch.setattr(tuning.judgement, "judge_loops", fails)
     found = ccd.tune(LAGS, rate_hz=20.0, starts=2)
     assert found.judge.passed is None
     assert not found.design.usable
@@ -133,13 +133,13 @@ def test_lines_are_judged_as_the_poles_of_the_loop_are(
     crossing = HZ * hz[np.argmax(np.sqrt(0.5) < S)] * 0.99
     bounds = Bounds(1.001 * max(S.max(), 1.001), 2.0, HZ * hz[0])
     system = StateSpace(K.A, K.B, K.C, K.D)
-    found = judge_lines(lines, system, bounds, crossing)
+    found = judge_lines(lines, system, bounds, 0.0, crossing, True)
     stable = bool((poles.real < 0.0).all())
     assert found.passed is stable, found.words
     if stable:
-        assert not judge_lines(lines, system, bounds, 1.1 * crossing).passed
+        assert not judge_lines(lines, system, bounds, 0.0, 1.1 * crossing, True).passed
         less = replace(bounds, S_max=1.0 + 0.99 * (bounds.S_max / 1.001 - 1.0))
-        assert not judge_lines(lines, system, less, crossing).passed
+        assert not judge_lines(lines, system, less, 0.0, crossing, True).passed
 
 
 def test_effort_bounds_the_controller_and_costs_bandwidth() -> None:

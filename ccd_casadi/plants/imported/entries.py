@@ -21,6 +21,7 @@ import numpy as np
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
+LOST = "the samples cannot be interpolated"
 MAX_DEGREE, MAX_TERMS = 12, 500
 SINGULAR = 1e-9  # terms that the samples do not tell apart, or samples that nothing else pins
 LENGTHS = (0.5, 1.0, 2.0)  # of half the range of each parameter
@@ -35,7 +36,7 @@ def fit_entries(theta: Array, Y: Array) -> tuple[ca.Function, Array]:
     N, p = theta.shape
     unit = 2.0 * (theta - lower) / np.where(width > 0.0, width, np.nan) - 1.0
     if not np.isfinite(unit).all():
-        raise _not_interpolated("a parameter does not vary among the samples")
+        raise PlantError(f"{LOST}: a parameter does not vary among the samples; add samples")
     if len(np.unique(unit, axis=0)) < N:
         raise PlantError("two samples are at the same theta; keep one of them")
     squares = ((unit[:, None] - unit) ** 2).sum(axis=2)
@@ -64,7 +65,8 @@ def fit_entries(theta: Array, Y: Array) -> tuple[ca.Function, Array]:
             spread[k][:, better] = a[:, better]
             trend[:, better] = np.linalg.solve(R, own.T @ (Y - phi @ a))[:, better]
     if not np.isfinite(left_out).all():
-        raise _not_interpolated(f"{N} samples of {p} parameters do not settle a polynomial")
+        words = f"{N} samples of {p} parameters do not settle a polynomial; add samples"
+        raise PlantError(f"{LOST}: {words}")
     x = ca.MX.sym("theta", p)
     scaled = 2.0 * (x - lower) / width - 1.0
     terms = [prod((scaled[j] ** int(k) for j, k in enumerate(row) if k), start=ca.MX(1.0))
@@ -81,7 +83,3 @@ def _matern(squares: Any, module: Any) -> Any:
     """φ of squared distances over l², by NumPy or CasADi."""
     x = module.sqrt(7.0 * squares + AT_A_SAMPLE)
     return (1.0 + x + 0.4 * x**2 + x**3 / 15.0) * module.exp(-x)
-
-
-def _not_interpolated(words: str) -> PlantError:
-    return PlantError(f"the samples cannot be interpolated: {words}; add samples")

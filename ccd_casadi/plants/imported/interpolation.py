@@ -22,6 +22,8 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 SAME = 1e-6  # of the range: no distance to a sample
+Errors = tuple[float, float]  # of a sample left out: frequency, response
+ANY: Errors = (np.inf, np.inf)
 DAMPED = 0.1  # responses are compared at s = (0.1 + j) ω: resonances that move do not drown it
 FREQUENCIES = 120
 
@@ -45,17 +47,6 @@ class LeftOut:
         return float(self.responses.max())
 
 
-@dataclass(frozen=True)
-class Accepted:
-    """Errors of a sample left out up to which designs between samples are worth their name."""
-
-    frequency: float = np.inf
-    response: float = np.inf
-
-
-ANY = Accepted()
-
-
 class InterpolatedModes:
     """θ -> Mechanics (M = I) between the samples of a modal table; `left_out` is its error.
 
@@ -64,7 +55,7 @@ class InterpolatedModes:
     PlantError where samples differ in their number of rigid-body modes, or are too few.
     """
 
-    def __init__(self, table: ModalTable, rigid_below: float, accepted: Accepted = ANY) -> None:
+    def __init__(self, table: ModalTable, rigid_below: float, accepted: Errors = ANY) -> None:
         counts = (table.omega < rigid_below).sum(axis=1)
         if np.ptp(counts) > 0:
             s = int(counts.argmin())
@@ -80,7 +71,7 @@ class InterpolatedModes:
         theta = ca.MX.sym("theta", len(table.names))
         y = entries(theta)
         self._entries = ca.Function("entries", [theta], [y, ca.jacobian(y, theta)])
-        self.refusal = self._refused(accepted)
+        self.refusal = self._refused(*accepted)
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         """M, D, K, B, C and their derivatives at θ."""
@@ -106,11 +97,11 @@ class InterpolatedModes:
         distance = np.abs((self.table.theta - np.asarray(theta)) / width).max(axis=1)
         return int(distance.argmin()), float(distance.min())
 
-    def _refused(self, accepted: Accepted) -> str:
+    def _refused(self, frequency: float, response: float) -> str:
         """The sample that is missed by most, over what is accepted, in words; else nothing."""
         table, errors = self.table, self.left_out
-        worst = errors.frequencies.max(axis=1, initial=0.0) / accepted.frequency
-        worst = np.maximum(worst, errors.responses / accepted.response)
+        worst = errors.frequencies.max(axis=1, initial=0.0) / frequency
+        worst = np.maximum(worst, errors.responses / response)
         s = int(worst.argmax())
         if not worst[s] > 1.0:
             return ""
@@ -121,11 +112,11 @@ class InterpolatedModes:
             hz = table.omega[s, self.rigid + i] / (2.0 * np.pi)
             words += f" and {100.0 * errors.frequencies[s, i]:.2g} % in the frequency of mode "
             words += f"{self.rigid + i + 1} ({hz:.4g} Hz)"
-        missed = (errors.frequencies > accepted.frequency).any(axis=0)
+        missed = (errors.frequencies > frequency).any(axis=0)
         few = f"the {self.rigid + int(missed.argmax())} lowest" if missed.any() else "fewer"
         return (
             f"the samples do not settle the plant between them: {place}, left out, is predicted "
-            f"{words}, where {100.0 * accepted.response:.2g} % and {100.0 * accepted.frequency:.2g}"
+            f"{words}, where {100.0 * response:.2g} % and {100.0 * frequency:.2g}"
             f" % are accepted; add a sample at {more}, or keep {few} modes"
         )
 

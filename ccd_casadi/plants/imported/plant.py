@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.plants.imported.entries import fit_entries
-from ccd_casadi.plants.imported.interpolation import SAME, Accepted, InterpolatedModes, row_of
+from ccd_casadi.plants.imported.interpolation import SAME, Errors, InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
 from ccd_casadi.plants.plant import Plant, named_values
@@ -17,7 +17,7 @@ from ccd_casadi.support.errors import PlantError
 
 # A mode 5 % off moves a response at 10 % of damping by half.
 FREQUENCY_ERROR, RESPONSE_ERROR = 0.05, 0.5  # of a sample left out
-ACCEPTED = Accepted(FREQUENCY_ERROR, RESPONSE_ERROR)
+ACCEPTED = (FREQUENCY_ERROR, RESPONSE_ERROR)
 NEAREST = "the nearest sample as it stands"
 
 
@@ -28,8 +28,8 @@ def modal_table(
     """The plant interpolated between the modal models of a CSV file (see `modal_table`)."""
     if not table:
         raise PlantError('modal_table needs table = "modes.csv", relative to the case file')
-    of, accepted = read_modal_table(Path(table)), Accepted(frequency_error, response_error)
-    return plant_of_table(of, names, rigid_below_hz, Path(table).name, accepted)
+    accepted, file = (frequency_error, response_error), Path(table)
+    return plant_of_table(read_modal_table(file), names, rigid_below_hz, file.name, accepted)
 
 
 def sampled_matrices(
@@ -41,13 +41,13 @@ def sampled_matrices(
     if not folder:
         raise PlantError('sampled_matrices needs folder = "fe", relative to the case file')
     table = reduced_table(Path(folder), modes, static_correction)
-    accepted = Accepted(frequency_error, response_error)
+    accepted = (frequency_error, response_error)
     return plant_of_table(table, names, rigid_below_hz, Path(folder).name, accepted)
 
 
 def plant_of_table(
     table: ModalTable, names: Sequence[str], rigid_below_hz: float, source: str,
-    accepted: Accepted = ACCEPTED,
+    accepted: Errors = ACCEPTED,
 ) -> Plant:  # fmt: skip
     """Any modal table as the plant that the design loop asks for.
 
