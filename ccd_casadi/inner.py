@@ -45,7 +45,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     if options.theta is None:
         start = ",".join(f"{each.name}={each.start:g}" for each in case.theta)
         raise CaseError(f"{case.path}: --theta is missing; give the hardware, --theta {start}")
-    problem = problem_of(case)
+    problem = problem_of(case, at_a_sample=True)
     theta = parse_theta(case, options.theta)
     point = break_frequencies(options)
     answer = {MixedSensitivityProblem: mixed_answer, StructuredProblem: structured_answer}

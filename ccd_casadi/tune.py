@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-from dataclasses import replace
 
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.options import integer, one_line, option, positive, real, valued
@@ -32,7 +31,7 @@ from ccd_casadi.support.terminal import inform, say
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
-    from ccd_casadi.deployment.realisation import Realisation, block_diagonal
+    from ccd_casadi.deployment.realisation import realised
     from ccd_casadi.deployment.source_code import write_c
     from ccd_casadi.drawing.stored import write_page
     from ccd_casadi.fixed_structure import Structure
@@ -64,6 +63,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     result = json_values({
         "status": answer.status, **answer.figures, "seconds": options.seconds(),
         "models": [norm for norm in found.norms if norm is not None],  # ‖S‖∞ of each model's loop
+        "judge": found.judge.entry,
         "seed": options.seed, "formulation": "tune", "versions": versions(),
     })  # fmt: skip
     write_json(folder / "result.json", result)
@@ -72,10 +72,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         write_json(folder / "controller.json", answer.controller)
         write_page(folder / "report.html", measured_page(case, K, result))
         if case.period is not None:
-            system, blocks = block_diagonal(tustin(K, case.period))
-            realised = Realisation(replace(system, period=case.period), tuple(blocks))
-            write_c(folder, realised, title=case.file, delay=options.delay,
-                    verified=found.design.usable)  # fmt: skip
+            write_c(folder, realised(tustin(K, case.period)), title=case.file,
+                    delay=options.delay, verified=found.design.usable)  # fmt: skip
         lines = [
             *(f"{'decision':14s}{words}" for words in (advice(result),) if words),
             f"{'bandwidth':14s}{result['bandwidth_hz']:.6g} Hz, |S| at most "

@@ -18,6 +18,7 @@ from ccd_casadi.support.errors import UserError
 ORDER = 4  # highest derivative of the setpoint
 POINTS = 64  # on the circle of Cauchy's integral
 RADIUS = 0.25  # of the nearest singularity of the inverse
+ROUNDING = 1e-11  # of the inverse on the circle: what a coefficient has by rounding there is none
 
 
 def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
@@ -25,7 +26,7 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
 
     Taylor coefficients by Cauchy's integral on a circle within which the inverse is analytic: its
     aliasing error is RADIUS^(POINTS - ORDER). Raises UserError where the plant has a zero at s = 0,
-    so that no finite force holds a position. A plant whose rigid bodies are free has F_0 = F_1 = 0.
+    so that no finite force holds a position. Free bodies have F_0 = 0, without dampers F_1 = 0.
     """
     return feedforward_slopes(plant, (), period, delay)[0]
 
@@ -42,14 +43,18 @@ def feedforward_slopes(
     nearest = min([*np.abs(zeros), poles.max()])
     if not nearest > 1e-9 * poles.max():
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
-    radius = RADIUS * nearest
+    radius = min(RADIUS * nearest, 1.0 / (delay + 0.5 * period))  # where exp stays of size one
     s = radius * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
     X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
-    inverse = np.linalg.pinv(plant.C @ X + plant.D)
+    G = plant.C @ X + plant.D
+    inverse = np.linalg.inv(G) if G.shape[1] == G.shape[2] else np.linalg.pinv(G)
     ahead = np.exp(s * (delay + 0.5 * period))[:, None, None]
 
     def series(values: np.ndarray) -> Array:
         found = np.fft.fft(ahead * values, axis=0).real[: ORDER + 1] / POINTS
+        size = np.abs(values).max(axis=0)
+        size = np.minimum(size.max(axis=0), size.max(axis=1)[:, None])  # whatever the units
+        found[np.abs(found) <= ROUNDING * size] = 0.0
         return np.asarray(found / radius ** np.arange(ORDER + 1)[:, None, None])
 
     F, dF = series(inverse), np.zeros((len(changes), ORDER + 1, *inverse.shape[1:]))

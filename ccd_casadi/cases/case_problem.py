@@ -6,7 +6,7 @@ from typing import Any
 from ccd_casadi.cases.budget import error_budget
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.diagnosis import diagnose
-from ccd_casadi.cases.findings import Severity
+from ccd_casadi.cases.findings import Severity, Topic
 from ccd_casadi.cases.kinds import structured_problem, weights_of
 from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
@@ -26,13 +26,15 @@ from ccd_casadi.support.units import HZ
 from ccd_casadi.support.user_code import raised_words
 
 
-def problem_of(case: Case) -> CoDesignProblem:
+def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
     """The case in SI, with its plant, which is made once here.
 
     Parameters
     ----------
     case : Case
         As `load_case` gives it.
+    at_a_sample : bool
+        Whether it is enough that the plant is known at samples of θ.
 
     Returns
     -------
@@ -110,7 +112,8 @@ def problem_of(case: Case) -> CoDesignProblem:
             with kept_quiet(True):
                 found = diagnose(problem, case.suspension.rigid_modes)[1]
             for finding in found:
-                if finding.severity is Severity.ERROR:
+                of_a_sample = at_a_sample and finding.topic is Topic.BETWEEN
+                if finding.severity is Severity.ERROR and not of_a_sample:
                     raise PlantError(finding.words)
     except UserError as error:
         raise CaseError(one_line(f"{case.path}: plant: {error}")) from error

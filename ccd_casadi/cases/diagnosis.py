@@ -156,9 +156,10 @@ def first_seen(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
+    unknown = plant.unknown_between
+    found = [Finding(Severity.ERROR, Topic.BETWEEN, unknown)] if unknown else []
     if plant.domain is None:
-        return []
-    found = []
+        return found
     box = zip(problem.names, problem.lower, problem.upper, *plant.domain, strict=True)
     for name, low, high, least, most in box:
         slack = 1e-9 * (most - least)

@@ -50,6 +50,7 @@ class Topic(StrEnum):
     HIDDEN_MODE = "hidden mode"
     ZERO = "transmission zero"
     DOMAIN = "domain"
+    BETWEEN = "between samples"
     UNITS = "units"
     DERIVATIVES = "derivatives"
     LOOP = "loop"

@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.design_entries import budget_entry, controller_dict, mixed_dict, move_entry
-from ccd_casadi.codesign.judgement import judge_on_model, judgement_of
+from ccd_casadi.codesign.judgement import judge_on_model
 from ccd_casadi.codesign.second_check import second_on_set, second_on_weighted
 from ccd_casadi.codesign.structured_entries import (
     active_of,
@@ -19,6 +19,7 @@ from ccd_casadi.codesign.structured_entries import (
     robust_dict,
     sections_controller,
 )
+from ccd_casadi.fixed_structure.judgement import judgement_of
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -72,8 +73,9 @@ class InnerOptions:
 
 
 def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
-    """θ by name, and what the hardware costs."""
+    """θ by name, what the hardware costs, and what a reader must know of the plant there."""
     return {
+        "notes": list(plant_of(problem).notes(theta)),
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": hardware_cost(plant_of(problem), theta),
     }

@@ -5,11 +5,10 @@ coordinates (`plants.as_written`), the loop rebuilt from controller and plant
 (`fixed_structure.certificate`). No modes, suspension, reduction or scaling of a search takes part.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
 
-from ccd_casadi.fixed_structure import SetCertificate, certify
+from ccd_casadi.fixed_structure import certify
+from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.state_space import StateSpace
@@ -17,33 +16,15 @@ from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL
 from ccd_casadi.plants.plant import mechanics
 
-ENGINE = "NumPy, on the matrices as the plant function returned them, free bodies free"
 
-
-@dataclass(frozen=True)
-class Judgement:
-    """What was found on so many `plants`: the largest figures over their bounds, by name."""
-
-    plants: int
-    figures: Mapping[str, float]
-    passed: bool
-    words: str
-
-    @property
-    def entry(self) -> dict[str, Any]:
-        """Of result.json."""
-        return {"engine": ENGINE, **vars(self)}
-
-
-def judgement_of(certificate: SetCertificate, plants: int) -> Judgement:
-    """Of a certificate on plants as they were written."""
-    return Judgement(plants, certificate.worst, certificate.passed, certificate.words)
-
-
-def written_plants(problem: CoDesignProblem, theta: Sequence[float]) -> list[StateSpace]:
-    """The model at θ and the plants of a mixed-sensitivity design's set, as they were written."""
+def written_plants(
+    problem: CoDesignProblem, theta: Sequence[float], shifts: int | None = None
+) -> list[StateSpace]:
+    """The model at θ and the plants of a mixed-sensitivity design's set, as they were written;
+    with so many `shifts` of its resonances."""
     system, robust = mechanics(plant_of(problem), theta, derivatives=False), problem.robust
-    others = [] if robust is None else [off for off in robust.perturbations() if off != NOMINAL]
+    places = () if robust is None else robust.perturbations(shifts)
+    others = [off for off in places if off != NOMINAL]
     count = problem.suspension.rigid_modes
     return [
         as_written(system, shift=off.shift, damping=off.damping, rigid_modes=count)

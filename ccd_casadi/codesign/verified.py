@@ -15,10 +15,11 @@ import numpy as np
 
 from ccd_casadi.codesign.design_entries import controller_dict
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
-from ccd_casadi.codesign.judgement import Judgement, judge_on_model
+from ccd_casadi.codesign.judgement import judge_on_model
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence, survives
+from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate

@@ -31,7 +31,7 @@ class VerifiedDesign(Verified):
 
     @property
     def certified(self) -> bool:
-        return self.design.figures.certified and self.judgement.passed
+        return self.design.figures.certified and bool(self.judgement.passed)
 
     @property
     def bandwidth(self) -> float:

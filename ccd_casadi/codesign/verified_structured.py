@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
-from ccd_casadi.codesign.judgement import Judgement, judgement_of
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     design_dict,
@@ -22,6 +21,7 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.design import TWICE
+from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of

@@ -89,6 +89,7 @@ def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str,
         "static_stiffness": None if found.statics is None else found.statics.stiffness,
         "static_compliance": None if found.statics is None else found.statics.compliance,
         "robust": robust,
+        "judge": None if found.judge is None else found.judge.entry,
         "channels": [_channel(item, run) for item in found.orders],
         "theta": dict(zip(run.problem.names, run.theta, strict=True)),
         "versions": versions(),
@@ -109,6 +110,7 @@ def _member(item: MemberLoop) -> dict[str, Any]:
     place: dict[str, Any] = {"shift": item.at.shift, "damping": item.at.damping}
     if isinstance(item.at, SetPlace):
         place |= {"modes": list(item.at.modes), "gain": item.at.gain, "option": item.at.option}
+        place |= {"varies": dict(item.at.varies)} if item.at.varies else {}
     return place | _sampled(item.figures)
 
 

@@ -1,11 +1,12 @@
 """A move as the machine makes it: sampled, delayed, saturated, quantised, with a jittering delay.
 
-Every period is cut in `PARTS`; the plant is stepped exactly from one to the next, and the force
-that was computed at kT reaches it at kT + τ_k, rounded up to a part. What is read at kT, and what
-the actuator is told, are multiples of a step where one is given.
+The plant is stepped exactly from each arrival of a force to the next: what was computed at kT
+reaches it at kT + τ + jitter, the jitter rounded to a part of a period. What is read at kT, and
+what the actuator is told, are multiples of a step where one is given.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.linalg import expm
@@ -13,10 +14,11 @@ from scipy.linalg import expm
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.deployment.realisation import Realisation
+from ccd_casadi.lti.hold import INSTANT
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
-PARTS = 20  # of a period
+PARTS = 20  # of a period, that a jitter is a multiple of: few steps to compute
 TAIL = 3.0  # the machine is watched for this many times the setpoint's duration after its end
 
 
@@ -61,12 +63,15 @@ def move(
         ahead = np.einsum("kt,km->tm", wanted, forward[:, :, axis])
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
-    ahead_by = [expm(joint * (T * i / PARTS))[:n] for i in range(PARTS + 1)]
     rng = np.random.default_rng(hardware.seed)
-    late = delay + hardware.jitter * rng.uniform(-1.0, 1.0, count)
-    reaches = np.ceil(np.maximum(late, 0.0) / T * PARTS - 1e-9).astype(int)
-    reaches += PARTS * np.arange(count)
+    parts = np.round(PARTS * hardware.jitter / T * rng.uniform(-1.0, 1.0, count))
+    reaches = np.arange(count) + np.maximum(delay / T + parts / PARTS, 0.0)  # in periods
     reaches = np.maximum.accumulate(reaches)  # no force overtakes an earlier one
+
+    @cache
+    def over(share: float) -> Array:
+        return np.asarray(expm(joint * (T * share))[:n])
+
     x, z, u_now = np.zeros(n), np.zeros(len(K.A)), np.zeros(m)
     error, force = np.zeros((count, p)), np.zeros((count, m))
     limit, gain = realisation.saturation, realisation.back_calculation
@@ -84,15 +89,15 @@ def move(
             z = z + gain @ (u - v)
         clipped += bool(np.any(u != v))
         force[k] = _stepped(u, hardware.force_step)
-        part, end = PARTS * k, PARTS * (k + 1)
-        while part < end:  # from one arrival to the next
-            while arriving <= k and reaches[arriving] <= part:
+        now, end = float(k), k + 1.0
+        while now < end:  # from one arrival to the next
+            while arriving <= k and reaches[arriving] <= now + INSTANT:
                 u_now = force[arriving]
                 arriving += 1
             following = min(end, reaches[arriving]) if arriving <= k else end
-            step = ahead_by[following - part]
+            step = over(round(following - now, 9))
             x = step[:, :n] @ x + step[:, n:] @ u_now
-            part = following
+            now = following
     return Move(time, wanted[0], wanted[2], error, force, forward is not None, profile.duration,
                 window, saturated=clipped / count)  # fmt: skip
 

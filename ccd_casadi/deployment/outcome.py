@@ -8,6 +8,7 @@ from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
 from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
@@ -42,6 +43,7 @@ class Deployment:
     `sampled` are the exact figures of the sampled loop on the nominal plant, `members` those on
     every other plant of the run's [robust] set. `unverified`: why the run itself is not verified,
     empty where it is. `needed_hz`: the least rate that will do, None where none does.
+    `judge`: the code's coefficients on the plants as their function returned them.
     `compliance`: the largest |GS| in m/N and on which plant, where the case bounds it.
     """
 
@@ -62,6 +64,7 @@ class Deployment:
     statics: Statics | None = None
     compliance: tuple[Perturbation, float] | None = None
     compliance_max: float | None = None
+    judge: Judgement | None = None
 
     @property
     def order(self) -> int:
@@ -93,6 +96,8 @@ class Deployment:
             if gain > (1.0 + self.target.excess) * self.compliance_max:
                 missed = missed_by(gain, self.compliance_max)
                 words.append(f"compliance |GS| in m/N {missed} ({place_words(at)})")
+        if self.judge is not None and not self.judge.passed:
+            words.append(f"the plant as its function returned it: {self.judge.words}")
         return tuple(words)
 
     @property

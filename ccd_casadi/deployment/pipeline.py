@@ -20,12 +20,14 @@ from ccd_casadi.deployment.outcome import (
 from ccd_casadi.deployment.rate_choice import choose
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import LoopLimits, ReducedController, reductions, smallest
-from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, members
+from ccd_casadi.deployment.robust_set import Member, MemberLoop, WorstFirst, as_written, members
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.judgement import Judgement, attempted, judge_loops
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.hold import Sampling, sampled
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
@@ -104,7 +106,8 @@ def deploy(
         progress("the rate of the case")
         target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing)
         way |= {"needed_hz": own_hz, "target": target}
-        return _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
+        found = _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
+        return replace(found, judge=attempted(_judged, run, found))
     loops = list(zip(channels, small, strict=True))
     for attempt in range(1 + ADDED):
         conversion, needed, rate = choose(
@@ -120,7 +123,24 @@ def deploy(
             break
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
-    return found
+    return replace(found, judge=attempted(_judged, run, found))
+
+
+def _judged(run: FinishedRun, found: Deployment) -> Judgement:
+    """The coefficients of the code on the plants as their function returned them."""
+    target, most, period = found.target, found.compliance_max, 1.0 / found.rate_hz
+    parts = [discretise(one.chosen.controller, found.conversion, period, found.delay)
+             for one in found.orders]  # fmt: skip
+    K = replace(assemble([one.channel for one in found.orders], parts), period=period)
+    bounds = Bounds(
+        target.peak, target.peak, run.problem.inner.omega_low,
+        compliance_max=None if most is None else most * (1.0 + target.excess),
+    )  # fmt: skip
+    return judge_loops(
+        as_written(run), K, found.realisation.as_coded, bounds,
+        Sampling(found.rate_hz, 1e6 * found.delay), target.bandwidth * (1.0 - target.tolerance),
+        integrator=False, on_all=False,
+    )  # fmt: skip
 
 
 def _orders(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import schur, solve_sylvester
+from scipy.linalg import block_diag, schur, solve_sylvester
 
 from ccd_casadi.deployment.channels import LoopChannel, assemble
 from ccd_casadi.lti.state_space import StateSpace
@@ -39,6 +39,12 @@ class Realisation:
         ends = pairwise(np.cumsum([0, *self.blocks]))
         return np.concatenate([np.zeros(0), *(self.system.A[i:j, i:j].ravel() for i, j in ends)])
 
+    @property
+    def as_coded(self) -> StateSpace:
+        """Of the coefficients that the code has: nothing of A but its blocks."""
+        inside = block_diag(*(np.ones((size, size)) for size in self.blocks))
+        return replace(self.system, A=self.system.A * (inside if self.blocks else 1.0))
+
 
 def realise(
     channels: Sequence[LoopChannel],
@@ -54,6 +60,12 @@ def realise(
     whole = assemble(channels, parts)
     system = replace(whole, period=controllers[0].period)
     return Realisation(system, tuple(blocks), saturation)
+
+
+def realised(K: StateSpace) -> Realisation:
+    """A controller in discrete time as the code has it."""
+    system, blocks = block_diagonal(K)
+    return Realisation(replace(system, period=K.period), tuple(blocks))
 
 
 def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:

@@ -10,24 +10,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.judgement import written_plants
 from ccd_casadi.codesign.robust_check import DENSE
 from ccd_casadi.deployment.channels import LoopChannel, along_directions
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.robust.sampled import SampledFigures
+from ccd_casadi.support.arrays import Array
 
 LATTICE = 41  # plants of a box that a deployed loop of sections is looked at on, besides its set
 
 
 @dataclass(frozen=True)
 class SetPlace(Perturbation):
-    """A place in the set of sections: besides, an option set of the plant (0: none) and a gain."""
+    """A place in the set of sections: besides, an option set of the plant (0: none), a gain, and
+    parameters of the model that vary."""
 
     option: int = 0
     gain: float = 0.0
+    varies: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,7 @@ def place_words(at: Perturbation) -> str:
     if isinstance(at, SetPlace):
         parts += [f"gain {100.0 * at.gain:+.3g} %"] if at.gain else []
         parts += [f"option set {at.option}"] if at.option else []
+        parts += [f"{name.removeprefix('theta.')}={value:.4g}" for name, value in at.varies]
     return ", ".join(parts) or "the nominal plant"
 
 
@@ -89,22 +96,35 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
     )
 
 
-def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
-    """Of a run with sections: corners of its box, its own set, `dense`: a lattice too."""
-    sections = structured_of(run.problem)
+def as_written(run: FinishedRun) -> list[StateSpace]:
+    """The model and every plant of the dense set, by the matrices as the plant function returned
+    them."""
+    if not kind_of(run.problem).as_designed:
+        return written_plants(run.problem, run.theta, DENSE)
     uncertain = uncertain_plant(run.problem, run.theta)
+    return uncertain.as_written([(0, uncertain.nominal), *_points(run, uncertain, True)])
+
+
+def _points(run: FinishedRun, uncertain: UncertainPlant, dense: bool) -> list[tuple[int, Array]]:
+    """Corners of the box, the run's own set, `dense`: a lattice too."""
+    sections = structured_of(run.problem)
     points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.scenarios)]
-    if dense:
-        points += lattice(uncertain, LATTICE, sections.seed)
+    return points + (lattice(uncertain, LATTICE, sections.seed) if dense else [])
+
+
+def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:
+    """Of a run with sections."""
+    uncertain = uncertain_plant(run.problem, run.theta)
     found: dict[SetPlace, Member] = {}
-    for option, point in points:
+    for option, point in _points(run, uncertain, dense):
         if option == 0 and np.array_equal(point, uncertain.nominal):
             continue
         values = dict(zip(uncertain.names, np.asarray(point, float).tolist(), strict=True))
         modes = tuple(values.get(f"mode_shift {i}", 0.0) for i in range(1, uncertain.modes + 1))
+        model = tuple(item for item in values.items() if item[0].startswith("theta."))
         place = SetPlace(
             values.get("resonance_shift", 0.0), values.get("damping", 1.0),
-            modes if any(modes) else (), option, values.get("gain", 0.0),
+            modes if any(modes) else (), option, values.get("gain", 0.0), model,
         )  # fmt: skip
         found.setdefault(place, Member(place, uncertain.plant(point, option)))
     return tuple(found.values())

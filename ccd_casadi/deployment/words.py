@@ -39,6 +39,7 @@ def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
         "bandwidth_hz": K.bandwidth / HZ,
         "sensitivity_peak": found.worst.figures.sensitivity_peak,
         "plants": 1 + len(found.members),
+        "judge": None if found.judge is None else found.judge.entry,
     }
     if found.shortfalls:
         return VerdictLine(State.FAILED, f"{at}: {found.shortfalls[0]}", figures)

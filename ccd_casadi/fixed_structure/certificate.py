@@ -10,7 +10,7 @@ its hold and delay exact, K by Tustin's rule; what happens between samples is no
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     with_crossings,
 )
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable, norms
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.hold import Sampling, delayed
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
@@ -93,7 +93,8 @@ def certify(
     Parameters
     ----------
     plants, controller : sequence of ScaledPlant or StateSpace, StateSpace
-        All of the set, force to displacement, SI; e in, u out.
+        All of the set, force to displacement, SI; e in, u out. In discrete time, at the rate of
+        `sampling`, they run as they are; a plant is then delayed by whole periods.
     bounds, integrator : Bounds, bool
         With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
@@ -153,7 +154,9 @@ def judged(
     K = _balanced(controller)
     G, held = free, K
     if sampling is not None:
-        G, held = [sampled(one, sampling) for one in free], _tustin(K, sampling.period)
+        G, held = [sampled(one, sampling) for one in free], as_run(K, sampling)
+    if plants[0].period:  # what acts on it between its instants is not known
+        free = G
     loops = [_sensitivity(one, held) for one in G]
     poles = [np.linalg.eigvals(S.A) for S in loops]
     grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
@@ -169,9 +172,10 @@ def judged(
         w = bounds.weights
         corner = max(w.c_K * w.omega_K, w.omega_T / w.A_u)
     own, grids = np.linalg.eigvals(held.A), []
-    zeros = [] if K.D.any() else [K.zeros(_size(K))]
+    zeros = [] if K.D.any() or K.period else [K.zeros(_size(K))]
     for i in good:
-        roots = [poles[i], np.linalg.eigvals(G[i].A), own, free[i].zeros(_size(free[i])), *zeros]
+        nulls = free[i].rates_of(free[i].zeros(_size(free[i])))
+        roots = [poles[i], np.linalg.eigvals(G[i].A), own, nulls, *zeros]
         grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner))
     grid, rows = padded(grids), np.arange(len(good))
     if not integrator:
@@ -184,7 +188,7 @@ def judged(
         values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
     tops = peaks(table, grid, values)
-    if sampling is not None and bounds.compliance_max is not None:
+    if table.free is not None and bounds.compliance_max is not None:
         beyond = _compliance_beyond(table, [free[i] for i in good])
         tops["GS"] = np.maximum(tops["GS"][0], beyond), tops["GS"][1]
     loops = [loops[i] for i in good]
@@ -277,6 +281,8 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     T, (n, m) = sampling.period, G.B.shape
     whole = int(np.floor(sampling.delay / T + 1e-9))
     rest = max(sampling.delay - whole * T, 0.0)
+    if G.period:
+        return delayed(G.A, [0.0 * G.B] * whole + [G.B], G.C, G.period)
     held = np.zeros((n + m, n + m))
     held[:n, :n], held[:n, n:] = G.A, G.B
     first, second = expm(held * rest), expm(held * (T - rest))
@@ -293,16 +299,26 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     return StateSpace(A, B, np.hstack([G.C, np.zeros((len(G.C), age))]), np.zeros((len(G.C), m)))
 
 
-def _tustin(K: StateSpace, period: float) -> StateSpace:
-    """K(z) with s = (2/T)(z - 1)/(z + 1)."""
-    one, half = np.eye(len(K.A)), 0.5 * period
+def as_run(K: StateSpace, sampling: Sampling) -> StateSpace:
+    """K(z) with s = (2/T)(z - 1)/(z + 1); in discrete time it runs as it is."""
+    if K.period:
+        return K
+    one, half = np.eye(len(K.A)), 0.5 * sampling.period
     inverse = np.linalg.inv(one - half * K.A)
-    C = K.C @ inverse
-    return StateSpace(inverse @ (one + half * K.A), period * inverse @ K.B, C, K.D + half * C @ K.B)
+    C, D = K.C @ inverse, K.D + half * K.C @ inverse @ K.B
+    A, B = inverse @ (one + half * K.A), sampling.period * inverse @ K.B
+    return StateSpace(A, B, C, D, period=sampling.period)
+
+
+def holds(G: StateSpace, K: StateSpace, sampling: Sampling) -> bool:
+    """Whether a controller in discrete time makes the loop stable, by its eigenvalues."""
+    loop = _sensitivity(sampled(_balanced(G), sampling), _balanced(K))
+    return bool(np.abs(np.linalg.eigvals(matrix_balance(loop.A)[0])).max() < 1.0)
 
 
 def _balanced(system: StateSpace) -> StateSpace:
-    return StateSpace(*balanced(system.A, system.B, system.C), system.D)
+    A, B, C = balanced(system.A, system.B, system.C)
+    return replace(system, A=A, B=B, C=C)
 
 
 def _size(system: StateSpace) -> float:

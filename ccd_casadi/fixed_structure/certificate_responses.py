@@ -73,7 +73,8 @@ class LoopTable:
         integrator: bool = True,
     ) -> None:
         self.G, self.K = Triangular(G), Triangular([K])
-        self.free = self.G if sampling is None else Triangular(free)
+        bare = sampling is None or free[0].period
+        self.free = None if bare else Triangular(free)
         self.period = None if sampling is None else sampling.period
         self.bounds, self.integrator = bounds, integrator
 
@@ -120,7 +121,7 @@ class LoopTable:
 
     def _matrices(self, which: np.ndarray, omega: Array) -> dict[str, np.ndarray]:
         S, g, k = self._loops(which, omega)
-        free = g if self.period is None else self.free.at(which, 1j * omega)
+        free = g if self.free is None else self.free.at(which, 1j * omega)
         KS = _product(k, S)
         return {"S": S, "KS": KS, "T": _product(g, KS), "GS": _product(S, free)}
 

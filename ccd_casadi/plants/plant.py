@@ -87,6 +87,8 @@ class Plant:
         θ -> what a reader of a result there must know; what is wrong with the derivatives, else "".
     domain : tuple of two arrays (n,), optional
         Bounds of θ beyond which the plant is not known.
+    unknown_between : str
+        Why the plant is known at samples of θ alone, where that is so.
     nearby : callable, optional
         Known θ -> a cheaper `evaluate`, true there and nearly so beside them.
     shapes, drawing : callable, optional
@@ -106,6 +108,7 @@ class Plant:
     values: Callable[[Sequence[float]], Mechanics] | None = None
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
     domain: tuple[Array, Array] | None = None
+    unknown_between: str = ""
     nearby: Callable[[Sequence[Sequence[float]]], Evaluate] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None

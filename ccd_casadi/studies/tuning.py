@@ -13,14 +13,17 @@ import numpy as np
 import scipy
 
 from ccd_casadi.cases.measured_case import MeasuredCase
+from ccd_casadi.deployment.realisation import realised
+from ccd_casadi.fixed_structure import judgement
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.fixed_structure.measured_design import NEGATIVE, MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import bandwidth_within
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.limits import HALF_POWER
 from ccd_casadi.lti.closed_loop import closed_loop, sigma_max
 from ccd_casadi.lti.grid import FLANKS, frequency_grid, local_maxima, root_flanks, zoomed
-from ccd_casadi.lti.hold import delay_parts, delayed, sampled, tustin
+from ccd_casadi.lti.hold import Sampling, delay_parts, delayed, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
@@ -47,6 +50,10 @@ APART = 1e-6  # relative, of lines
 AT_REST = 1e-7  # of the largest root: below, it lies at 0
 
 
+Plant = MeasuredResponse | StateSpace
+NOT_JUDGED = Judgement(0, {}, None, "no usable controller was found to judge")
+
+
 @dataclass(frozen=True)
 class Tuned:
     """A tuned controller.
@@ -57,12 +64,15 @@ class Tuned:
         The lines, and the design on them.
     models, norms : tuple of StateSpace, tuple of float
         Plants in discrete time, and ‖S‖∞ of their loops, infinite where poles are not stable.
+    judge : Judgement
+        The deployed controller on the plants as they were given; the design is usable if it passes.
     """
 
     case: MeasuredCase
     design: MeasuredDesign
     models: tuple[StateSpace | None, ...]
     norms: tuple[float | None, ...]
+    judge: Judgement = NOT_JUDGED
 
     @property
     def controller(self) -> StateSpace | None:
@@ -135,7 +145,8 @@ def tune(
     own = {"unstable_poles": unstable_poles, "poles_at_zero": poles_at_zero,
            "least_damping": least_damping}  # fmt: skip
     stated = [name for name, value in own.items() if value is not None]
-    read = [_plant(item, rate_hz, delay, tell) for item in given]
+    known = [_read(item, delay, tell) for item in given]
+    read = [_plant(item, rate_hz, late) for item, late in known]
     models = tuple(model for _, model in read)
     if stated and None not in models:
         words = f"{', '.join(stated)}: is of measured plants, and of a model its poles are known"
@@ -164,9 +175,9 @@ def tune(
         if not design.usable or not periods:
             break
         loops = _loops_on(models, design.controller, bounds, structure.integrator)
-        known = [loop for loop in loops if loop is not None]
-        worse = [loop for loop in known if not loop.norm <= S_max]
-        slower = [loop for loop in known if loop.bandwidth < (1.0 - SLOWER) * design.bandwidth]
+        found = [loop for loop in loops if loop is not None]
+        worse = [loop for loop in found if not loop.norm <= S_max]
+        slower = [loop for loop in found if loop.bandwidth < (1.0 - SLOWER) * design.bandwidth]
         if not worse and not slower:
             break
         inside, initial = inside * (2.0 if worse else 1.0), design.kappa
@@ -179,7 +190,29 @@ def tune(
         design = _on_models(design, loops, S_max)
         norms = tuple(None if loop is None else loop.norm for loop in loops)
     case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
-    return Tuned(case, design, models, norms)
+    judge, K = NOT_JUDGED, design.controller
+    if design.usable and K is not None:
+        coded = K if period is None else realised(tustin(K, period)).as_coded
+        judge = judgement.together([
+            judgement.attempted(_judged, plant, late, one, K, coded, bounds, design.bandwidth,
+                                structure.integrator)
+            for (plant, late), one in zip(known, responses, strict=True)
+        ])  # fmt: skip
+        words = f"as it was given the plant does not confirm it: {judge.words}; {design.words}"
+        design = design if judge.passed else replace(design, usable=False, words=words)
+    return Tuned(case, design, models, norms, judge)
+
+
+def _judged(
+    plant: Plant, delay: float, stated: MeasuredResponse, K: StateSpace, coded: StateSpace,
+    bounds: Bounds, bandwidth: float, integrator: bool,
+) -> Judgement:  # fmt: skip
+    """What runs on a plant as it was read; its poles as they are `stated`."""
+    if isinstance(plant, StateSpace):
+        hold = Sampling(1.0 / coded.period, 1e6 * delay)
+        return judgement.judge_loops([plant], K, coded, bounds, hold, bandwidth, integrator)
+    plant = replace(plant, unstable_poles=stated.unstable_poles, poles_at_zero=stated.poles_at_zero)
+    return judgement.judge_lines(plant, coded, bounds, delay, bandwidth, integrator)
 
 
 @dataclass(frozen=True)
@@ -262,25 +295,31 @@ def _on_models(
                    words=words)  # fmt: skip
 
 
-def _plant(
-    item: Any, rate_hz: float | None, delay: float, tell: Tell
-) -> tuple[MeasuredResponse, StateSpace | None]:
-    """The response as the controller sees it; of a model also itself in discrete time."""
+def _read(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
+    """A plant as it was given, and what it is behind in s."""
     if isinstance(item, str | Path):
         name, item = Path(item).name, _of_file(Path(item))
         tell(f"{name}: {item.words}")
     elif hasattr(item, "frdata"):
         item = from_control(item)
     if isinstance(item, MeasuredResponse):
+        return item, delay
+    if isinstance(item, interchange.NamedSystem):
+        return item.system, delay + item.delay
+    return interchange.from_control(item), delay
+
+
+def _plant(
+    item: Plant, rate_hz: float | None, delay: float
+) -> tuple[MeasuredResponse, StateSpace | None]:
+    """The response as the controller sees it; of a model also itself in discrete time."""
+    if isinstance(item, MeasuredResponse):
         kept = item.hz < (np.inf if rate_hz is None else 0.5 * rate_hz)
         lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
         G = (item.matrix * lag).reshape(item.G.shape)
         spread = item.spread if item.spread is None else item.spread[kept]
         return replace(item, hz=item.hz[kept], G=G[kept], spread=spread), None
-    if isinstance(item, interchange.NamedSystem):
-        system, delay = item.system, delay + item.delay
-    else:
-        system = interchange.from_control(item)
+    system = item
     own = system.period
     if own and rate_hz is None:
         rate_hz = 1.0 / own

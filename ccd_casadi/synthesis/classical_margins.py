@@ -25,7 +25,8 @@ class ClassicalMargins:
     """Factors `gain_down` < 1 < `gain_up` at which stability is lost (0 and inf where none is).
 
     `phase_deg`: least change of phase, either way, at |L| = 1; `delay`: least lag there in s;
-    `crossover`: the first such frequency in rad/s. All are inf where |L| does not cross 1.
+    `crossover`: where |L| falls through 1 in the end, rad/s (`_crossover`). All are inf where |L|
+    does not cross 1.
     `places`: where gain_down, gain_up and phase_deg are, rad/s; inf where there is no such margin.
     """
 
@@ -63,13 +64,26 @@ def classical_margins(
         gain_up=float(gains[high].min(initial=np.inf)),
         phase_deg=float(phases.min(initial=np.inf)),
         delay=float((lags / crossover).min(initial=np.inf)),
-        crossover=float(crossover.min(initial=np.inf)),
+        crossover=_crossover(np.log(crossover), np.log(omega[0]), abs(L[0]) > 1.0),
         places=(
             _at_least(-gains[low], turned[low]),
             _at_least(gains[high], turned[high]),
             _at_least(phases, crossover),
         ),
     )
+
+
+def _crossover(falls: Array, lowest: float, above: bool) -> float:
+    """Of all ln ω where |L| passes 1 the one below which it is above 1, and above it below, over
+    most of ln ω: neither a graze at low frequencies nor a resonance further up is the crossover.
+
+    `above`: whether it is at the `lowest` ln ω. inf where it never falls through 1.
+    """
+    signs = (1.0 if above else -1.0) * (-1.0) ** np.arange(len(falls))
+    gained = np.cumsum(signs * np.diff(falls, prepend=lowest))
+    gained[signs < 0.0] = -np.inf  # there it rises through 1
+    best = int(gained.argmax()) if len(gained) else 0
+    return float(np.exp(falls[best])) if (signs > 0.0).any() else np.inf
 
 
 def _at_least(values: Array, places: Array) -> float:

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.files import deployment_dict
 from ccd_casadi.deployment.outcome import Deployment
-from ccd_casadi.deployment.pipeline import deploy
+from ccd_casadi.deployment.pipeline import _judged, deploy
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
@@ -134,6 +135,17 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
 ) -> None:
     run, found = by_hand
     assert found.passed, found.shortfalls
+    assert found.judge is not None
+    assert found.judge.passed is True
+    assert found.judge.plants > 4
+    worst = found.judge.figures["S_max"] * found.target.peak
+    assert worst == pytest.approx(found.worst.figures.sensitivity_peak, rel=1e-5)
+    K = found.realisation.system
+    wrong = replace(found.realisation, system=replace(K, C=-K.C, D=-K.D))
+    assert _judged(run, replace(found, realisation=wrong)).passed is False
+    for share, passed in ((1.001, True), (0.999, False)):
+        target = replace(found.target, S_max=share * worst / (1.0 + found.target.excess))
+        assert _judged(run, replace(found, target=target)).passed is passed
     assert {getattr(item.at, "option", 0) for item in found.members} == {0, 1}
     uncertain = uncertain_plant(run.problem, run.theta)
     for option in (0, 1):  # in between, by plants of one's own

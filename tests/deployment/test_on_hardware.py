@@ -1,6 +1,7 @@
 """On the machine: feedforward, limits with back-calculation, a start without a jump, moves."""
 
 from dataclasses import replace
+from typing import Any
 
 import control
 import numpy as np
@@ -22,6 +23,9 @@ from ccd_casadi.deployment.realisation import Realisation, difference_equation
 from ccd_casadi.deployment.source_code import structured_text, vectors
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import FREE, modal_plant
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import UserError
 
 PERIOD = DELAY = 1e-4
@@ -91,6 +95,34 @@ def test_feedforward_inverts_the_plant_to_fifth_order(seed: int, inputs: int) ->
     np.testing.assert_allclose(mix @ F[2], 10.0 * np.eye(inputs), rtol=0, atol=1e-4)
 
 
+@few(max_examples=40)
+@given(seed=st.integers(0, 10**6), inputs=st.integers(1, 3), held=st.booleans())
+def test_a_free_body_needs_no_force_for_its_position_and_velocity(
+    seed: int, inputs: int, held: bool
+) -> None:
+    """Modes up to 10^5 times as fast as the slowest, in units that differ from axis to axis."""
+    rng = np.random.default_rng(seed)
+    n = inputs + 4
+    mix, units = well_conditioned(rng, inputs), 10.0 ** rng.uniform(-3.0, 3.0, inputs)
+    B = np.vstack([mix, 0.3 * rng.standard_normal((4, inputs))]) / units
+    C = np.hstack([np.eye(inputs), 0.3 * rng.standard_normal((inputs, 4))]) * units[:, None]
+    omega = np.append(np.full(inputs, 5.0 * held), 10.0 ** rng.uniform(2.0, 7.0, 4))
+    matrices = np.eye(n), np.zeros((n, n)), np.diag(omega**2), B, C
+    none: Any = tuple(np.zeros((0, *part.shape)) for part in matrices)
+    plant = Mechanics(*matrices, 0.01, none)
+    G = scale_plant(modal_plant(plant, FREE), 1.0, bare=True).plant_si()
+    F = feedforward(G, PERIOD, DELAY)
+    assert F[2].all()
+    if held:
+        scale = np.outer(units, units)
+        rigid = 25.0 * np.linalg.inv(C[:, :inputs] @ B[:inputs]) * scale
+        most = 1e-3 * np.abs(rigid).max()
+        np.testing.assert_allclose(F[0] * scale, rigid, rtol=0, atol=most)
+    else:
+        assert not F[0].any()
+        assert not F[1].any()
+
+
 def test_a_plant_that_holds_no_position_has_no_feedforward() -> None:
     G = StateSpace(
         np.diag([-1.0, -2.0]), np.ones((2, 1)), np.array([[1.0, -2.0]]), np.zeros((1, 1))
@@ -150,7 +182,12 @@ def test_an_unlimited_move_is_the_linear_loop() -> None:
     found = made(K)
     errors, _ = simulate(plant, K.system, found.position[:, None, None])
     np.testing.assert_allclose(found.error, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)
-    late = made(K, hardware=Electronics(jitter=PERIOD / PARTS / 4))
+    for delay in (0.0, 0.123 * PERIOD, 1.77 * PERIOD):  # the delay is that which is given
+        errors, _ = simulate(sampled(stage(), PERIOD, delay), K.system,
+                             found.position[:, None, None])  # fmt: skip
+        exact = move(stage(), K, delay, PROFILE).error
+        np.testing.assert_allclose(exact, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)
+    late = made(K, hardware=Electronics(jitter=PERIOD / PARTS))
     np.testing.assert_array_equal(made(K, hardware=Electronics()).error, found.error)
     assert 0.0 < np.abs(late.error - found.error).max() < 1e-2 * found.peak_error
 

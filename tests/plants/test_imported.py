@@ -17,8 +17,9 @@ from scipy.sparse import coo_array, csc_array, save_npz
 
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.imported.frames import frames
-from ccd_casadi.plants.imported.interpolation import InterpolatedModes
+from ccd_casadi.plants.imported.interpolation import ANY, InterpolatedModes
 from ccd_casadi.plants.imported.matrices import modes_of, reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table, write_modal_table
 from ccd_casadi.plants.imported.plant import plant_of_table
@@ -114,6 +115,56 @@ def test_derivatives_are_those_of_the_interpolated_plant(t: float, modal: bool) 
         np.testing.assert_allclose(here.derivatives[k][0] / size, slope / size, atol=1e-7)
 
 
+def scattered(seed: int) -> ModalTable:
+    """Eight samples at random, of modes that have nothing to do with one another."""
+    rng = np.random.default_rng(seed)
+    table = veering(0.02, np.sort(rng.uniform(0.0, 1.0, 8)), seed)
+    inputs, outputs = rng.standard_normal((8, 3, 1)), rng.standard_normal((8, 3, 2))
+    return replace(table, inputs=inputs, outputs=outputs, shapes=inputs,
+                   omega=np.sort(rng.uniform(1e3, 5e3, (8, 3)), axis=1))  # fmt: skip
+
+
+@pytest.mark.parametrize("table", [veering(0.02), *map(scattered, range(3))])
+def test_at_a_sample_the_plant_is_that_sample(table: ModalTable) -> None:
+    """Frequencies and residues, whatever the samples are; and beside it what its slopes say."""
+    modes = InterpolatedModes(table, 1.0)
+    for s, theta in enumerate(table.theta):
+        found = modes(theta)
+        lam, turn = eigh(found.K)
+        np.testing.assert_allclose(np.sqrt(lam), table.omega[s], rtol=1e-9)
+        residues = np.einsum("pr,rm->rpm", found.C @ turn, turn.T @ found.B)
+        own = np.einsum("rp,rm->rpm", table.outputs[s], table.inputs[s])
+        np.testing.assert_allclose(residues, own, atol=1e-9 * np.abs(own).max())
+        h = 1e-5
+        ends = [modes(theta + sign * h) for sign in (-1, 1)]
+        for k, name in enumerate("MDKBC"):
+            slope = (getattr(ends[1], name) - getattr(ends[0], name)) / (2.0 * h)
+            size = np.abs(getattr(found, name)).max() + np.abs(slope).max() + 1e-300
+            np.testing.assert_allclose(found.derivatives[k][0] / size, slope / size, atol=1e-4)
+
+
+def test_what_samples_do_not_settle_is_refused_but_at_samples() -> None:
+    """By the sample, the mode, and the sample to add, which lies between two."""
+    table = scattered(0)
+    plant = plant_of_table(table, ("t",), 0.1, "modes.csv")
+    words = plant.unknown_between
+    assert "left out, is predicted" in words
+    assert "in the frequency of mode" in words
+    more = float(words.split("add a sample at t=")[1].split(",")[0])
+    assert table.theta.min() < more < table.theta.max()
+    assert np.abs(table.theta - more).min() > 0.0
+    mechanics(plant, tuple(table.theta[3]))
+    with pytest.raises(PlantError, match="at a sample, such as t="):
+        mechanics(plant, (more,))
+    assert not plant_of_table(table, ("t",), 0.1, "m", ANY).unknown_between
+
+
+def test_one_sample_twice_is_refused() -> None:
+    table = veering(0.02, np.array([0.0, 0.5, 0.5, 1.0]))
+    with pytest.raises(PlantError, match="two samples are at the same theta"):
+        InterpolatedModes(table, 1.0)
+
+
 def test_a_written_table_is_read_back(tmp_path: Path) -> None:
     table = veering(0.02)
     write_modal_table(tmp_path / "modes.csv", table)
@@ -187,6 +238,15 @@ def test_a_wrong_case_of_a_table_is_told(tmp_path: Path, old: str, new: str, wor
     with pytest.raises(CaseError) as caught:
         problem_of(load_case(case(tmp_path, (old, new))))
     assert words in str(caught.value)
+
+
+def test_check_and_solve_refuse_what_inner_designs_at_a_sample(tmp_path: Path) -> None:
+    path = case(tmp_path, ('"modes.csv"', '"modes.csv"\nfrequency_error = 1e-6'))
+    with pytest.raises(CaseError, match=r"modes\.csv: the samples do not settle the plant"):
+        problem_of(load_case(path))
+    problem = problem_of(load_case(path), at_a_sample=True)
+    with pytest.raises(PlantError, match="the samples do not settle"):
+        mechanics(plant_of(problem), problem.start + np.array([1e-3, 0.0]))
 
 
 def test_samples_belong_to_the_content_of_the_table_not_to_its_place(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.lti.hold import tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.synthesis.classical_margins import classical_margins
 
 HZ = 2.0 * np.pi
 
@@ -169,3 +170,32 @@ def test_a_loop_that_rings_near_its_bandwidth_is_told(sampling: Sampling | None)
     assert found(0.03 + lag, 0.45 * w) is None
     assert found(0.03 + lag, 2.2 * w) is None
     assert found(0.06 + lag, w) is None
+
+
+@given(st.floats(1.5, 3.0), st.floats(1.2, 3.0), st.floats(1.0, 4.0), st.booleans())
+def test_the_crossover_is_where_the_loop_falls_not_where_it_grazes(
+    decades: float, above: float, depth: float, rises: bool
+) -> None:
+    """A notch far below that takes |L| under 1, a resonance above that takes it over, and a plant
+    without integrator whose loop begins under 1."""
+
+    def smooth(w: np.ndarray) -> np.ndarray:
+        s = 1j * w
+        begin = (s / (s + 1e-3)) ** 3 if rises else 1.0
+        return np.asarray(begin / s / (0.1 * s + 1.0))
+
+    def response(w: np.ndarray) -> np.ndarray:
+        s = 1j * w
+        low, high = 10.0**-decades, 3.0 * above
+        width = 0.1 / depth * low  # at the notch |L| is 1/depth of what takes it to 1
+        notch = (s**2 + 2.0 * width * low * s + low**2) / (s**2 + 0.2 * low * s + low**2)
+        mode = 1.0 + 1.0 / ((s / high) ** 2 + 2e-3 * s / high + 1.0)
+        return np.asarray(smooth(w) * notch * mode / 2.0)
+
+    omega = np.geomspace(1e-6, 1e3, 20001)
+    found = classical_margins(response, omega).crossover
+    L = np.abs(response(omega))
+    falls = omega[1:][(L[:-1] > 1.0) & (L[1:] <= 1.0)]
+    alone = omega[np.flatnonzero(np.abs(smooth(omega)) > 1.0)[-1]]
+    assert len(falls) > 1, "the case has something to choose from"
+    assert found == pytest.approx(alone, rel=0.15)

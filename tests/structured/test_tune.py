@@ -2,20 +2,29 @@
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import control
 import numpy as np
 import pytest
+from helpers import few
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from scipy.io import savemat
 from scipy.signal import cont2discrete
 from test_measured import two_by_two
 
 import ccd_casadi as ccd
 from ccd_casadi import report
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.judgement import judge_lines
 from ccd_casadi.fixed_structure.line_problem import line_problem
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
+from ccd_casadi.studies import tuning
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
 from ccd_casadi.tune import main
 from surrogates.lazy_names import from_stub
 
@@ -68,6 +77,69 @@ def test_every_form_of_a_plant_is_the_same_plant(tmp_path: Path) -> None:
     found.append(ccd.tune(tmp_path / "plant.mat", rate_hz=10.0, starts=4).design)
     assert all(design.usable for design in found)
     np.testing.assert_allclose([d.bandwidth / found[0].bandwidth for d in found], 1.0, rtol=1e-2)
+
+
+@pytest.mark.parametrize("wrong", ["sampled", "realised"])
+def test_what_a_search_gets_wrong_the_judge_refutes(
+    monkeypatch: pytest.MonkeyPatch, wrong: str
+) -> None:
+    """A plant with a third of its gain, and code with a third of the controller's."""
+    right = getattr(tuning, wrong)
+
+    def third(system: StateSpace, *others: float) -> object:
+        return right(replace(system, C=system.C / 3.0, D=system.D / 3.0), *others)
+
+    monkeypatch.setattr(tuning, wrong, third)
+    found = ccd.tune(1.0 / (s**2 * (s + 10.0)), rate_hz=200.0, starts=4)
+    assert found.judge.passed is False
+    assert not found.design.usable
+    assert "does not confirm it" in found.design.words
+
+
+def test_a_judge_without_an_answer_has_not_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*of: object, **others: object) -> None:
+        raise np.linalg.LinAlgError("no eigenvalues")
+
+    monkeypatch.setattr(tuning.judgement, "judge_loops", fails)
+    found = ccd.tune(LAGS, rate_hz=20.0, starts=2)
+    assert found.judge.passed is None
+    assert not found.design.usable
+
+
+@few(max_examples=25)
+@given(st.integers(0, 10**6), st.floats(0.05, 20.0), st.integers(0, 2), st.booleans())
+def test_lines_are_judged_as_the_poles_of_the_loop_are(
+    seed: int, harder: float, integrators: int, unstable: bool
+) -> None:
+    """A plant of two channels under PI control: stability, the peak on the lines, the bandwidth."""
+    rng = np.random.default_rng(seed)
+    lag = control.tf([1.0], [0.1, 1.0]) if not unstable else control.tf([1.0], [0.5, -1.0])
+    free = control.tf([1.0], [1.0, 0.0]) ** integrators
+    mode = control.tf([1.0], [1e-2, 0.02 * rng.uniform(0.5, 5.0), 1.0])
+    one = control.ss(lag * free * mode)
+    mix = np.eye(2) + 0.3 * rng.standard_normal((2, 2))
+    G = control.append(one, one) * mix
+    pid = control.ss(harder * control.tf([1.0, 0.2], [1.0, 0.0]))
+    if integrators:
+        pid = pid * control.tf([2.0, 1.0], [0.02, 1.0]) ** integrators
+    K = control.append(pid, pid) * np.linalg.inv(mix)
+    loop = control.feedback(control.ss([], [], [], np.eye(2)), G * K)
+    poles = loop.poles()
+    assume(np.abs(poles.real / np.abs(poles)).min() > 1e-3)
+    hz = np.geomspace(1e-3, 1e3, 4000) / HZ
+    matrix = np.moveaxis(G(2j * np.pi * hz), -1, 0)
+    lines = MeasuredResponse(hz, matrix, 2 * unstable, integrators)
+    S = np.linalg.norm(np.moveaxis(loop(2j * np.pi * hz), -1, 0), 2, axis=(1, 2))
+    crossing = HZ * hz[np.argmax(np.sqrt(0.5) < S)] * 0.99
+    bounds = Bounds(1.001 * max(S.max(), 1.001), 2.0, HZ * hz[0])
+    system = StateSpace(K.A, K.B, K.C, K.D)
+    found = judge_lines(lines, system, bounds, 0.0, crossing, True)
+    stable = bool((poles.real < 0.0).all())
+    assert found.passed is stable, found.words
+    if stable:
+        assert not judge_lines(lines, system, bounds, 0.0, 1.1 * crossing, True).passed
+        less = replace(bounds, S_max=1.0 + 0.99 * (bounds.S_max / 1.001 - 1.0))
+        assert not judge_lines(lines, system, less, 0.0, crossing, True).passed
 
 
 def test_effort_bounds_the_controller_and_costs_bandwidth() -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ccd_casadi.plants.imported.entries import fit_entries
 from ccd_casadi.plants.imported.frames import Frame, frames
@@ -20,26 +21,41 @@ from ccd_casadi.plants.plant import Mechanics, named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
+SAME = 1e-6  # of the range: no distance to a sample
+Errors = tuple[float, float]  # of a sample left out: frequency, response
+ANY: Errors = (np.inf, np.inf)
 DAMPED = 0.1  # responses are compared at s = (0.1 + j) ω: resonances that move do not drown it
 FREQUENCIES = 120
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Worst errors over the rows, each predicted without it (relative)."""
+    """Errors of N samples, each predicted without it (relative): of the frequencies of its flexible
+    modes (N, r), and of its response (N,)."""
 
-    frequency: float
-    response: float
+    frequencies: Array
+    responses: Array
+
+    @property
+    def frequency(self) -> float:
+        """The largest."""
+        return float(self.frequencies.max(initial=0.0))
+
+    @property
+    def response(self) -> float:
+        """The largest."""
+        return float(self.responses.max())
 
 
 class InterpolatedModes:
     """θ -> Mechanics (M = I) between the samples of a modal table; `left_out` is its error.
 
-    Frequencies below `rigid_below` (rad/s) are rigid-body modes. Raises PlantError where samples
-    differ in their number of these, or are too few.
+    Frequencies below `rigid_below` (rad/s) are rigid-body modes. `refusal` says which sample is
+    missed by more than is `accepted`: then no plant is known but those of the samples. Raises
+    PlantError where samples differ in their number of rigid-body modes, or are too few.
     """
 
-    def __init__(self, table: ModalTable, rigid_below: float) -> None:
+    def __init__(self, table: ModalTable, rigid_below: float, accepted: Errors = ANY) -> None:
         counts = (table.omega < rigid_below).sum(axis=1)
         if np.ptp(counts) > 0:
             s = int(counts.argmin())
@@ -55,9 +71,14 @@ class InterpolatedModes:
         theta = ca.MX.sym("theta", len(table.names))
         y = entries(theta)
         self._entries = ca.Function("entries", [theta], [y, ca.jacobian(y, theta)])
+        self.refusal = self._refused(*accepted)
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         """M, D, K, B, C and their derivatives at θ."""
+        index, distance = self.nearest(theta)
+        if self.refusal and distance > SAME:
+            known = named_values(self.table.names, self.table.theta[index])
+            raise PlantError(f"{self.refusal}; at a sample, such as {known}, the plant is known")
         y, slopes = (np.array(value) for value in self._entries(np.asarray(theta, float)))
         L, log_D, B, C = self._matrices(y.T, self.frame)
         dL, dlog_D, dB, dC = self._matrices(slopes.T, self.frame)
@@ -75,6 +96,40 @@ class InterpolatedModes:
         width = np.where(high > low, high - low, 1.0)
         distance = np.abs((self.table.theta - np.asarray(theta)) / width).max(axis=1)
         return int(distance.argmin()), float(distance.min())
+
+    def _refused(self, frequency: float, response: float) -> str:
+        """The sample that is missed by most, over what is accepted, in words; else nothing."""
+        table, errors = self.table, self.left_out
+        worst = errors.frequencies.max(axis=1, initial=0.0) / frequency
+        worst = np.maximum(worst, errors.responses / response)
+        s = int(worst.argmax())
+        if not worst[s] > 1.0:
+            return ""
+        place, more = (named_values(table.names, at) for at in (table.theta[s], self._between(s)))
+        words = f"{100.0 * errors.responses[s]:.2g} % off in its response"
+        if errors.frequencies.size:
+            i = int(errors.frequencies[s].argmax())
+            hz = table.omega[s, self.rigid + i] / (2.0 * np.pi)
+            words += f" and {100.0 * errors.frequencies[s, i]:.2g} % in the frequency of mode "
+            words += f"{self.rigid + i + 1} ({hz:.4g} Hz)"
+        missed = (errors.frequencies > frequency).any(axis=0)
+        few = f"the {self.rigid + int(missed.argmax())} lowest" if missed.any() else "fewer"
+        return (
+            f"the samples do not settle the plant between them: {place}, left out, is predicted "
+            f"{words}, where {100.0 * response:.2g} % and {100.0 * frequency:.2g}"
+            f" % are accepted; add a sample at {more}, or keep {few} modes"
+        )
+
+    def _between(self, s: int) -> Array:
+        """Half way from a sample to that of its neighbours that is predicted worst, no other sample
+        being as near to the middle as these two."""
+        theta, errors = self.table.theta, self.left_out.responses
+        unit = theta / np.ptp(theta, axis=0)
+        middle = 0.5 * (unit + unit[s])
+        half = np.linalg.norm(middle - unit[s], axis=1)
+        beside = cdist(middle, unit).min(axis=1) >= (1.0 - SAME) * half
+        beside[s] = False
+        return np.asarray(0.5 * (theta[s] + theta[np.where(beside, errors, -np.inf).argmax()]))
 
     def _fitted(self, frame: Frame) -> tuple[Frame, ca.Function, LeftOut]:
         """θ -> entries in the frame: ln K, ln D where it is not modal, B and C; and their error."""
@@ -127,13 +182,13 @@ class InterpolatedModes:
 
     def _left_out(self, Y: Array, predicted: Array, frame: Frame) -> LeftOut:
         omega = np.exp(0.5 * np.linalg.eigvalsh(self._matrices(predicted, frame)[0]))
-        moved = np.abs(omega / self.table.omega[:, self.rigid :] - 1.0).max(initial=0.0)
+        moved = np.abs(omega / self.table.omega[:, self.rigid :] - 1.0)
         missed = []
         for pair in zip(Y, predicted, strict=True):
             one, other = (self._response(y[None], frame) for y in pair)
             sizes = np.linalg.norm(one, axis=(1, 2))
             missed.append((np.linalg.norm(other - one, axis=(1, 2)) / sizes).max())
-        return LeftOut(float(moved), float(max(missed)))
+        return LeftOut(moved, np.array(missed))
 
     def _response(self, y: Array, frame: Frame) -> np.ndarray:
         """G at s = (0.1 + j) ω over the band of the modes, undamped."""

@@ -9,41 +9,46 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.plants.imported.entries import fit_entries
-from ccd_casadi.plants.imported.interpolation import InterpolatedModes, row_of
+from ccd_casadi.plants.imported.interpolation import SAME, Errors, InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
 from ccd_casadi.plants.plant import Plant, named_values
 from ccd_casadi.support.errors import PlantError
 
+# A mode 5 % off moves a response at 10 % of damping by half.
+FREQUENCY_ERROR, RESPONSE_ERROR = 0.05, 0.5  # of a sample left out
+ACCEPTED = (FREQUENCY_ERROR, RESPONSE_ERROR)
 NEAREST = "the nearest sample as it stands"
 
-SAME = 1e-6  # of the range: no distance to a sample
 
-
-def modal_table(names: Sequence[str], table: str = "", rigid_below_hz: float = 0.1) -> Plant:
+def modal_table(
+    names: Sequence[str], table: str = "", rigid_below_hz: float = 0.1,
+    frequency_error: float = FREQUENCY_ERROR, response_error: float = RESPONSE_ERROR,
+) -> Plant:  # fmt: skip
     """The plant interpolated between the modal models of a CSV file (see `modal_table`)."""
     if not table:
         raise PlantError('modal_table needs table = "modes.csv", relative to the case file')
-    return plant_of_table(read_modal_table(Path(table)), names, rigid_below_hz, Path(table).name)
+    accepted, file = (frequency_error, response_error), Path(table)
+    return plant_of_table(read_modal_table(file), names, rigid_below_hz, file.name, accepted)
 
 
 def sampled_matrices(
-    names: Sequence[str],
-    folder: str = "",
-    modes: int = 10,
-    static_correction: bool = False,
-    rigid_below_hz: float = 0.1,
-) -> Plant:
+    names: Sequence[str], folder: str = "", modes: int = 10, static_correction: bool = False,
+    rigid_below_hz: float = 0.1, frequency_error: float = FREQUENCY_ERROR,
+    response_error: float = RESPONSE_ERROR,
+) -> Plant:  # fmt: skip
     """The plant interpolated between M and K given as files (see `matrices`), reduced to modes."""
     if not folder:
         raise PlantError('sampled_matrices needs folder = "fe", relative to the case file')
     table = reduced_table(Path(folder), modes, static_correction)
-    return plant_of_table(table, names, rigid_below_hz, Path(folder).name)
+    accepted = (frequency_error, response_error)
+    return plant_of_table(table, names, rigid_below_hz, Path(folder).name, accepted)
 
 
 def plant_of_table(
-    table: ModalTable, names: Sequence[str], rigid_below_hz: float, source: str
-) -> Plant:
+    table: ModalTable, names: Sequence[str], rigid_below_hz: float, source: str,
+    accepted: Errors = ACCEPTED,
+) -> Plant:  # fmt: skip
     """Any modal table as the plant that the design loop asks for.
 
     Raises PlantError where the table's parameters are not those of the case.
@@ -61,12 +66,13 @@ def plant_of_table(
     numbers, between = np.column_stack([table.cost, table.constraints]), dict[str, Any]()
     if names:
         try:
-            modes = InterpolatedModes(table, rigid_below)
+            modes = InterpolatedModes(table, rigid_below, accepted)
         except PlantError as error:
             raise PlantError(f"{source}: {error}") from error
         scalars = fit_entries(table.theta, numbers)[0](theta)
         between = {
             "evaluate": modes,
+            "unknown_between": modes.refusal and f"{source}: {modes.refusal}",
             "references": {NEAREST: lambda at: row_of(table, modes.rigid, modes.nearest(at)[0])},
             "notes": lambda at: _notes(modes, source, at),
             "domain": (table.theta.min(axis=0), table.theta.max(axis=0)),

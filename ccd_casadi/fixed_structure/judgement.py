@@ -1,0 +1,147 @@
+"""The final judgement of a controller on plants as they were written, or on lines as measured.
+
+What is judged is what runs: the coefficients of the difference equation, in z. Models are closed
+with it behind their own hold and delay (`certificate`); on measured lines S is taken from G as the
+file has it, and stability from the winding of det(I + GK),
+
+    Z = P + q/2 - Δ/π
+
+with P unstable poles of G, q poles of GK at 0, and Δ the growth of its angle from 0 on. Nothing
+that a search has made of the plant takes part. What cannot be judged is unknown: it has not passed.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.certificate import TOLERANCE, SetCertificate, as_run, certify, holds
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.measured import MeasuredResponse
+from ccd_casadi.support.errors import UserError, described
+from ccd_casadi.support.units import HZ, counted
+
+ENGINE = "NumPy, on the matrices as the plant function returned them, free bodies free"
+AS_GIVEN = "NumPy, on the plants as they were given, with the coefficients of the code"
+SLOWER = 2e-3  # relative: what a claimed bandwidth may be above the judge's
+LOWEST, LINES = 1e-6, 600  # of half the rate, and frequencies, at which they are compared
+BELOW, PER_DECADE = 4.0, 40  # decades below the first line, where G is (jω)^-n, and points in each
+UNCLEAR = 0.9 * np.pi  # an angle that turns further between two lines may as well turn back
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What was found on so many `plants`: the largest figures over their bounds, by name.
+
+    `passed` is None where it could not be judged.
+    """
+
+    plants: int
+    figures: Mapping[str, float]
+    passed: bool | None
+    words: str
+    engine: str = field(default=ENGINE, kw_only=True)
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Of result.json."""
+        return {**vars(self)}
+
+
+def judgement_of(certificate: SetCertificate, plants: int) -> Judgement:
+    """Of a certificate on plants as they were written."""
+    return Judgement(plants, certificate.worst, certificate.passed, certificate.words)
+
+
+def attempted(judge: Callable[..., Judgement], *of: Any) -> Judgement:
+    """What a judge finds; unknown where it finds no answer."""
+    try:
+        return judge(*of)
+    except (UserError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return Judgement(0, {}, None, f"the judge has no answer: {described(error)}")
+
+
+def judge_loops(
+    plants: Sequence[StateSpace], controller: StateSpace, coded: StateSpace, bounds: Bounds,
+    sampling: Sampling, bandwidth: float, integrator: bool, on_all: bool = True,
+) -> Judgement:  # fmt: skip
+    """A difference equation (e in, u out) on plants, continuous or in discrete time at its rate.
+
+    What is `coded` has to be the controller, and hold every plant; figures are the controller's:
+    poles that nearly coincide cost a level test its digits in the form that is coded. `bandwidth`:
+    the one claimed, rad/s, on each plant or, not `on_all`, on the first alone.
+    """
+    omega = np.geomspace(LOWEST, 0.999, LINES) * np.pi / sampling.period
+    K, own_K = coded.response(omega), as_run(controller, sampling).response(omega)
+    off = float((np.linalg.norm(K - own_K, 2, (1, 2)) / np.linalg.norm(own_K, 2, (1, 2))).max())
+    if not off <= TOLERANCE:
+        words = f"the coefficients of the code are off the controller by {100.0 * off:.2g} %"
+        return Judgement(len(plants), {"code": off / TOLERANCE}, False, words, engine=AS_GIVEN)
+    found = certify(plants, controller, bounds, sampling, integrator=integrator)
+    if not (found.worst and all(holds(plant, coded, sampling) for plant in plants)):
+        words = "unstable with the coefficients of the code" if found.worst else found.words
+        return Judgement(len(plants), {}, False, words, engine=AS_GIVEN)
+    own = found.bandwidth if on_all else found.plants[0].bandwidth
+    figures = found.worst | {"bandwidth": bandwidth / own if own > 0.0 else np.inf}
+    slow = not own >= bandwidth * (1.0 - SLOWER)
+    words = f"the bandwidth is {own / HZ:.6g} Hz, not {bandwidth / HZ:.6g} Hz"
+    words = words if slow and found.passed else found.words
+    return Judgement(len(plants), figures, found.passed and not slow, words, engine=AS_GIVEN)
+
+
+def judge_lines(
+    measured: MeasuredResponse, controller: StateSpace, bounds: Bounds, delay: float,
+    bandwidth: float, integrator: bool,
+) -> Judgement:  # fmt: skip
+    """A controller, continuous or a difference equation, on a response as its file has it.
+
+    `delay`: in s, besides that in the response; `integrator`: of K, in each channel.
+    """
+    hz, n = measured.hz, measured.slope
+    if controller.period:
+        hz = hz[hz < 0.5 / controller.period]
+    G, p = measured.matrix[: len(hz)], len(measured.matrix[0])
+    below = np.geomspace(10.0**-BELOW, 1.0, int(BELOW * PER_DECADE), endpoint=False)
+    asymptote = measured.static * ((-1j / below) ** n)[:, None, None]
+    omega = HZ * np.concatenate([below * hz[0], hz])
+    lag = np.exp(-1j * omega * delay)[:, None, None]
+    L = np.concatenate([asymptote, G]) @ controller.response(omega) * lag
+    F = np.linalg.det(np.eye(p) + L)
+    q = (n + int(integrator)) * p
+    half = -0.5 * np.pi * q  # the angle of F at 0, but for half turns
+    first = half + np.pi * np.round((np.angle(F[0]) - half) / np.pi)
+    turns = np.append(np.angle(F[1:] / F[:-1]), -np.angle(F[-1]))
+    if np.abs(turns).max() > UNCLEAR or abs(np.angle(F[0]) - first) > UNCLEAR - 0.5 * np.pi:
+        words = "the angle of det(I + GK) turns too fast from line to line to be followed"
+        return Judgement(1, {}, None, words, engine=AS_GIVEN)
+    grown = np.angle(F[0]) - first + turns.sum()
+    unstable = round(measured.unstable_poles + 0.5 * q - grown / np.pi)
+    if unstable:
+        words = f"unstable: {unstable} poles in the right half plane"
+        return Judgement(1, {}, False, words, engine=AS_GIVEN)
+    S = np.linalg.norm(np.linalg.inv(np.eye(p) + L[len(below) :]), 2, axis=(1, 2))
+    x = np.maximum(HZ * hz, 0.0 if integrator else bounds.omega_low) / bandwidth * (1.0 + SLOWER)
+    room = np.where(x <= 1.0, 1.0 / x, np.inf) if bounds.shape is None else bounds.room(x)
+    shares = S / np.minimum(np.sqrt(0.5) * x * room, bounds.S_max)
+    figures = {"S_max": float(S.max()) / bounds.S_max, "bandwidth": float(shares.max())}
+    broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in figures.items()
+              if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
+    words = f"stable and within every bound on {counted(len(hz), 'line')}"
+    if broken:
+        words = f"exceeds its bound on {', '.join(broken)}"
+    return Judgement(1, figures, not broken, words, engine=AS_GIVEN)
+
+
+def together(each: Sequence[Judgement]) -> Judgement:
+    """Of one controller on several plants: passed where it is on all, unknown where on one."""
+    if len(each) == 1:
+        return each[0]
+    names = dict.fromkeys(name for one in each for name in one.figures)
+    worst = {name: float(np.max([one.figures.get(name, 0.0) for one in each])) for name in names}
+    first = next((one for one in each if not one.passed), each[0])
+    words = f"of {len(each)} plants: {first.words}"
+    passed = False if any(one.passed is False for one in each) else first.passed
+    return Judgement(sum(one.plants for one in each), worst, passed, words, engine=AS_GIVEN)
