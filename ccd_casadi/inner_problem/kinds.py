@@ -70,6 +70,10 @@ class InnerKind(ABC):
         """The plants on which the controller's figures count, the model first."""
         return [scaled_plant(self.problem, theta)]
 
+    def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        """Those that margins and steps are of: with the plants of a robust set."""
+        return self.plants(theta)
+
     def bounds(self) -> Bounds:
         """The bounds on every plant, SI."""
         inner = self.problem.inner
@@ -109,6 +113,9 @@ class MixedSensitivity(InnerKind):
 
     def require_function(self) -> None:
         """It always is."""
+
+    def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        return list(scaled_plant(self.problem, theta).members)
 
     def common_shifts(self) -> tuple[float, float]:
         shift = 0.0 if self.problem.robust is None else self.problem.robust.shift

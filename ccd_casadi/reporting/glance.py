@@ -24,7 +24,7 @@ def glance(
     """Of a design on the plants that it is made for."""
     assert isinstance(move.drawing, Lines)
     S_max = problem.inner.S_max
-    names = ("the model", "other plants") if view.scalar else ("an eigenvalue of L", "the others")
+    names = ("the model", "plant 2 (and the others)") if view.scalar else ("an eigenvalue of L", "the others")
     rows: tuple[tuple[Place, ...], ...] = (
         (machine(problem, theta), S_panel(view)),
         (
@@ -44,7 +44,7 @@ def loci(view: LoopView) -> list[np.ndarray]:
     if not view.scalar:
         return list(loci_of(view.open[0]).T)
     L = view.open[:, :, 0, 0]
-    return list(np.where(np.abs(L) <= FAR, L, np.nan))
+    return list(np.where(np.abs(L) <= FAR, L, complex(np.nan, np.nan)))
 
 
 def machine(problem: CoDesignProblem, theta: Sequence[float]) -> Modes | Picture | Table:

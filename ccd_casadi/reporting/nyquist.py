@@ -72,4 +72,4 @@ def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:
         for i in range(1, len(values)):
             away = np.abs(values[i - 1][:, None] - values[i][None, :])
             values[i] = values[i][scipy.optimize.linear_sum_assignment(away)[1]]
-    return np.where(np.abs(values) <= far, values, np.nan)
+    return np.where(np.abs(values) <= far, values, complex(np.nan, np.nan))

@@ -5,10 +5,12 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from ccd_casadi.analysis.loop_figures import PERIODS
 from ccd_casadi.codesign.verdict import OwnSet, State
 from ccd_casadi.drawing.content import Head, VerdictLine
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.support.terminal import columns, wrapped
+from ccd_casadi.support.units import with_unit
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 NEXT = {  # what to do about a line that failed
@@ -147,8 +149,12 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
         if overshoot > OVERSHOOT:
             usual = f"usual: at most {100.0 * OVERSHOOT:g}"
             found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
-        if result["settling_ms"] is None:
-            found.append("a step does not settle within 160 periods of the bandwidth")
+        settled = result["settling_ms"]
+        if settled is None:
+            found.append("a step does not settle within 2 %")
+        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > PERIODS:
+            late = f"only after {with_unit(1e-3 * settled, 's')}"
+            found.append(f"a step settles {late}, {PERIODS:g} periods of the bandwidth or more")
     reach = result.get("sensitivity_peak_between_lines")  # of a measured response
     if reach is not None and reach > BETWEEN * result["sensitivity_peak"]:
         where = result.get("sensitivity_peak_between_lines_hz")
