@@ -48,6 +48,7 @@ class OwnSet(StrEnum):
     KEPT = "kept"
     BROKEN = "broken"
     UNPROVEN = "unproven"  # kept on all plants that were tried; the proof left bounds open
+    SEARCHED = "searched"  # kept on all plants that were tried; no proof applies to all its bounds
     NONE = "none"  # the case names no plant but the model
 
 
@@ -257,6 +258,8 @@ def survives(
             said.append(f"peak of S {peak:.3g} on {name}")
     failed = failed or bool(survival.contradiction)
     state = State.FAILED if failed else State.WARNED if warned else State.PASSED
+    if own is OwnSet.SEARCHED and state is State.PASSED:
+        state = State.UNKNOWN
     rest = survival.statics
     if rest.differentiates:
         said.append(

@@ -11,6 +11,7 @@ from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.judgement import Judgement, judgement_of
 from ccd_casadi.codesign.structured_entries import (
     active_of,
+    bound_words,
     design_dict,
     kept_words,
     proof_dict,
@@ -20,7 +21,7 @@ from ccd_casadi.codesign.structured_entries import (
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
 from ccd_casadi.fixed_structure.design import TWICE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
@@ -100,7 +101,8 @@ class VerifiedStructured(Verified):
         """Whether the whole set is: by the judge, proof, draws, and along its common shift."""
         found, ends = self.survival, kind_of(self.problem).common_shifts()
         along = found is None or found.within(*ends)
-        return self.wide.passed and not self.proof.refuted and self.all_drawn and along
+        denied = self.proof.refuted or self.proof.outcome is ProofOutcome.UNSTABLE
+        return self.wide.passed and not denied and self.all_drawn and along
 
     @property
     def all_drawn(self) -> bool:
@@ -181,8 +183,14 @@ class VerifiedStructured(Verified):
             words = "certified, but a constraint on theta is not met"
             return VerdictLine(State.FAILED, words, figures)
         count = 0 if judged is None else len(judged.plants)
+        untested = () if judged is None else judged.grid_only
+        most, levels = 1.0 + self.proof.slack, self.proof.levels
+        on_grid = bound_words(name for name in untested if not levels.get(name, math.inf) <= most)
         where = "the model" if count == 1 else f"the {count} plants"
         words = f"stable and within every bound on {where} that it was designed on"
+        if on_grid:  # a check that does not exist for a sampled loop is not passed
+            words += f"; {', '.join(on_grid)} on a grid of frequencies alone"
+            return VerdictLine(State.WARNED, words, {**figures, "on_grid_alone": on_grid})
         return VerdictLine(State.PASSED, words, figures)
 
     def own_set(self) -> dict[str, Any]:
@@ -200,13 +208,14 @@ class VerifiedStructured(Verified):
         own = OwnSet.KEPT if self.set_is_met else OwnSet.BROKEN
         if not self.wide.passed:
             words = f"on {where}: {self.wide.words}"
-        elif proof.refuted:
+        elif proof.refuted or proof.outcome is ProofOutcome.UNSTABLE:
             words = f"{kept} on {where}, but {proof.words}"
         elif self.checked <= 1:
             own, words = OwnSet.NONE, "[robust] names no plant but the model"
         elif not self.all_drawn:
             words = f"{kept} on {where}, but of the whole box {drawn}"
         elif self.set_is_met:
+            own = OwnSet.SEARCHED if proof.unasked else own
             own = OwnSet.UNPROVEN if proof.unclosed else own
             words = "; ".join(part for part in (words, drawn, proof.words) if part)
         else:

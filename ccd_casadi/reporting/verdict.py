@@ -54,6 +54,15 @@ def worst_state(result: Mapping[str, Any]) -> State:
     return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
 
 
+def unproven(result: Mapping[str, Any]) -> str | None:
+    """Why `survives` is neither passed nor warned; None where it is one of them."""
+    line = next((line for line in lines_of(result) if line.name == "survives"), None)
+    if line is None or line.state != State.UNKNOWN:
+        return None
+    own = result["verdict"]["survives"].get("set")
+    return "searched, not proven" if own == OwnSet.SEARCHED else "not known"
+
+
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """`survives      warned   stable for ...`, wrapped under their words."""
     lines = [f"{line.name:14s}{line.state:9s}{line.words}" for line in lines_of(result)]
@@ -69,6 +78,7 @@ def head_of(
     `decision`: what the page answers, where that is not whether to build the design.
     """
     clean = worst_state(result) is State.PASSED and not loop_concerns(result)
+    clean &= unproven(result) is None
     badge = "bad" if not good else "good" if clean else "warn"
     decision = decision or advice(result)
     return Head(title, badge, status, reason, meta, lead, lines_of(result), decision)
@@ -123,6 +133,10 @@ def advice(result: Mapping[str, Any]) -> str:
             words = "Do not build this yet: it was judged on the model alone."
         return f"{words} Next: {NEXT['survives']}."
     warned = [f"{name} warned" for name, state in states.items() if state == State.WARNED]
+    if states.get("survives") == State.UNKNOWN:
+        if unproven(result) == "not known":
+            return f"Do not build this yet: what it survives is not known. Next: {NEXT['survives']}."
+        warned.append(f"the [robust] set is {unproven(result)}")
     unjudged = states.get("deployable") == State.UNKNOWN
     if warned or looked_at:
         words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
@@ -171,6 +185,8 @@ def head_words(result: Mapping[str, Any]) -> str:
     )
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
+    if not warned and unproven(result) is not None:
+        return f"all that could be checked passed; survives: {unproven(result)}"
     if not warned:
         return "all checks passed" + ("; the loop needs a look" if loop_concerns(result) else "")
     return f"with warnings: {', '.join(warned)}"

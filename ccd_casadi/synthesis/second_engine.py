@@ -16,7 +16,7 @@ import slycot
 
 from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
 from ccd_casadi.lti.hold import Sampling, in_w, sampled, tustin
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
 from ccd_casadi.support.errors import described
 from ccd_casadi.support.units import counted
 from ccd_casadi.synthesis.weights import Weights
@@ -29,7 +29,8 @@ ACCURACY = 1e-9  # relative, of SLICOT's norm
 class SecondOpinion:
     """What SLICOT finds of one loop.
 
-    `norms` by name: "S", ‖S‖∞, and with weights "weighted loop"; infinite where the loop is
+    `norms` by name: "S", ‖S‖∞, "KS", "T", of a continuous loop "GS", and with weights "weighted
+    loop"; infinite where the loop is
     not stable, NaN where SLICOT has no answer: `reason` says why. `max_real_pole` in 1/s (sampled:
     ln of the spectral radius over the period).
     """
@@ -92,7 +93,10 @@ def second_opinion(
             rate = float(np.log(max(float(np.abs(poles).max()), 1e-300))) / loop.period
         if not rate < 0.0:
             return SecondOpinion(False, rate, {"S": inf})
-        norms = {"S": _norm(loop.S)}
+        parts = {"S": loop.S, "KS": loop.KS, "T": loop.T}
+        if not loop.period:  # sampled it is a product of functions of z and of s
+            parts["GS"] = loop.GS
+        norms = {name: _norm(part) for name, part in parts.items()}
         if weights is not None and not loop.period:
             norms["weighted loop"] = _norm(weighted_loop(loop, weights))
     except (slycot.exceptions.SlycotError, np.linalg.LinAlgError, ValueError) as error:
@@ -108,22 +112,12 @@ def weighted_loop(loop: ClosedLoop, weights: Weights) -> StateSpace:
     w, p, m = weights, len(loop.C_y), len(loop.C_u)
     outputs = [(-loop.C_y, np.eye(p)), (loop.C_u, loop.D_u), (loop.C_y, np.zeros((p, p)))]
     if w.disturbance:
-        outputs[2] = loop.C_u / w.M_K, loop.D_u / w.M_K
+        outputs[2] = loop.C_u / w.disturbance, loop.D_u / w.disturbance
     B, C, D = loop.B_r, np.vstack([C for C, _ in outputs]), np.vstack([D for _, D in outputs])
     if w.disturbance:
         B, D = np.hstack([B, w.disturbance * loop.B_d]), np.hstack([D, np.zeros((len(D), m))])
-    filters = [  # pole, feedthrough and zero of each, s + zero over s + pole times feedthrough
-        *[(w.omega_S * w.A_S, 1.0 / w.M_S, w.omega_S * w.M_S)] * p,
-        *[(w.c_K * w.omega_K, w.c_K / w.M_K, w.omega_K)] * m,
-        *[(w.omega_T / w.A_u, 1.0 / w.A_u, w.omega_T / w.A_l)] * len(outputs[2][0]),
-    ]
-    pole, through, zero = (np.array(column) for column in zip(*filters, strict=True))
-    return StateSpace(
-        np.block([[loop.A, np.zeros((len(loop.A), len(C)))], [C, -np.diag(pole)]]),
-        np.vstack([B, D]),
-        np.hstack([through[:, None] * C, np.diag(through * (zero - pole))]),
-        through[:, None] * D,
-    )
+    rows = np.repeat(w.filters(), [p, m, len(outputs[2][0])], axis=0)
+    return weighted(StateSpace(loop.A, B, C, D), rows)
 
 
 def _norm(system: StateSpace) -> float:
