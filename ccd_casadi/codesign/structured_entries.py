@@ -1,12 +1,15 @@
 """A controller of fixed structure as values of result.json and controller.json."""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
+from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
@@ -181,3 +184,37 @@ def sections_controller(
     if sampling is not None:
         words["loop"] = vars(sampling) | {"method": "tustin"}
     return controller_dict(design.controller) | {"sections": words}
+
+
+def box_words(
+    wide: SetCertificate, checked: int, proof: Proof, worst: Excess, drawn: Yield | None,
+    *, along: bool,
+) -> dict[str, Any]:  # fmt: skip
+    """What `survives` takes of a loop on its box: the judge on so many plants, the proof, the worst
+    plant that was searched, random ones; `along`: whether its common shift is kept."""
+    excess, fresh = math.expm1(worst.value), "" if drawn is None else drawn.words
+    figures = {
+        "plants": checked,
+        "worst_excess": excess,
+        "proof": proof.outcome.name.lower(),
+        "proven": proof.levels,
+        "unproven": proof.unasked,
+    }
+    where = f"{counted(checked, 'plant')} of the box that [robust] names"
+    share, within = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(worst)
+    own, words = OwnSet.BROKEN, f"{within} on {where}, the worst that a search found at {share}"
+    if not wide.passed:
+        words = f"on {where}: {wide.words}"
+    elif proof.denies:
+        words = f"{within} on {where}, but {proof.words}"
+    elif checked <= 1:
+        own, words = OwnSet.NONE, "[robust] names no plant but the model"
+    elif drawn is not None and drawn.survived < drawn.draws:
+        words = f"{within} on {where}, but of the whole box {fresh}"
+    elif along:
+        own = OwnSet.SEARCHED if proof.unasked else OwnSet.KEPT
+        own = OwnSet.UNPROVEN if proof.unclosed else own
+        words = "; ".join(part for part in (words, fresh, proof.words) if part)
+    else:
+        words = f"{within} on {where}, but not all along its common resonance shift"
+    return {"own": own, "own_words": words, "figures": figures}

@@ -12,16 +12,16 @@ from ccd_casadi.codesign.judgement import Judgement, judgement_of
 from ccd_casadi.codesign.structured_entries import (
     active_of,
     bound_words,
+    box_words,
     design_dict,
-    kept_words,
     proof_dict,
     robust_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
+from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.design import TWICE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
 from ccd_casadi.inner_problem.figure import BANDWIDTH
@@ -38,7 +38,7 @@ from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.sampling.neighbours import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.units import HZ
 
 
 @dataclass(frozen=True)
@@ -99,10 +99,13 @@ class VerifiedStructured(Verified):
     @property
     def set_is_met(self) -> bool:
         """Whether the whole set is: by the judge, proof, draws, and along its common shift."""
-        found, ends = self.survival, kind_of(self.problem).common_shifts()
-        along = found is None or found.within(*ends)
-        denied = self.proof.refuted or self.proof.outcome is ProofOutcome.UNSTABLE
-        return self.wide.passed and not denied and self.all_drawn and along
+        return self.wide.passed and not self.proof.denies and self.all_drawn and self.along
+
+    @property
+    def along(self) -> bool:
+        """Whether it is met all along its common shift, as far as that is known."""
+        found = self.survival
+        return found is None or found.within(*kind_of(self.problem).common_shifts())
 
     @property
     def all_drawn(self) -> bool:
@@ -194,33 +197,8 @@ class VerifiedStructured(Verified):
         return VerdictLine(State.PASSED, words, figures)
 
     def own_set(self) -> dict[str, Any]:
-        excess, proof = math.expm1(self.worst.value), self.proof
-        drawn = "" if self.drawn is None else self.drawn.words
-        figures = {
-            "plants": self.checked,
-            "worst_excess": excess,
-            "proof": proof.outcome.name.lower(),
-            "proven": proof.levels,
-        }
-        where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
-        share, kept = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(self.worst)
-        words = f"{kept} on {where}, the worst that a search found at {share}"
-        own = OwnSet.KEPT if self.set_is_met else OwnSet.BROKEN
-        if not self.wide.passed:
-            words = f"on {where}: {self.wide.words}"
-        elif proof.refuted or proof.outcome is ProofOutcome.UNSTABLE:
-            words = f"{kept} on {where}, but {proof.words}"
-        elif self.checked <= 1:
-            own, words = OwnSet.NONE, "[robust] names no plant but the model"
-        elif not self.all_drawn:
-            words = f"{kept} on {where}, but of the whole box {drawn}"
-        elif self.set_is_met:
-            own = OwnSet.SEARCHED if proof.unasked else own
-            own = OwnSet.UNPROVEN if proof.unclosed else own
-            words = "; ".join(part for part in (words, drawn, proof.words) if part)
-        else:
-            words = f"{kept} on {where}, but not all along its common resonance shift"
-        return {"own": own, "own_words": words, "figures": figures}
+        return box_words(self.wide, self.checked, self.proof, self.worst, self.drawn,
+                         along=self.along)  # fmt: skip
 
     def gap_words(self) -> str:
         figure = self.problem.figure

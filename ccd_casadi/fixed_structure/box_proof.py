@@ -80,6 +80,11 @@ class Proof:
         return self.outcome is ProofOutcome.REFUTED
 
     @property
+    def denies(self) -> bool:
+        """Whether it contradicts that the box is kept: a plant of it, or the model's own loop."""
+        return self.refuted or self.outcome is ProofOutcome.UNSTABLE
+
+    @property
     def unasked(self) -> str:
         """Why nothing was proven that was not begun either: the proof does not apply, or is not of
         every bound; empty where it is complete in kind."""
@@ -103,6 +108,8 @@ class Proof:
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
             return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"
+        if self.outcome is ProofOutcome.UNSTABLE:
+            return f"the proof denies it: {self.outcome.value}"
         if not self.stable:
             return f"searched, not proven: {self.outcome.value}"
         left = f"; {self.unasked}" if self.channels else ""

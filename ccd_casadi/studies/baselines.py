@@ -16,18 +16,24 @@ import numpy as np
 from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.design_entries import figures_dict
-from ccd_casadi.codesign.structured_entries import active_of, design_dict
+from ccd_casadi.codesign.robust_check import survived
+from ccd_casadi.codesign.structured_entries import active_of, box_words, design_dict
+from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.verdict import OwnSet, VerdictLine, survives
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 
@@ -82,6 +88,12 @@ class Baseline(ABC):
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
         """Its controller, SI."""
 
+    @abstractmethod
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool | None = None
+    ) -> tuple[StateSpace, VerdictLine]:
+        """Its controller (SI), and what that survives: the line of the verdict of a run."""
+
 
 class MixedBaseline(Baseline):
     """The paper's own: a sweep of (ω_S, ω_T)."""
@@ -112,6 +124,17 @@ class MixedBaseline(Baseline):
         at = (design.figures.omega_S, design.figures.omega_T)
         return final_design(self.problem, theta, at).controller
 
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool | None = None
+    ) -> tuple[StateSpace, VerdictLine]:
+        K = self.controller(theta, design)
+        found, robust = survived(self.problem, loops_of(self.problem, theta, K), design.figures)
+        own: dict[str, Any] = {}
+        if robust is not None:
+            state = OwnSet.KEPT if robust.passed else OwnSet.BROKEN
+            own = {"own": state, "own_words": robust.words}
+        return K, survives(found, S_max=self.problem.inner.S_max, **own)
+
 
 class StructuredBaseline(Baseline):
     """Climbs from the warm starts; climbs and multi-start searches are what it spends."""
@@ -138,6 +161,18 @@ class StructuredBaseline(Baseline):
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
         assert design.controller is not None
         return design.controller
+
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool | None = None
+    ) -> tuple[StateSpace, VerdictLine]:
+        K, on_box = self.controller(theta, design), DesignOnBox(self.problem, theta, design)
+        worst = on_box.worst()[0]
+        wide, checked, proof = on_box.judged(worst, workers)
+        found = survived(self.problem, loops_of(self.problem, theta, K), design)[0]
+        drawn = None if proof.conclusive else on_box.fresh_yield(workers)
+        along = found is not None and found.within(*kind_of(self.problem).common_shifts())
+        own = box_words(wide, checked, proof, worst, drawn, along=along)
+        return K, survives(found, S_max=self.problem.inner.S_max, **own)
 
 
 def case_to_compare(path: Path, command: str) -> tuple[Case, CoDesignProblem]:

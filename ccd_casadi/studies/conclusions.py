@@ -3,6 +3,7 @@
 from typing import Any
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.reporting.verdict import advice
 from ccd_casadi.support.units import counted
 
 EQUAL = 1e-6  # relative difference of J that counts as none
@@ -41,7 +42,26 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     for i, name in enumerate(against):  # the best of them stands first: it is the answer
         answer[name], sentence = _sequential(solved[name], solved[cheapest], name)
         sentences.insert(len(sentences) if i else 0, sentence)
+    if words := decision(solved[cheapest]):
+        sentences[0] = f"{words} That is the best design, of {LABELS[cheapest]}. {sentences[0]}"
     return answer | {"sentences": sentences}
+
+
+def decision(figures: dict[str, Any]) -> str:
+    """Whether to build a design: by its verdict, of a baseline by what it survives alone, which
+    says at best what it needs."""
+    words = advice(figures)
+    complete = "certified" in figures.get("verdict", {})
+    return words if complete or words.startswith("Do not") else (
+        words and "Solve the case before you build this: a baseline has no verdict but that it "
+        "survives small errors."
+    )  # fmt: skip
+
+
+def stable_words(figures: dict[str, Any]) -> str:
+    """For resonances how far off a loop is stable, in %; what is not known is a dash."""
+    shift = figures.get("verdict", {}).get("survives", {}).get("stable_shift")
+    return "–" if not shift else f"{100.0 * shift[0]:+.2g} to {100.0 * shift[1]:+.2g} %"
 
 
 def _beside(figures: dict[str, Any]) -> str:
