@@ -36,6 +36,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.source_code import write_c
     from ccd_casadi.drawing.stored import write_page
     from ccd_casadi.fixed_structure import Structure
+    from ccd_casadi.inner_problem.kinds import FixedStructure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.hold import tustin
     from ccd_casadi.reporting.facts import loop_lines
@@ -75,7 +76,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             system, blocks = block_diagonal(tustin(K, case.period))
             realised = Realisation(replace(system, period=case.period), tuple(blocks))
             write_c(folder, realised, title=case.file, delay=options.delay,
-                    verified=found.design.usable)  # fmt: skip
+                    verified=found.design.usable, kind=FixedStructure.title)  # fmt: skip
         lines = [
             *(f"{'decision':14s}{words}" for words in (advice(result),) if words),
             f"{'bandwidth':14s}{result['bandwidth_hz']:.6g} Hz, |S| at most "

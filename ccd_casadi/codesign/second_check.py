@@ -22,8 +22,8 @@ from ccd_casadi.synthesis.synthesis import Design
 def second_on_weighted(
     problem: CoDesignProblem, theta: Sequence[float], design: Design
 ) -> Comparison:
-    """Of mixed sensitivity: the norm that γ was reached with and ‖GS‖∞ on the model, and the largest
-    ‖S‖∞ of its set."""
+    """Of mixed sensitivity: the norm that γ was reached with and ‖GS‖∞ on the model, and the
+    largest ‖S‖∞ of its set."""
     figures = design.figures
     opinions = [
         second_opinion(plant, design.controller, weights=weights)

@@ -11,7 +11,7 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.fixed_structure.bounds import BINDS, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
@@ -22,15 +22,6 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.structured_robustness import LOOSE
 from ccd_casadi.support.units import HZ, counted
 
-BINDS = {
-    "S_MAX": "S_max",
-    "SHAPE": "shape",
-    "LEVEL": "|S| below omega_b",
-    "S_LOW": "S_low",
-    "KS": "weighted_level of KS",
-    "T": "weighted_level of T",
-    "GS": "compliance_max",
-}
 WORST = 1.0 + TOLERANCE  # figure over bound up to which the judge counts a bound as met
 
 
@@ -105,12 +96,9 @@ def bound_words(names: Iterable[str]) -> list[str]:
     ['S_max of channel z', 'weighted_level of KS']
     """
     order = list(BINDS)
-    found = [kind_and_channel(name) for name in names]
-    bounds = [(order.index(kind), channel) for kind, channel in found if kind in BINDS]
-    return [
-        BINDS[order[kind]] + (f" of channel {channel}" if channel else "")
-        for kind, channel in sorted(bounds)
-    ]
+    found = [(kind_and_channel(name), name) for name in names]
+    bounds = [(order.index(kind), of, name) for (kind, of), name in found if kind in BINDS]
+    return [key_words(name) for *_, name in sorted(bounds)]
 
 
 def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.sampling.neighbours import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, counted
 
 
 @dataclass(frozen=True)

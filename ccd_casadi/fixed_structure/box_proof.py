@@ -39,7 +39,7 @@ class ProofOutcome(StrEnum):
     REFUTED = "a plant of the box exceeds a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has several outputs and not as many channels"
-    NOT_MODAL = "the plant is not modal: its damping matrix couples the modes, or brakes a free body"
+    NOT_MODAL = "the plant is not modal: its damping couples the modes, or brakes a free body"
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
 
 

@@ -24,6 +24,7 @@ from ccd_casadi.fixed_structure.bounds import (
     ChannelBounds,
     ChannelPeaks,
     LoopPeaks,
+    key_words,
     kind_and_channel,
 )
 from ccd_casadi.fixed_structure.certificate_curves import (
@@ -137,7 +138,7 @@ def certify(
         shares = bounds.shares(figures) | bounds.channel_shares(figures.channels)
         for name, ratio in shares.items():
             worst[name] = float(np.maximum(worst.get(name, 0.0), ratio))  # NaN stays NaN
-    broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
+    broken = [f"{key_words(name)} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
     if broken:
@@ -255,6 +256,7 @@ def _raised(
         if bounds.weights is not None:
             _, of_KS, of_T = bounds.weights.filters()
             systems["weighted KS"] = weighted(KS, np.tile(of_KS, (len(K.C), 1)))
+            of_T[1] *= bounds.weights.delta or 1.0
             systems["weighted T"] = weighted(T, np.tile(of_T, (p, 1)))
             for own in bounds.channels:
                 if own.M_K is not None:

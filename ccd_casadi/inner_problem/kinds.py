@@ -45,9 +45,10 @@ class InnerKind(ABC):
     and S_low.
 
     `slack`: relative, by how much its judge lets a bound be exceeded. `as_designed`: its
-    controllers run as they are, without being reduced.
+    controllers run as they are, without being reduced. `title`: of such a controller in code.
     """
 
+    title: str = "Controller"
     slack: float
     as_designed: bool
 
@@ -95,6 +96,7 @@ class InnerKind(ABC):
 class MixedSensitivity(InnerKind):
     """H∞ controllers by the weights W_S, W_KS and W_T, over their frequencies."""
 
+    title = "H-infinity controller"
     slack = 1e-6
     as_designed = False
 
@@ -140,6 +142,7 @@ class MixedSensitivity(InnerKind):
 class FixedStructure(InnerKind):
     """Gain, notches, leads and roll-off on a set of plants, sampled or continuous."""
 
+    title = "Controller of sections (integrator, lead, notches, roll-off)"
     slack = LOOSE
     as_designed = True
 

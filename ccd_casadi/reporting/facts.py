@@ -171,8 +171,8 @@ def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class HeldTheta:
-    """Where bounds and λ alone determine θ: their names, and df (n,) where each is loosened by 1 of
-    its multiplier's unit. What J falls by and what f changes by leave what its figure changes by."""
+    """Where bounds and λ alone determine θ: their names, and df (n,) where each is loosened by 1
+    of its multiplier's unit. What J falls by less that is what its figure changes by."""
 
     names: tuple[str, ...]
     cost: Array

@@ -103,7 +103,8 @@ def S_panel(view: LoopView) -> Panel:
     marks = tuple(_peak_marks(_high_peaks(view)[:1], BLACK, ", the model" * several))
     if several:
         _, i = np.unravel_index(view.sizes[0].argmax(), view.sizes[0].shape)
-        worst = _peak_marks([(float(view.hz[i]), float(view.sizes[0].max()))], GREEN, ", worst plant")
+        top = float(view.hz[i]), float(view.sizes[0].max())
+        worst = _peak_marks([top], GREEN, ", worst plant")
         marks = (*(replace(mark, offset=(0.0, -14.0)) for mark in marks), *worst)
     return _gain_panel([view], 0, view.bounded.asked, marks=marks)
 

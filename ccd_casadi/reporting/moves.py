@@ -104,7 +104,7 @@ def cycle_chapter(
 
 
 def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
-    """The position of every plant after a step of 1 N, of the actuator and output that move most."""
+    """The position of every plant after a step of 1 N, of the pair that moves most."""
     K, bandwidth = view.loop.controller, HZ * view.bandwidth_hz
     loops = [Loop(one.plant_si(), K, problem.sampling) for one in kind_of(problem).members(theta)]
     most, seconds = largest_force_step(loops, bandwidth), max(map(rest_time, loops))
@@ -197,7 +197,7 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     late = [m for m in made if np.isinf(m.settled)]
-    when = f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "stays within its window"
+    when = "stays within its window" if not settled else f"settled after {with_unit(settled, 's')}"
     if late:
         when = "does not settle" if any(m.rest > m.window for m in late) else (
             f"not settled within {with_unit(min(float(m.time[-1]) for m in late), 's')}"

@@ -135,7 +135,8 @@ def advice(result: Mapping[str, Any]) -> str:
     warned = [f"{name} warned" for name, state in states.items() if state == State.WARNED]
     if states.get("survives") == State.UNKNOWN:
         if unproven(result) == "not known":
-            return f"Do not build this yet: what it survives is not known. Next: {NEXT['survives']}."
+            words = "Do not build this yet: what it survives is not known."
+            return f"{words} Next: {NEXT['survives']}."
         warned.append(f"the [robust] set is {unproven(result)}")
     unjudged = states.get("deployable") == State.UNKNOWN
     if warned or looked_at:

@@ -112,7 +112,7 @@ def weighted_loop(loop: ClosedLoop, weights: Weights) -> StateSpace:
     w, p, m = weights, len(loop.C_y), len(loop.C_u)
     outputs = [(-loop.C_y, np.eye(p)), (loop.C_u, loop.D_u), (loop.C_y, np.zeros((p, p)))]
     if w.disturbance:
-        outputs[2] = loop.C_u / w.disturbance, loop.D_u / w.disturbance
+        outputs[2] = loop.C_u / w.M_K, loop.D_u / w.M_K
     B, C, D = loop.B_r, np.vstack([C for C, _ in outputs]), np.vstack([D for _, D in outputs])
     if w.disturbance:
         B, D = np.hstack([B, w.disturbance * loop.B_d]), np.hstack([D, np.zeros((len(D), m))])
@@ -121,7 +121,8 @@ def weighted_loop(loop: ClosedLoop, weights: Weights) -> StateSpace:
 
 
 def _norm(system: StateSpace) -> float:
-    """ab13dd of a stable system, over w where it is in discrete time.
+    """ab13dd of a stable system, over w where it is in discrete time, at a norm of about 1: its
+    search ended 3e-5 short at a norm of 128, and 8e-3 at one of 12,800.
 
     Balanced beforehand: ab13dd's own scaling left norms of loops of case study 1 7 % off in z, and
     none at all 45 % in w; balanced they agree to 1e-11.
@@ -131,9 +132,13 @@ def _norm(system: StateSpace) -> float:
     size = len(A), B.shape[1], len(C)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of its own accuracy
-        found = slycot.ab13dd("C", "I", "S", "D", *size, A, np.eye(len(A)), B, C, over.D,
-                              tol=ACCURACY)  # fmt: skip
-    return float(found[0])
+        norm = 1.0
+        for _ in range(2):
+            scaled = C / norm, over.D / norm
+            found = slycot.ab13dd("C", "I", "S", "D", *size, A, np.eye(len(A)), B, *scaled,
+                                  tol=ACCURACY)  # fmt: skip
+            norm *= float(found[0]) or 1.0
+    return norm if found[0] else 0.0
 
 
 @dataclass(frozen=True)

@@ -72,13 +72,12 @@ class Weights:
         )
 
     def filters(self) -> NDArray[np.float64]:
-        """Pole, feedthrough and zero (3, 3) of the weights of S, KS and T: each is feedthrough
-        times (s + zero)/(s + pole)."""
-        share = self.delta or 1.0
+        """Pole, feedthrough and zero (3, 3) of W1, W2 and W3: each is feedthrough times
+        (s + zero)/(s + pole)."""
         return np.array([
             (self.omega_S * self.A_S, 1.0 / self.M_S, self.omega_S * self.M_S),
             (self.c_K * self.omega_K, self.c_K / self.M_K, self.omega_K),
-            (self.omega_T / self.A_u, share / self.A_u, self.omega_T / self.A_l),
+            (self.omega_T / self.A_u, 1.0 / self.A_u, self.omega_T / self.A_l),
         ])  # fmt: skip
 
     def responses(self, omega: NDArray[np.float64]) -> NDArray[np.complex128]:

@@ -102,8 +102,8 @@ def test_a_force_step_is_followed_to_its_largest(soft_hz: float, sampling: Sampl
     w, soft, damping = 50.0 * HZ, soft_hz * HZ, 0.05
     A = np.zeros((4, 4))
     A[0, 1] = A[2, 3] = 1.0
-    A[1] = [-w**2, -w, 0.0, 0.0]
-    A[3] = [0.0, 0.0, -soft**2, -2.0 * damping * soft]
+    A[1] = [-(w**2), -w, 0.0, 0.0]
+    A[3] = [0.0, 0.0, -(soft**2), -2.0 * damping * soft]
     B, C = np.zeros((4, 2)), np.zeros((2, 4))
     B[1, 0], B[3, 1], C[1, 0], C[0, 2] = 1.0, 1.0, 1.0, 1.0
     none = np.zeros((2, 2))
