@@ -302,7 +302,7 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
         return VerdictLine(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / survival.delay
     words = (
-        f"run deploy; the loops' least delay margin is {with_unit(survival.delay, 's')}, and below "
+        f"run deploy; on the model the delay margin is {with_unit(survival.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     )
     return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
