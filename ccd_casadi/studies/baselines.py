@@ -90,7 +90,7 @@ class Baseline(ABC):
 
     @abstractmethod
     def judged(
-        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool | None = None
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, VerdictLine]:
         """Its controller (SI), and what that survives: the line of the verdict of a run."""
 
@@ -125,7 +125,7 @@ class MixedBaseline(Baseline):
         return final_design(self.problem, theta, at).controller
 
     def judged(
-        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool | None = None
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, VerdictLine]:
         K = self.controller(theta, design)
         found, robust = survived(self.problem, loops_of(self.problem, theta, K), design.figures)
@@ -163,7 +163,7 @@ class StructuredBaseline(Baseline):
         return design.controller
 
     def judged(
-        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool | None = None
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, VerdictLine]:
         K, on_box = self.controller(theta, design), DesignOnBox(self.problem, theta, design)
         worst = on_box.worst()[0]

@@ -42,8 +42,8 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     for i, name in enumerate(against):  # the best of them stands first: it is the answer
         answer[name], sentence = _sequential(solved[name], solved[cheapest], name)
         sentences.insert(len(sentences) if i else 0, sentence)
-    if words := decision(solved[cheapest]):
-        sentences[0] = f"{words} That is the best design, of {LABELS[cheapest]}. {sentences[0]}"
+    if said := decision(solved[cheapest]):
+        sentences[0] = f"{said} That is the best design, of {LABELS[cheapest]}. {sentences[0]}"
     return answer | {"sentences": sentences}
 
 
