@@ -31,9 +31,7 @@ PER_PERIOD = 100  # points of a continuous loop's step
 BAND = 0.02  # about its end, in which a step has settled
 SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
 OCTAVE = 0.1
-LIGHT = 0.1 * (
-    1.0 - 1e-6
-)  # damping of a root of K worth a word within NEAR of ω_b; not a bound on it
+LIGHT = 0.1 * (1.0 - 1e-6)  # damping of a root of K worth a word within NEAR of ω_b; not a bound
 NEAR = 0.2
 BOUGHT = 0.03  # of ω_b that a dip of |S| is worth a word for
 RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
@@ -51,18 +49,13 @@ class ForceStep:
     plant: int
 
     @property
-    def output_words(self) -> str:
+    def pair(self) -> str:
         """Counted from 1, as a reader does."""
-        return f"output {self.output + 1}"
-
-    @property
-    def actuator_words(self) -> str:
-        """The same."""
-        return f"actuator {self.actuator + 1}"
+        return f"output {self.output + 1} by actuator {self.actuator + 1}"
 
     def entry(self, scalar: bool) -> dict[str, Any]:
         """Of result.json; of several channels with the pair in words."""
-        pair = {} if scalar else {"pair": f"{self.output_words} by {self.actuator_words}"}
+        pair = {} if scalar else {"pair": self.pair}
         return {"seconds": self.seconds, "plant": self.plant + 1, **pair}
 
 
@@ -109,7 +102,7 @@ def step_figures(loop: Loop, bandwidth: float) -> tuple[float, float]:
 
 
 def force_response(loop: Loop, bandwidth: float, seconds: float) -> tuple[Array, Array]:
-    """Times (k,) in s and y (m, p, k) in m after 1 N at each actuator, at least for `seconds`."""
+    """`until_rest` after 1 N at each actuator, in m."""
     longest = HZ / bandwidth / PER_PERIOD
     return until_rest(loop, longest, seconds, loop.over_a_step(longest).B_d)
 

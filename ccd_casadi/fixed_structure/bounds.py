@@ -33,11 +33,7 @@ BINDS = {  # by kind of bound, as a case has it
 
 
 def key_words(name: str) -> str:
-    """The key of a bound by kind and channel, or by the name of a figure over it.
-
-    >>> key_words("KS of z"), key_words("S_max"), key_words("S_low")
-    ('weighted_level of KS of channel z', 'S_max', 'S_low')
-    """
+    """The key of a bound by kind and channel, or by the name of a figure over it."""
     kind, channel = kind_and_channel(name)
     return BINDS.get(kind, kind) + (f" of channel {channel}" if channel else "")
 

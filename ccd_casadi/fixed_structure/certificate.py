@@ -5,11 +5,10 @@ Of plants with several inputs and outputs the whole loop is judged, by largest s
 From the SI matrices of K and of every plant: the closed loop is rebuilt, its eigenvalues decide
 stability; S, KS, T and GS are evaluated (`certificate_responses`) on grids through every pole and
 zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. Of
-every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_raised`), so that it
-holds between the frequencies of a grid too. A sampled loop is judged in z, its hold and delay
-exact, K by Tustin's rule; what happens between samples is not in it. Its GS and its weighted KS and
-T are products of functions of z and of s, which no Hamiltonian is of: they are on the grid alone
-(`grid_only`), and hold between its points as far as a proof has them.
+every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_raised`). A sampled
+loop is judged in z, its hold and delay exact, K by Tustin's rule; what happens between samples is
+not in it. Its GS and weighted KS and T are products of functions of z and of s, which no
+Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
 """
 
 from collections.abc import Sequence

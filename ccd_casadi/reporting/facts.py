@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_slopes
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.package_text import template
 from ccd_casadi.support.terminal import plain
 from ccd_casadi.support.units import HZ, counted, display_unit, number, small_share, with_unit
@@ -169,19 +167,11 @@ def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
     return [_sentence(problem, name, multipliers.get(name), held) for name in names]
 
 
-@dataclass(frozen=True)
-class HeldTheta:
-    """Where bounds and λ alone determine θ: their names, and df (n,) where each is loosened by 1
-    of its multiplier's unit. What J falls by less that is what its figure changes by."""
-
-    names: tuple[str, ...]
-    cost: Array
-
-
 def _held_theta(
     problem: CoDesignProblem, theta: Mapping[str, float], multipliers: Mapping[str, float]
-) -> HeldTheta | None:
-    """None where θ moves otherwise too: how far takes second derivatives, as `insight` has."""
+) -> dict[str, float] | None:
+    """Where bounds and λ alone determine θ, df by each of them that is loosened by 1 of its
+    multiplier's unit. None where θ moves otherwise too: that takes second derivatives."""
     point, plant = [theta[name] for name in problem.names], plant_of(problem)
     width = np.subtract(problem.upper, problem.lower)
     df, dlam = (rows * width for rows in hardware_slopes(plant, point))
@@ -193,11 +183,11 @@ def _held_theta(
     A = np.array([rows[name] for name in names]).reshape(len(names), len(df))
     if len(names) != len(df) or np.linalg.matrix_rank(A) < len(df):
         return None
-    return HeldTheta(names, df @ np.linalg.inv(A))
+    return dict(zip(names, (df @ np.linalg.inv(A)).tolist(), strict=True))
 
 
 def _sentence(
-    problem: CoDesignProblem, name: str, multiplier: float | None, held: HeldTheta | None
+    problem: CoDesignProblem, name: str, multiplier: float | None, held: dict[str, float] | None
 ) -> str:
     words, step, loosened = _held(problem, name)
     if multiplier is None or not loosened:  # a constraint on θ has no unit to be loosened by
@@ -206,7 +196,7 @@ def _sentence(
     in_J = f"J falls by {number(falls, 3)}"
     if held is None or not problem.w2:
         return f"{words}; {loosened}: {in_J}, to first order."
-    cost = step * float(held.cost[held.names.index(name)]) if name in held.names else 0.0
+    cost = step * held.get(name, 0.0)
     value = (-falls - problem.w1 * cost) / problem.w2
     v, changed = problem.figure, f"f by {number(cost, 3)} {problem.cost_unit}".rstrip()
     moves = f"{v.symbol} changes by {v.shown(value, 3)}, {changed} ({in_J})"

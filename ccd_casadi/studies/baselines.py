@@ -19,7 +19,8 @@ from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.structured_entries import active_of, box_words, design_dict
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.verdict import OwnSet, VerdictLine, survives
+from ccd_casadi.codesign.verdict import VerdictLine, survives
+from ccd_casadi.codesign.verified_mixed import robust_words
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -85,10 +86,6 @@ class Baseline(ABC):
         """A design under the contract's keys, with its status and what is active."""
 
     @abstractmethod
-    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
-        """Its controller, SI."""
-
-    @abstractmethod
     def judged(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, VerdictLine]:
@@ -120,19 +117,13 @@ class MixedBaseline(Baseline):
         active = list(active_constraints(inner, found))
         return figures_dict(found) | {"status": STATUS[inner.feasible(found)], "active": active}
 
-    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
-        at = (design.figures.omega_S, design.figures.omega_T)
-        return final_design(self.problem, theta, at).controller
-
     def judged(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, VerdictLine]:
-        K = self.controller(theta, design)
+        at = (design.figures.omega_S, design.figures.omega_T)
+        K = final_design(self.problem, theta, at).controller
         found, robust = survived(self.problem, loops_of(self.problem, theta, K), design.figures)
-        own: dict[str, Any] = {}
-        if robust is not None:
-            state = OwnSet.KEPT if robust.passed else OwnSet.BROKEN
-            own = {"own": state, "own_words": robust.words}
+        own = {} if robust is None else robust_words(robust)
         return K, survives(found, S_max=self.problem.inner.S_max, **own)
 
 
@@ -158,14 +149,10 @@ class StructuredBaseline(Baseline):
         entries = design_dict(self.problem, theta, design)
         return entries | {"status": STATUS[design.certified], "active": active_of(design)}
 
-    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
-        assert design.controller is not None
-        return design.controller
-
     def judged(
         self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
     ) -> tuple[StateSpace, VerdictLine]:
-        K, on_box = self.controller(theta, design), DesignOnBox(self.problem, theta, design)
+        K, on_box = design.controller, DesignOnBox(self.problem, theta, design)
         worst = on_box.worst()[0]
         wide, checked, proof = on_box.judged(worst, workers)
         found = survived(self.problem, loops_of(self.problem, theta, K), design)[0]

@@ -48,14 +48,11 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
 
 
 def decision(figures: dict[str, Any]) -> str:
-    """Whether to build a design: by its verdict, of a baseline by what it survives alone, which
-    says at best what it needs."""
+    """Whether to build a design: of a baseline, which has no other line, by what it survives."""
     words = advice(figures)
-    complete = "certified" in figures.get("verdict", {})
-    return words if complete or words.startswith("Do not") else (
-        words and "Solve the case before you build this: a baseline has no verdict but that it "
-        "survives small errors."
-    )  # fmt: skip
+    if words and "certified" not in figures.get("verdict", {}) and words.startswith("Build"):
+        return "Solve the case before you build this: a baseline has no whole verdict."
+    return words
 
 
 def stable_words(figures: dict[str, Any]) -> str:

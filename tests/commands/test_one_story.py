@@ -73,8 +73,9 @@ def test_a_proof_that_is_none_and_half_a_point_are_found(run: Path) -> None:
     text, page = terminal_of(run), page_of(run)
     claimed = text + "\nproven for the whole box by 10 enclosures"
     assert disagreements(run, claimed) == ["terminal: proven, no proof"]
-    half = c.Figure(c.Lines((), ""), "", (c.Table(("frequency (Hz)", "Re L (–)", "Im L (–)"),
-                                                  ((1.0, "–", 0.0), (2.0, 1.0, 2.0))),))  # fmt: skip
+    head = ("frequency (Hz)", "Re L (–)", "Im L (–)")
+    table = c.Table(head, ((1.0, "–", 0.0), (2.0, 1.0, 2.0)))
+    half = c.Figure(c.Lines((), ""), "", (table,))
     write_page(run / "report.html", replace(page, chapters=(c.Chapter("L", (half,)),
                                                             *page.chapters)))  # fmt: skip
     assert disagreements(run, text) == ["table: Re L (–) and its Im"]

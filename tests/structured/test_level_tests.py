@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 from fixed_structure_channels import loop as channel_loop
 from fixed_structure_channels import plant as channel_plant

@@ -115,7 +115,7 @@ def test_a_force_step_is_followed_to_its_largest(soft_hz: float, sampling: Sampl
     assert found.size == pytest.approx((1.0 + over) / soft**2, rel=1e-3)
     assert found.seconds == pytest.approx(0.5 / soft_hz, rel=0.05)
     assert found.seconds > (PERIODS if soft_hz < 0.1 else 0.1 * PERIODS) / 50.0
-    assert (found.output_words, found.actuator_words) == ("output 1", "actuator 2")
+    assert found.pair == "output 1 by actuator 2"
     both = [Loop(stiff, one, sampling), Loop(turned(stiff, 3.0), one, sampling)]
     assert largest_force_step(both, w).plant == 1
 

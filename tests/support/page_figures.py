@@ -199,7 +199,7 @@ def _curves(r: Mapping[str, Any], page: c.Page) -> Claims:
         yield 1.0 - ON_GRID <= share <= 1.0 + CLOSE, "figure: peak of S"
         below = [np.interp(r["bandwidth_hz"], x, y)
                  for x, y in [*((k.x, k.y) for k in panel.curves[:1]),
-                              *((b.x, b.high) for b in panel.bands if "proof" in r)]]
+                              *((b.x, b.high) for b in panel.bands if "proof" in r)]]  # fmt: skip
         yield max(below) <= HALF_POWER * (1.0 + ON_GRID), "figure: |S| at the bandwidth"
     for label, key in (("GS", "compliance_max"), ("KS", "KS_max")):
         for panel in _panels(page, "Closed loop", label):
