@@ -13,7 +13,7 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import S_panel
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
-from ccd_casadi.reporting.nyquist import loci_of, near, nyquist_panel
+from ccd_casadi.reporting.nyquist import loci_of, nyquist_panel
 
 HEIGHT = 3.0  # inches of a row
 
@@ -43,10 +43,7 @@ def glance(
 
 def loci(view: LoopView) -> list[np.ndarray]:
     """L of one channel on every plant, of several its eigenvalues on the model."""
-    if not view.scalar:
-        return list(loci_of(view.open[0]).T)
-    L = view.open[:, :, 0, 0]
-    return list(near(L))
+    return [line for L in view.open for line in loci_of(L).T]
 
 
 def machine(problem: CoDesignProblem, theta: Sequence[float]) -> Modes | Picture | Table:

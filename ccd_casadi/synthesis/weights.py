@@ -85,12 +85,8 @@ class Weights:
 
         With a disturbance that of T (one channel: KSG) is δ W3.
         """
+        pole, through, zero = self.filters().T[..., None]
         s = 1j * np.asarray(omega)
-        share = self.delta or 1.0
-        return np.array(
-            [
-                (s / self.M_S + self.omega_S) / (s + self.omega_S * self.A_S),
-                self.c_K * (s + self.omega_K) / (self.M_K * (s + self.c_K * self.omega_K)),
-                share * (s + self.omega_T / self.A_l) / (self.A_u * s + self.omega_T),
-            ]
-        )
+        found = through * (s + zero) / (s + pole)
+        found[2] *= self.delta or 1.0
+        return np.asarray(found)
