@@ -15,6 +15,9 @@ from ccd_casadi.analysis.loop_figures import (
     ringing,
     step_figures,
 )
+from ccd_casadi.analysis.move import simulate
+from ccd_casadi.analysis.move_limits import LIMITS
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.lti.hold import tustin
 from ccd_casadi.lti.loop import Loop
@@ -118,6 +121,21 @@ def test_a_force_step_is_followed_to_its_largest(soft_hz: float, sampling: Sampl
     assert found.pair == "output 1 by actuator 2"
     both = [Loop(stiff, one, sampling), Loop(turned(stiff, 3.0), one, sampling)]
     assert largest_force_step(both, w).plant == 1
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_the_error_that_stays_is_that_of_a_long_move(sampling: Sampling | None) -> None:
+    """A spring of k and a gain of 3 k: a quarter of the way is left; a free mass: nothing."""
+    w, m, gain = 20.0 * HZ, 3.0, 3.0 * 3.0 * (20.0 * HZ) ** 2
+    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+    for stiffness, left in ((w**2, 0.25 * LIMITS.stroke), (0.0, 0.0)):
+        A = np.array([[0.0, 1.0], [-stiffness, -2.0 * w]])
+        G = StateSpace(A, np.array([[0.0], [1.0 / m]]), np.eye(1, 2), np.zeros((1, 1)))
+        own = Loop(G, StateSpace(*none, np.array([[gain]])), sampling)
+        made = simulate(own, setpoint(LIMITS), axis=0, forces=None, window=1e-9, bandwidth_hz=20.0)
+        assert made.rest == pytest.approx(left, abs=1e-12)
+        assert abs(made.error[-1]) == pytest.approx(left, abs=1e-8)
+        assert np.isinf(made.settled) == (left > 0.0)
 
 
 def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
