@@ -97,7 +97,9 @@ def main(options: argparse.Namespace) -> ExitCode:
     files.write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
         K, name = found.realisation, run_name(options.run)
-        naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed}
+        kind = kind_of(finished.problem).title
+        naming: dict[str, Any] = {"title": name, "delay": found.delay, "verified": found.passed,
+                                  "kind": kind}  # fmt: skip
         texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
         code = source_code.structured_text(K, **naming)
         (folder / source_code.ST_FILE).write_text(code, "utf-8")

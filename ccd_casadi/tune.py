@@ -35,6 +35,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.source_code import write_c
     from ccd_casadi.drawing.stored import write_page
     from ccd_casadi.fixed_structure import Structure
+    from ccd_casadi.inner_problem.kinds import FixedStructure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.hold import tustin
     from ccd_casadi.reporting.facts import loop_lines
@@ -72,8 +73,8 @@ def main(options: argparse.Namespace) -> ExitCode:
         write_json(folder / "controller.json", answer.controller)
         write_page(folder / "report.html", measured_page(case, K, result))
         if case.period is not None:
-            write_c(folder, realised(tustin(K, case.period)), title=case.file,
-                    delay=options.delay, verified=found.design.usable)  # fmt: skip
+            write_c(folder, realised(tustin(K, case.period)), title=case.file, delay=options.delay,
+                    verified=found.design.usable, kind=FixedStructure.title)  # fmt: skip
         lines = [
             *(f"{'decision':14s}{words}" for words in (advice(result),) if words),
             f"{'bandwidth':14s}{result['bandwidth_hz']:.6g} Hz, |S| at most "

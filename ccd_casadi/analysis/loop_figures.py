@@ -5,7 +5,7 @@ are given; steps are of the model and of the plants where the margins are least.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,38 +23,99 @@ from ccd_casadi.synthesis.classical_margins import (
     least_of,
 )
 
-PERIODS = 160.0  # of ω_b that a step is followed for
+PERIODS = 160.0  # of ω_b that a step is followed for closely
+COARSER, FEWER = 16, 4  # times as far apart beyond, and as few
+LEFT = 1e-3  # of the slowest part of a loop that counts as at rest
 AROUND = 2.0 ** np.linspace(-1.0, 1.0, 201)  # ω/ω_b, 0.7 % apart
 PER_PERIOD = 100  # points of a continuous loop's step
 BAND = 0.02  # about its end, in which a step has settled
 SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
 OCTAVE = 0.1
-LIGHT = 0.1 * (
-    1.0 - 1e-6
-)  # damping of a root of K worth a word within NEAR of ω_b; not a bound on it
+LIGHT = 0.1 * (1.0 - 1e-6)  # damping of a root of K worth a word within NEAR of ω_b; not a bound
 NEAR = 0.2
 BOUGHT = 0.03  # of ω_b that a dip of |S| is worth a word for
 RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
 
 
-def step_figures(loop: Loop, bandwidth: float) -> tuple[float, float, float]:
-    """Of a unit step of a reference the overshoot, and the last time outside 2 % in s (inf: not
-    within the time looked at); the largest displacement by 1 N in m, that at rest included. Of
-    each reference and each force in turn, the worst."""
-    duration = PERIODS * HZ / bandwidth
-    steps = loop.over_a_step(duration / (PERIODS * PER_PERIOD))
-    count = int(duration / steps.period) + 1
-    time = np.arange(count) * steps.period
-    overshoot, settling = 0.0, 0.0
-    for i, drive in enumerate(steps.B_r.T):
-        y = constant_drive(steps, drive, count)[i]
-        overshoot = max(overshoot, float(y.max()) - 1.0)
-        outside = np.flatnonzero(np.abs(y - 1.0) > BAND)
-        last = int(outside[-1]) + 1 if len(outside) else 0
-        settling = max(settling, float(time[last]) if last < count else np.inf)
-    rest = steps.C_y @ np.linalg.solve(np.eye(len(steps.A)) - steps.A, steps.B_d)
-    moved = [float(np.abs(constant_drive(steps, drive, count)).max()) for drive in steps.B_d.T]
-    return overshoot, settling, max(*moved, float(np.abs(rest).max()))
+@dataclass(frozen=True)
+class ForceStep:
+    """The largest displacement by a step of 1 N: `size` in m after `seconds`, of output `output` by
+    actuator `actuator` on plant `plant`, all from 0 on."""
+
+    size: float
+    seconds: float
+    output: int
+    actuator: int
+    plant: int
+
+    @property
+    def pair(self) -> str:
+        """Counted from 1, as a reader does."""
+        return f"output {self.output + 1} by actuator {self.actuator + 1}"
+
+    def entry(self, scalar: bool) -> dict[str, Any]:
+        """Of result.json; of several channels with the pair in words."""
+        pair = {} if scalar else {"pair": self.pair}
+        return {"seconds": self.seconds, "plant": self.plant + 1, **pair}
+
+
+def until_rest(loop: Loop, longest: float, seconds: float, drives: Array) -> tuple[Array, Array]:
+    """Times (k,) in s and y (m, p, k) from rest under each of the constant inputs `drives` (n, m),
+    B_r or B_d of the loop over `longest` s; exact at the instants.
+
+    The first `PERIODS` times `PER_PERIOD` instants follow one another; from there on, to `seconds`,
+    they are `COARSER` as far apart, and so on: what is fast has decayed by then.
+    """
+    steps, count = loop.over_a_step(longest), int(PERIODS * PER_PERIOD)
+    n, period, first = len(steps.A), steps.period or longest, 0
+    P = np.eye(n + drives.shape[1])
+    P[:n, :n], P[:n, n:] = steps.A, drives
+    times, found = [], []
+    while True:
+        coarse = replace(steps, A=P[:n, :n])
+        y = np.array([constant_drive(coarse, drive, count + 1) for drive in P[:n, n:].T])
+        times.append(period * np.arange(first, count + 1))
+        found.append(y[:, :, first:])
+        if period * count >= seconds:
+            return np.concatenate(times), np.concatenate(found, axis=2)
+        reached, count = period * count, int(PERIODS * PER_PERIOD) // FEWER
+        P, period = np.linalg.matrix_power(P, COARSER), COARSER * period
+        first = int(reached / period + 0.5) + 1
+
+
+def rest_time(loop: Loop) -> float:
+    """Seconds after which `LEFT` of the slowest part of a stable loop is left."""
+    return float(np.log(1.0 / LEFT) / max(-loop.poles.real.max(), 1e-300))
+
+
+def step_figures(loop: Loop, bandwidth: float) -> tuple[float, float]:
+    """Of a unit step of each reference in turn the worst: the overshoot, and the last time outside
+    2 % in s (inf: it ends there)."""
+    longest = HZ / bandwidth / PER_PERIOD
+    drives = loop.over_a_step(longest).B_r
+    times, found = until_rest(loop, longest, rest_time(loop), drives)
+    own = np.array([y[i] for i, y in enumerate(found)])
+    last = [np.flatnonzero(np.abs(y - 1.0) > BAND) for y in own]
+    ends = np.append(times, np.inf)
+    settling = max(float(ends[outside[-1] + 1]) if len(outside) else 0.0 for outside in last)
+    return float(own.max()) - 1.0, settling
+
+
+def force_response(loop: Loop, bandwidth: float, seconds: float) -> tuple[Array, Array]:
+    """`until_rest` after 1 N at each actuator, in m."""
+    longest = HZ / bandwidth / PER_PERIOD
+    return until_rest(loop, longest, seconds, loop.over_a_step(longest).B_d)
+
+
+def largest_force_step(loops: Sequence[Loop], bandwidth: float) -> ForceStep:
+    """Of every plant, actuator and output, until the loop is at rest."""
+    found = []
+    for plant, loop in enumerate(loops):
+        times, y = force_response(loop, bandwidth, rest_time(loop))
+        actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))
+        size = abs(float(y[actuator, output, k]))
+        found.append(ForceStep(size, float(times[k]), output, actuator, plant))
+    return max(found, key=lambda step: step.size)
 
 
 def ringing(poles: np.ndarray, bandwidth: float) -> tuple[float, float] | None:
@@ -100,21 +161,6 @@ def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> 
     count = points if loop.sampling is None else int(np.ceil(seconds / steps.period)) + 1
     y = constant_drive(steps, steps.B_r @ direction, count)
     return np.asarray(np.arange(count) * steps.period), y.T
-
-
-def force_step(loop: Loop, times: Array) -> tuple[Array, Array]:
-    """Times in s near the given ones, and y of the first output in m after 1 N, exact at them.
-
-        y_n = C (I - A)⁻¹ (I - Aⁿ) B
-
-    of the loop over one step: a period, or where the loop is continuous the first of the times.
-    """
-    steps = loop.over_a_step(float(times[0]))
-    counts = np.unique(np.maximum(np.round(times / steps.period), 1.0).astype(int))
-    A, C = steps.A, steps.C_y[0]
-    final = np.linalg.solve(np.eye(len(A)) - A, steps.B_d[:, 0])
-    y = [float(C @ (final - np.linalg.matrix_power(A, int(n)) @ final)) for n in counts]
-    return np.asarray(steps.period * counts, float), np.array(y)
 
 
 def loop_warnings(
@@ -197,13 +243,14 @@ def loop_entry(
 ) -> dict[str, Any]:
     """Of a stable loop on every plant, the model first, under the keys of `result.json`; SI, ω_b
     in rad/s. The least margins of all plants, with the crossover of the model, and 1/‖S‖∞ as the
-    modulus margin; the worst step."""
+    modulus margin; the worst step of a reference where they are least, that of a force of all."""
     loops = [Loop(plant, controller, sampling) for plant in plants]
     margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
     gain = [gain_margin(m) for m in margins]
     worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
     steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
-    overshoot, settling, by_force = map(max, zip(*steps, strict=True))
+    overshoot, settling = map(max, zip(*steps, strict=True))
+    force = largest_force_step(loops, bandwidth)
     above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
     sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
     growth = max(float((size / size[0]).max()) for size in sizes)
@@ -212,7 +259,8 @@ def loop_entry(
     return _entry(least, sensitivity_peak) | {
         "step_overshoot": overshoot,
         "settling_ms": 1e3 * settling,
-        "force_step_max": by_force,
+        "force_step_max": force.size,
+        "force_step_at": force.entry(loops[0].plant.D.shape == (1, 1)),
         "loop_warnings": loop_warnings(
             growth, bandwidth_dip(loops, bandwidth), controller, bandwidth, rings
         ),

@@ -100,8 +100,9 @@ class LoopView:
 
     @cached_property
     def shares(self) -> Array:
-        """The largest gain of any plant over its bound (3, k)."""
-        return np.asarray(self.sizes[:3].max(axis=1) / self.bounds)
+        """The largest gain of any plant over its bound (3, k); γ/|W| bounds the model's alone."""
+        sizes = self.sizes[:3].max(axis=1) if self.bounded.asked else self.gains
+        return np.asarray(sizes / self.bounds)
 
 
 def loop_view(
@@ -129,7 +130,9 @@ def loop_view(
         high = END * 0.5 / model.sampling.period
     light = (model.plant.poles, model.controller.rates, model.plant.zeros(_unit(model)))
     near = root_flanks(np.concatenate([resonant(roots) for roots in light]), FLANKS) / HZ
-    places = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
+    worst = [max(peaks_of(loop), key=lambda peak: peak[1], default=(bandwidth_hz, 0.0))[0]
+             for loop in loops[1:]]  # fmt: skip
+    places = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found), *worst])
     others = _of_others([resonant(loop.plant.poles) for loop in loops[1:]])
     hz = frequency_grid(low, high, points, near, places, others, apart=SAME)
     G, K = model.responses(HZ * hz)

@@ -35,7 +35,8 @@ class Move:
     """Time (k,) in s, setpoint (k,), its acceleration (k,), error and forces (k, m).
 
     The error is of the moving output (k,), or of all (k, p). The setpoint ends at `duration`.
-    `saturated`: share of the instants at a limit.
+    `saturated`: share of the instants at a limit. `rest`: the error of the moving output that stays
+    for ever, NaN where it is not known.
     """
 
     time: Array
@@ -47,6 +48,7 @@ class Move:
     duration: float
     window: float
     saturated: float = 0.0
+    rest: float = np.nan
 
     @property
     def settled(self) -> float:
@@ -175,8 +177,10 @@ def simulate(
             break
         tail *= 2.0
     force = x @ closed.C_u.T + np.outer(r[0], closed.D_u[:, axis]) + r.T @ ahead
+    end = r[0, -1]  # whose derivatives are zero
+    rest = end - end * closed.C_y[axis] @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])
     return Move(time, r[0], profile.at(time)[2], error, force, forces is not None,
-                profile.duration, window)  # fmt: skip
+                profile.duration, window, rest=abs(float(rest)))  # fmt: skip
 
 
 def _over(loop: Loop, ahead: Array, axis: int, step: float) -> tuple[Array, Array]:

@@ -22,7 +22,8 @@ from ccd_casadi.synthesis.synthesis import Design
 def second_on_weighted(
     problem: CoDesignProblem, theta: Sequence[float], design: Design
 ) -> Comparison:
-    """Of mixed sensitivity: the norm that γ was reached with, and the largest ‖S‖∞ of its set."""
+    """Of mixed sensitivity: the norm that γ was reached with and ‖GS‖∞ on the model, and the
+    largest ‖S‖∞ of its set."""
     figures = design.figures
     opinions = [
         second_opinion(plant, design.controller, weights=weights)
@@ -30,7 +31,7 @@ def second_on_weighted(
     ]
     worst = max(opinions, key=lambda one: one.norms.get("S", inf))
     found = compared([
-        (opinions[0], {"weighted_loop": figures.certificate.norm}),
+        (opinions[0], {"weighted_loop": figures.certificate.norm, "GS": figures.compliance}),
         (worst, {"S": figures.sensitivity_peak}),
     ])  # fmt: skip
     return replace(found, loops=len(opinions))
@@ -39,14 +40,17 @@ def second_on_weighted(
 def second_on_set(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
 ) -> Comparison:
-    """Of a fixed structure: ‖S‖∞ on every plant that its certificate is of, as the loop runs."""
+    """Of a fixed structure: ‖S‖∞, and those of KS and T, of a continuous loop of GS too, on every
+    plant that its certificate is of, as the loop runs."""
     judged, K = design.certificate, design.controller
     if judged is None or K is None:
         return NOT_COMPARED
     uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
     points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
     pairs = zip(uncertain.as_written(points), judged.plants, strict=True)
+    of_GS = ("GS",) if problem.sampling is None else ()
     return compared(
-        (second_opinion(plant, K, problem.sampling), {"S": figures.S_peak})
+        (second_opinion(plant, K, problem.sampling),
+         {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)})
         for plant, figures in pairs
-    )
+    )  # fmt: skip

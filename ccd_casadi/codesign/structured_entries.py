@@ -1,14 +1,17 @@
 """A controller of fixed structure as values of result.json and controller.json."""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
+from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.fixed_structure.bounds import BINDS, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
@@ -19,15 +22,6 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.structured_robustness import LOOSE
 from ccd_casadi.support.units import HZ, counted
 
-BINDS = {
-    "S_MAX": "S_max",
-    "SHAPE": "shape",
-    "LEVEL": "|S| below omega_b",
-    "S_LOW": "S_low",
-    "KS": "weighted_level of KS",
-    "T": "weighted_level of T",
-    "GS": "compliance_max",
-}
 WORST = 1.0 + TOLERANCE  # figure over bound up to which the judge counts a bound as met
 
 
@@ -102,12 +96,9 @@ def bound_words(names: Iterable[str]) -> list[str]:
     ['S_max of channel z', 'weighted_level of KS']
     """
     order = list(BINDS)
-    found = [kind_and_channel(name) for name in names]
-    bounds = [(order.index(kind), channel) for kind, channel in found if kind in BINDS]
-    return [
-        BINDS[order[kind]] + (f" of channel {channel}" if channel else "")
-        for kind, channel in sorted(bounds)
-    ]
+    found = [(kind_and_channel(name), name) for name in names]
+    bounds = [(order.index(kind), of, name) for (kind, of), name in found if kind in BINDS]
+    return [key_words(name) for *_, name in sorted(bounds)]
 
 
 def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
@@ -181,3 +172,37 @@ def sections_controller(
     if sampling is not None:
         words["loop"] = vars(sampling) | {"method": "tustin"}
     return controller_dict(design.controller) | {"sections": words}
+
+
+def box_words(
+    wide: SetCertificate, checked: int, proof: Proof, worst: Excess, drawn: Yield | None,
+    *, along: bool,
+) -> dict[str, Any]:  # fmt: skip
+    """What `survives` takes of a loop on its box: the judge on so many plants, the proof, the worst
+    plant that was searched, random ones; `along`: whether its common shift is kept."""
+    excess, fresh = math.expm1(worst.value), "" if drawn is None else drawn.words
+    figures = {
+        "plants": checked,
+        "worst_excess": excess,
+        "proof": proof.outcome.name.lower(),
+        "proven": proof.levels,
+        "unproven": proof.unasked,
+    }
+    where = f"{counted(checked, 'plant')} of the box that [robust] names"
+    share, within = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(worst)
+    own, words = OwnSet.BROKEN, f"{within} on {where}, the worst that a search found at {share}"
+    if not wide.passed:
+        words = f"on {where}: {wide.words}"
+    elif proof.denies:
+        words = f"{within} on {where}, but {proof.words}"
+    elif checked <= 1:
+        own, words = OwnSet.NONE, "[robust] names no plant but the model"
+    elif drawn is not None and drawn.survived < drawn.draws:
+        words = f"{within} on {where}, but of the whole box {fresh}"
+    elif along:
+        own = OwnSet.SEARCHED if proof.unasked else OwnSet.KEPT
+        own = OwnSet.UNPROVEN if proof.unclosed else own
+        words = "; ".join(part for part in (words, fresh, proof.words) if part)
+    else:
+        words = f"{within} on {where}, but not all along its common resonance shift"
+    return {"own": own, "own_words": words, "figures": figures}

@@ -48,6 +48,7 @@ class OwnSet(StrEnum):
     KEPT = "kept"
     BROKEN = "broken"
     UNPROVEN = "unproven"  # kept on all plants that were tried; the proof left bounds open
+    SEARCHED = "searched"  # kept on all plants that were tried; no proof applies to all its bounds
     NONE = "none"  # the case names no plant but the model
 
 
@@ -257,6 +258,8 @@ def survives(
             said.append(f"peak of S {peak:.3g} on {name}")
     failed = failed or bool(survival.contradiction)
     state = State.FAILED if failed else State.WARNED if warned else State.PASSED
+    if own is OwnSet.SEARCHED and state is State.PASSED:
+        state = State.UNKNOWN
     rest = survival.statics
     if rest.differentiates:
         said.append(
@@ -299,7 +302,7 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
         return VerdictLine(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / survival.delay
     words = (
-        f"run deploy; the loops' least delay margin is {with_unit(survival.delay, 's')}, and below "
+        f"run deploy; on the model the delay margin is {with_unit(survival.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     )
     return VerdictLine(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})

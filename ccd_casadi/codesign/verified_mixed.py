@@ -15,6 +15,12 @@ from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Design
 
 
+def robust_words(robust: RobustCheck) -> dict[str, Any]:
+    """What `survives` takes of a set that was searched along its shift."""
+    own = OwnSet.KEPT if robust.passed else OwnSet.BROKEN
+    return {"own": own, "own_words": robust.words}
+
+
 @dataclass(frozen=True, kw_only=True)
 class VerifiedDesign(Verified):
     """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
@@ -113,10 +119,7 @@ class VerifiedDesign(Verified):
             (check.name, check.figures.certificate.stable, check.figures.sensitivity_peak)
             for check in self.references
         ]
-        if self.robust is None:
-            return {"closer": found}
-        own = OwnSet.KEPT if self.robust.passed else OwnSet.BROKEN
-        return {"own": own, "own_words": self.robust.words, "closer": found}
+        return {"closer": found, **({} if self.robust is None else robust_words(self.robust))}
 
     def gap_words(self) -> str:
         return f"other weights at the same theta give {100 * self.inner_gap:.2g} % more bandwidth"

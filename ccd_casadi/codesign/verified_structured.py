@@ -10,13 +10,14 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
 from ccd_casadi.codesign.structured_entries import (
     active_of,
+    bound_words,
+    box_words,
     design_dict,
-    kept_words,
     proof_dict,
     robust_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
+from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
@@ -98,9 +99,13 @@ class VerifiedStructured(Verified):
     @property
     def set_is_met(self) -> bool:
         """Whether the whole set is: by the judge, proof, draws, and along its common shift."""
-        found, ends = self.survival, kind_of(self.problem).common_shifts()
-        along = found is None or found.within(*ends)
-        return self.wide.passed and not self.proof.refuted and self.all_drawn and along
+        return self.wide.passed and not self.proof.denies and self.all_drawn and self.along
+
+    @property
+    def along(self) -> bool:
+        """Whether it is met all along its common shift, as far as that is known."""
+        found = self.survival
+        return found is None or found.within(*kind_of(self.problem).common_shifts())
 
     @property
     def all_drawn(self) -> bool:
@@ -181,37 +186,19 @@ class VerifiedStructured(Verified):
             words = "certified, but a constraint on theta is not met"
             return VerdictLine(State.FAILED, words, figures)
         count = 0 if judged is None else len(judged.plants)
+        untested = () if judged is None else judged.grid_only
+        most, levels = 1.0 + self.proof.slack, self.proof.levels
+        on_grid = bound_words(name for name in untested if not levels.get(name, math.inf) <= most)
         where = "the model" if count == 1 else f"the {count} plants"
         words = f"stable and within every bound on {where} that it was designed on"
+        if on_grid:  # a check that does not exist for a sampled loop is not passed
+            words += f"; {', '.join(on_grid)} on a grid of frequencies alone"
+            return VerdictLine(State.WARNED, words, {**figures, "on_grid_alone": on_grid})
         return VerdictLine(State.PASSED, words, figures)
 
     def own_set(self) -> dict[str, Any]:
-        excess, proof = math.expm1(self.worst.value), self.proof
-        drawn = "" if self.drawn is None else self.drawn.words
-        figures = {
-            "plants": self.checked,
-            "worst_excess": excess,
-            "proof": proof.outcome.name.lower(),
-            "proven": proof.levels,
-        }
-        where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
-        share, kept = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(self.worst)
-        words = f"{kept} on {where}, the worst that a search found at {share}"
-        own = OwnSet.KEPT if self.set_is_met else OwnSet.BROKEN
-        if not self.wide.passed:
-            words = f"on {where}: {self.wide.words}"
-        elif proof.refuted:
-            words = f"{kept} on {where}, but {proof.words}"
-        elif self.checked <= 1:
-            own, words = OwnSet.NONE, "[robust] names no plant but the model"
-        elif not self.all_drawn:
-            words = f"{kept} on {where}, but of the whole box {drawn}"
-        elif self.set_is_met:
-            own = OwnSet.UNPROVEN if proof.unclosed else own
-            words = "; ".join(part for part in (words, drawn, proof.words) if part)
-        else:
-            words = f"{kept} on {where}, but not all along its common resonance shift"
-        return {"own": own, "own_words": words, "figures": figures}
+        return box_words(self.wide, self.checked, self.proof, self.worst, self.drawn,
+                         along=self.along)  # fmt: skip
 
     def gap_words(self) -> str:
         figure = self.problem.figure

@@ -48,15 +48,16 @@ def write_c(folder: Path, realisation: Realisation, **how: Any) -> Mapping[str, 
 
 def c_files(
     realisation: Realisation, *, title: str, delay: float, verified: bool,
-    forward: Array | None = None,
+    forward: Array | None = None, kind: str = "Controller",
 ) -> Mapping[str, str]:  # fmt: skip
-    """The three files' texts by name; delay in s; the header says whether the loop was verified.
+    """The three files' texts by name; delay in s; the header says whether the loop was verified,
+    and what `kind` of controller it is.
 
     `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none.
     """
     K, limit = realisation.system, realisation.saturation
     errors, forwards, first, forces = vectors(realisation)
-    values = _values(realisation, title, delay, verified) | {
+    values = _values(realisation, title, delay, verified, kind) | {
         "rate": f"{1.0 / K.period:.10g}", "ahead": f"{delay + 0.5 * K.period:.6g}",
         "room": max(len(K.A), 1), "limit": None if limit is None else f"{limit:.17g}",
         "blocks": realisation.blocks or (0,), "A": realisation.block_entries,
@@ -68,7 +69,9 @@ def c_files(
     return {name: template(f"deployment/templates/{name}").render(values) for name in C_FILES}
 
 
-def structured_text(realisation: Realisation, *, title: str, delay: float, verified: bool) -> str:
+def structured_text(
+    realisation: Realisation, *, title: str, delay: float, verified: bool, kind: str = "Controller"
+) -> str:
     """The function block; delay in s. A controller without states keeps one that stays at rest."""
     K, limit, sizes = realisation.system, realisation.saturation, realisation.blocks or (1,)
     n, (m, p), rest = sum(sizes), K.D.shape, {}
@@ -77,7 +80,7 @@ def structured_text(realisation: Realisation, *, title: str, delay: float, verif
         rest = {name: np.zeros(shape) for name, shape in shapes.items()}
     starts = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
     L = realisation.back_calculation
-    values = _values(realisation, title, delay, verified) | {
+    values = _values(realisation, title, delay, verified, kind) | {
         "n": n, "limit": literal(1e308 if limit is None else limit), "starts": starts,
         "ends": starts + np.repeat(sizes, sizes) - 1, "A": K.A,
         "L": np.zeros((n, m)) if L is None else L, "numbers": lambda entries: literals(entries, 8),
@@ -85,11 +88,14 @@ def structured_text(realisation: Realisation, *, title: str, delay: float, verif
     return template(f"deployment/templates/{ST_FILE}").render(values | rest)
 
 
-def _values(realisation: Realisation, title: str, delay: float, verified: bool) -> dict[str, Any]:
+def _values(
+    realisation: Realisation, title: str, delay: float, verified: bool, kind: str
+) -> dict[str, Any]:
     """What both languages need."""
     K = realisation.system
     return {
-        "title": plain_title(title), "verified": verified, "period": f"{K.period:.17g}",
+        "title": plain_title(title), "kind": kind, "verified": verified,
+        "period": f"{K.period:.17g}",
         "delay": f"{delay:.10g}", "n": len(K.A), "p": K.B.shape[1], "m": len(K.C),
         "B": K.B, "C": K.C, "D": K.D, "L": realisation.back_calculation, "X": takeover(K),
     }  # fmt: skip

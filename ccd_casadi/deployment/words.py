@@ -9,6 +9,7 @@ from ccd_casadi.deployment.discretise import Conversion
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.robust_set import place_words
 from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.robust.sampled import SampledFigures
 from ccd_casadi.support.units import HZ
 
 
@@ -38,16 +39,28 @@ def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
         "stable": found.stable,
         "bandwidth_hz": K.bandwidth / HZ,
         "sensitivity_peak": found.worst.figures.sensitivity_peak,
+        "worst_bandwidth_hz": found.worst.figures.bandwidth / HZ,
         "plants": 1 + len(found.members),
         "judge": None if found.judge is None else found.judge.entry,
     }
     if found.shortfalls:
         return VerdictLine(State.FAILED, f"{at}: {found.shortfalls[0]}", figures)
-    kept = f"{at}: bandwidth {K.bandwidth / HZ:.4g} Hz, peak of S {figures['sensitivity_peak']:.5g}"
+    kept = f"{at}: {_loop_words(K)}"
+    if found.members:
+        kept = f"{at}: on the model {_loop_words(K)}"
+        worst = found.worst
+        if worst.figures is not K:
+            where = place_words(worst.at)
+            kept += f"; on the plant with the largest peak ({where}) {_loop_words(worst.figures)}"
     reason = reason_words(run, found)
     if reason:
         return VerdictLine(State.WARNED, f"{kept}; {reason}", figures)
     return VerdictLine(State.PASSED, kept, figures)
+
+
+def _loop_words(found: SampledFigures) -> str:
+    """Of one plant."""
+    return f"bandwidth {found.bandwidth / HZ:.4g} Hz, peak of S {found.sensitivity_peak:.5g}"
 
 
 def order_words(run: FinishedRun, found: Deployment) -> str:

@@ -34,9 +34,12 @@ def tables_of(drawing: Drawing) -> tuple[Table, ...]:
 
 def _columns(panel: Panel) -> Iterator[Column]:
     """What a panel shows, of loci over frequency both parts."""
+    named = any(curve.label for curve in panel.curves if curve.hz is not None)
     for curve in panel.curves:
         same = panel.y_label.startswith(curve.label)
         name = panel.y_label if same else f"{panel.y_label}, {curve.label}"
+        if curve.hz is not None and not curve.label and named:
+            continue  # no reader knows which of the others it is
         if curve.hz is not None:
             real = name.replace(panel.y_label, panel.x_label)
             yield from ((FREQUENCY, real, curve.hz, curve.x, True),

@@ -26,6 +26,7 @@ from ccd_casadi.support.units import HZ
 POINTS = 180  # of the frequency grid, besides those around resonances
 STEP_POINTS = 240
 STEP_PERIODS = 5.0  # of the bandwidth
+SAME = 1e-3  # relative: the peak of S on the model is that of the design
 WATCHED = 2.0  # durations of the move that are shown
 NONE = np.zeros(0)
 AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, WINDOW)
@@ -86,8 +87,10 @@ def curves_of(look: Look) -> Curves | None:
     gamma = float(np.nan_to_num(look.figures.certificate.norm_bound))
     bounded = kind_of(problem).bounded(look.weights, gamma, look.bandwidth_hz)
     f = look.figures
-    top = (f.sensitivity_peak_frequency / HZ, f.sensitivity_peak)
-    view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=(top,))
+    top, at = f.sensitivity_peak, f.sensitivity_peak_frequency
+    own = float(sigma_max(loop.sensitivity(np.array([at])))[0]) if at > 0.0 else np.nan
+    peaks = ((at / HZ, top),) if abs(own / top - 1.0) < SAME else None  # else another plant's
+    view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=peaks)
     time, step, move = NONE, NONE, AT_REST
     if loop.stable:
         first = np.eye(len(loop.plant.C))[0]

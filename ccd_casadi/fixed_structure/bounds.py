@@ -21,6 +21,23 @@ def kind_and_channel(name: str) -> tuple[str, str]:
     return kind, channel
 
 
+BINDS = {  # by kind of bound, as a case has it
+    "S_MAX": "S_max",
+    "SHAPE": "shape",
+    "LEVEL": "|S| below omega_b",
+    "S_LOW": "S_low",
+    "KS": "weighted_level of KS",
+    "T": "weighted_level of T",
+    "GS": "compliance_max",
+}
+
+
+def key_words(name: str) -> str:
+    """The key of a bound by kind and channel, or by the name of a figure over it."""
+    kind, channel = kind_and_channel(name)
+    return BINDS.get(kind, kind) + (f" of channel {channel}" if channel else "")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ChannelPeaks:
     """What is held against a channel's own bounds: the largest values of its row of S, uᵀS, and of
@@ -191,6 +208,16 @@ class Bounds:
             compliance_max=times(self.compliance_max),
             channels=tuple(replace(own, S_max=times(own.S_max)) for own in self.channels),
         )
+
+    def missed(self, name: str, ratio: float) -> str:
+        """How a controller misses a bound by a factor, and the value of its key that it meets."""
+        kind, channel = kind_and_channel(name)
+        known = {"S_MAX": self.S_max, "S_LOW": self.S_low, "KS": self.weighted_level,
+                 "T": self.weighted_level, "GS": self.compliance_max}  # fmt: skip
+        own = next((one for one in self.channels if one.name == channel), None)
+        given = own.S_max if own is not None and kind == "S_MAX" else known.get(kind)
+        words = f"{key_words(name)} by a factor {ratio:.6g}"
+        return words if given is None else f"{words} ({given:g} is given, {given * ratio:.4g} met)"
 
     def shares(self, peaks: LoopPeaks) -> dict[str, float]:
         """Every bound's figure over the bound; above 1 where it is not met."""

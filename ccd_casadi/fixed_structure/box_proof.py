@@ -39,8 +39,11 @@ class ProofOutcome(StrEnum):
     REFUTED = "a plant of the box exceeds a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has several outputs and not as many channels"
-    NOT_MODAL = "a given damping matrix couples the modes, or brakes a free body"
+    NOT_MODAL = "the plant is not modal: its damping couples the modes, or brakes a free body"
     VARIES = "a theta varies in a plant whose modes are not enclosed, so its range was searched"
+
+
+NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.VARIES)
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,19 @@ class Proof:
         return self.outcome is ProofOutcome.REFUTED
 
     @property
+    def denies(self) -> bool:
+        """Whether it contradicts that the box is kept: a plant of it, or the model's own loop."""
+        return self.refuted or self.outcome is ProofOutcome.UNSTABLE
+
+    @property
+    def unasked(self) -> str:
+        """Why nothing was proven that was not begun either: the proof does not apply, or is not of
+        every bound; empty where it is complete in kind."""
+        if self.outcome in NOT_APPLICABLE:
+            return self.outcome.value
+        return "bounds of single channels are judged, not proven" if self.channels else ""
+
+    @property
     def unclosed(self) -> bool:
         """Whether it was begun, and did not reach every bound within its slack."""
         return self.outcome in (ProofOutcome.LOOSER, ProofOutcome.OPEN)
@@ -92,9 +108,11 @@ class Proof:
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
             return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"
+        if self.outcome is ProofOutcome.UNSTABLE:
+            return f"the proof denies it: {self.outcome.value}"
         if not self.stable:
-            return f"between these plants nothing is proven: {self.outcome.value}"
-        left = "; bounds of single channels are judged, not proven" if self.channels else ""
+            return f"searched, not proven: {self.outcome.value}"
+        left = f"; {self.unasked}" if self.channels else ""
         worst = max(self.levels.values(), default=0.0)
         if self.outcome is ProofOutcome.LOOSER:
             over = [name for name, level in self.levels.items() if not level <= 1.0 + self.slack]

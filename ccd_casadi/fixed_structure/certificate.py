@@ -4,9 +4,11 @@ Of plants with several inputs and outputs the whole loop is judged, by largest s
 
 From the SI matrices of K and of every plant: the closed loop is rebuilt, its eigenvalues decide
 stability; S, KS, T and GS are evaluated (`certificate_responses`) on grids through every pole and
-zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. For
-S the largest gain is confirmed by a Hamiltonian matrix (`norms`). A sampled loop is judged in z,
-its hold and delay exact, K by Tustin's rule; what happens between samples is not in it.
+zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. Of
+every figure the largest gain is confirmed by a Hamiltonian matrix (`norms`, `_raised`). A sampled
+loop is judged in z, its hold and delay exact, K by Tustin's rule; what happens between samples is
+not in it. Its GS and weighted KS and T are products of functions of z and of s, which no
+Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof has them between.
 """
 
 from collections.abc import Sequence
@@ -16,7 +18,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import expm, matrix_balance
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds, ChannelPeaks, LoopPeaks
+from ccd_casadi.fixed_structure.bounds import (
+    Bounds,
+    ChannelBounds,
+    ChannelPeaks,
+    LoopPeaks,
+    key_words,
+    kind_and_channel,
+)
 from ccd_casadi.fixed_structure.certificate_curves import (
     crossing_and_bandwidth,
     grid_through,
@@ -26,7 +35,8 @@ from ccd_casadi.fixed_structure.certificate_curves import (
 )
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable, norms
 from ccd_casadi.lti.hold import Sampling, delayed
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.units import counted
@@ -77,6 +87,7 @@ class SetCertificate:
     plants: tuple[PlantFigures, ...]
     worst: dict[str, float]
     words: str
+    grid_only: tuple[str, ...] = ()  # names of `worst` that no level test is of
 
 
 def certify(
@@ -127,7 +138,7 @@ def certify(
         shares = bounds.shares(figures) | bounds.channel_shares(figures.channels)
         for name, ratio in shares.items():
             worst[name] = float(np.maximum(worst.get(name, 0.0), ratio))  # NaN stays NaN
-    broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
+    broken = [f"{key_words(name)} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
     if broken:
@@ -139,7 +150,9 @@ def certify(
     else:
         words = f"stable and within every bound on {counted(len(found), 'plant')}"
     passed = not broken and not lost and bandwidth > 0.0
-    return SetCertificate(passed, bandwidth, tuple(found), worst, words)
+    products = ("KS", "T", "GS") if sampling is not None else ()
+    untested = tuple(name for name in worst if kind_and_channel(name)[0] in products)
+    return SetCertificate(passed, bandwidth, tuple(found), worst, words, untested)
 
 
 def judged(
@@ -192,6 +205,8 @@ def judged(
         beyond = _compliance_beyond(table, [free[i] for i in good])
         tops["GS"] = np.maximum(tops["GS"][0], beyond), tops["GS"][1]
     loops = [loops[i] for i in good]
+    for k, i in enumerate(good):
+        _raised(tops, k, loops[k], G[i], held, bounds, table.period)
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"])
     norm, confirmed = norms(loops, table.period, *tops["S"])
     channels: list[list[ChannelFigures]] = [[] for _ in good]
@@ -225,6 +240,37 @@ def judged(
             channels=tuple(channels[k]),
         )
     return found
+
+
+def _raised(
+    tops: dict[str, tuple[Array, Array]], row: int, loop: StateSpace, G: StateSpace,
+    K: StateSpace, bounds: Bounds, period: float | None,
+) -> None:  # fmt: skip
+    """Raise the largest KS, T and GS of plant `row`, weighted or not, to what a Hamiltonian finds
+    above them; `loop` is its S. Of a sampled loop KS and T alone."""
+    zero, p = np.zeros((len(G.C), len(K.A))), len(G.C)
+    of_u, of_y = np.hstack([-K.D @ G.C, K.C]), np.hstack([G.C, zero])
+    KS = StateSpace(loop.A, loop.B, of_u, K.D)
+    T = StateSpace(loop.A, loop.B, of_y, np.zeros((p, p)))
+    systems = {"KS": KS, "T": T}
+    if period is None:
+        d = np.vstack([G.B, np.zeros((len(K.A), G.B.shape[1]))])
+        systems["GS"] = StateSpace(loop.A, d, of_y, np.zeros((p, d.shape[1])))
+        if bounds.weights is not None:
+            _, of_KS, of_T = bounds.weights.filters()
+            systems["weighted KS"] = weighted(KS, np.tile(of_KS, (len(K.C), 1)))
+            of_T[1] *= bounds.weights.delta or 1.0
+            systems["weighted T"] = weighted(T, np.tile(of_T, (p, 1)))
+            for own in bounds.channels:
+                if own.M_K is not None:
+                    one = np.array([own.force]) * (bounds.weights.M_K / own.M_K)
+                    row_u = StateSpace(loop.A, loop.B, one @ of_u, one @ K.D)
+                    systems[f"weighted KS of {own.name}"] = weighted(row_u, of_KS[None])
+    for name, system in systems.items():
+        value, at = tops[name]
+        norm, place = hinf_norm(replace(system, period=period or 0.0), at[row])
+        if not norm <= value[row]:  # NaN stays NaN
+            value[row], at[row] = norm, place
 
 
 def _compliance_beyond(table: LoopTable, plants: Sequence[StateSpace]) -> Array:

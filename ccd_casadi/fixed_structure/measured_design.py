@@ -17,7 +17,7 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.channel_design import TIGHTENED
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling
@@ -35,6 +35,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Tell, silent, titled
+from ccd_casadi.support.units import HZ
 
 FEWER = 600  # lines that starts of single channels are designed on
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
@@ -65,6 +66,10 @@ class MeasuredDesign:
     words: str
     steps: int
     sign: float = 1.0
+
+    def __repr__(self) -> str:
+        order = "none" if self.controller is None else f"order {len(self.controller.A)}"
+        return f"{type(self).__name__}({order}, {self.bandwidth / HZ:.6g} Hz, {self.words!r})"
 
 
 def design_on_data(
@@ -187,7 +192,7 @@ def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int
     K = structure.state_space(si)
     figures = judge(problem.responses, K, bounds, period=period, integrator=structure.integrator)
     shares = bounds.shares(figures).items()
-    broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in shares
+    broken = [f"{key_words(name)} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in shares
               if figures.stable and not ratio <= 1.0 + EXCEEDED]  # fmt: skip
     words = figures.words
     if broken:

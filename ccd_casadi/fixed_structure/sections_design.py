@@ -147,7 +147,7 @@ class DesignSearch:
         outcome, words = SectionsOutcome.CERTIFIED, judged.words
         if short:
             outcome = SectionsOutcome.BOUND_NOT_MET
-            missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
+            missed = ", ".join(problem.bounds.missed(name, ratio) for name, ratio in short.items())
             words = f"none found from {starts} starts: the nearest controller misses {missed}"
         elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
             outcome = SectionsOutcome.NOT_CERTIFIED

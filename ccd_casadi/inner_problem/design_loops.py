@@ -37,7 +37,8 @@ def design_view(
 ) -> LoopView:
     """The view of a design; `weights` and γ of a mixed-sensitivity one."""
     bounded = kind_of(problem).bounded(weights or problem.weights, gamma, bandwidth_hz)
-    loops = design_loops(problem, theta, controller)
+    plants = kind_of(problem).members(theta)  # whose figures the result has
+    loops = [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
     return loop_view(loops, bounded, bandwidth_hz=bandwidth_hz, label=label)
 
 

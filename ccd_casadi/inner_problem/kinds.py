@@ -45,9 +45,10 @@ class InnerKind(ABC):
     and S_low.
 
     `slack`: relative, by how much its judge lets a bound be exceeded. `as_designed`: its
-    controllers run as they are, without being reduced.
+    controllers run as they are, without being reduced. `title`: of such a controller in code.
     """
 
+    title: str = "Controller"
     slack: float
     as_designed: bool
 
@@ -70,6 +71,10 @@ class InnerKind(ABC):
         """The plants on which the controller's figures count, the model first."""
         return [scaled_plant(self.problem, theta)]
 
+    def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        """Those that margins and steps are of: with the plants of a robust set."""
+        return self.plants(theta)
+
     def bounds(self) -> Bounds:
         """The bounds on every plant, SI."""
         inner = self.problem.inner
@@ -91,6 +96,7 @@ class InnerKind(ABC):
 class MixedSensitivity(InnerKind):
     """H∞ controllers by the weights W_S, W_KS and W_T, over their frequencies."""
 
+    title = "H-infinity controller"
     slack = 1e-6
     as_designed = False
 
@@ -109,6 +115,9 @@ class MixedSensitivity(InnerKind):
 
     def require_function(self) -> None:
         """It always is."""
+
+    def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        return list(scaled_plant(self.problem, theta).members)
 
     def common_shifts(self) -> tuple[float, float]:
         shift = 0.0 if self.problem.robust is None else self.problem.robust.shift
@@ -133,6 +142,7 @@ class MixedSensitivity(InnerKind):
 class FixedStructure(InnerKind):
     """Gain, notches, leads and roll-off on a set of plants, sampled or continuous."""
 
+    title = "Controller of sections (integrator, lead, notches, roll-off)"
     slack = LOOSE
     as_designed = True
 

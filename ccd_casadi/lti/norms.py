@@ -74,7 +74,7 @@ def hinf_norm(system: StateSpace, start: float | None = None) -> tuple[float, fl
     poles = np.linalg.eigvals(A)
     if not poles.real.max() < 0.0:
         return np.inf, float(abs(poles[np.argmax(poles.real)].imag))
-    omega = _first_grid(poles) if start is None else np.array([start])
+    omega = _first_grid(poles) if start is None else np.array([start, np.inf])
     values = gains(scaled, omega)
     i = int(np.argmax(values))
     best, at = float(values[i]), float(omega[i])

@@ -154,3 +154,16 @@ def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
     parts = (even[:n, :n], even[:n, n : n + m], even[n + m :, :n])
     A, B, C = (np.ascontiguousarray(part) for part in parts)
     return A, B, C
+
+
+def weighted(system: StateSpace, filters: Array) -> StateSpace:
+    """Each output of a continuous system behind its own filter of one state, rows of pole,
+    feedthrough and zero: feedthrough times (s + zero)/(s + pole)."""
+    pole, through, zero = filters.T
+    A, B, C, D = system.A, system.B, system.C, system.D
+    return StateSpace(
+        np.block([[A, np.zeros((len(A), len(C)))], [C, -np.diag(pole)]]),
+        np.vstack([B, D]),
+        np.hstack([through[:, None] * C, np.diag(through * (zero - pole))]),
+        through[:, None] * D,
+    )

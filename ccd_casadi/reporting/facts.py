@@ -10,10 +10,13 @@ from jinja2 import UndefinedError
 
 from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.plant import hardware_slopes
 from ccd_casadi.support.package_text import template
 from ccd_casadi.support.terminal import plain
 from ccd_casadi.support.units import HZ, counted, display_unit, number, small_share, with_unit
+
+HOLDS = 1e-6  # of the largest multiplier: one below it holds nothing
 
 
 def conclusion(result: Mapping[str, Any]) -> str:
@@ -157,22 +160,47 @@ def loop_lines(r: Mapping[str, Any]) -> list[str]:
 
 
 def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
-    """A sentence for everything that binds, with what loosening it would gain."""
+    """A sentence for everything that binds, with what loosening it by 1 % changes."""
     multipliers: dict[str, float] = result["kkt"]["multipliers"]
     names = list(dict.fromkeys([*multipliers, *result["active"]]))
-    return [_sentence(problem, name, multipliers.get(name)) for name in names]
+    held = _held_theta(problem, result["theta"], multipliers)
+    return [_sentence(problem, name, multipliers.get(name), held) for name in names]
 
 
-def _sentence(problem: CoDesignProblem, name: str, multiplier: float | None) -> str:
+def _held_theta(
+    problem: CoDesignProblem, theta: Mapping[str, float], multipliers: Mapping[str, float]
+) -> dict[str, float] | None:
+    """Where bounds and λ alone determine θ, df by each of them that is loosened by 1 of its
+    multiplier's unit. None where θ moves otherwise too: that takes second derivatives."""
+    point, plant = [theta[name] for name in problem.names], plant_of(problem)
+    width = np.subtract(problem.upper, problem.lower)
+    df, dlam = (rows * width for rows in hardware_slopes(plant, point))
+    rows = dict(zip(plant.constraint_names, dlam, strict=True))
+    for i, name in enumerate(problem.names):
+        rows |= {f"{name} lower": -np.eye(len(df))[i], f"{name} upper": np.eye(len(df))[i]}
+    most = max(multipliers.values(), default=0.0)
+    names = tuple(name for name, mu in multipliers.items() if name in rows and mu > HOLDS * most)
+    A = np.array([rows[name] for name in names]).reshape(len(names), len(df))
+    if len(names) != len(df) or np.linalg.matrix_rank(A) < len(df):
+        return None
+    return dict(zip(names, (df @ np.linalg.inv(A)).tolist(), strict=True))
+
+
+def _sentence(
+    problem: CoDesignProblem, name: str, multiplier: float | None, held: dict[str, float] | None
+) -> str:
     words, step, loosened = _held(problem, name)
-    if multiplier is None:
+    if multiplier is None or not loosened:  # a constraint on θ has no unit to be loosened by
         return f"{words}."
-    gain = multiplier * step  # in J, which is nobody's unit
-    worth = [problem.figure.shown(gain / abs(problem.w2), 3)] if problem.w2 else []
-    if problem.w1 > 0.0 and problem.cost_unit:
-        worth.append(f"{gain / problem.w1:.3g} {problem.cost_unit}")
-    value = " or ".join(worth) or f"{number(gain, 3)} of J"
-    return f"{words}; {loosened} is worth {value}, to first order."
+    falls = multiplier * step  # J does
+    in_J = f"J falls by {number(falls, 3)}"
+    if held is None or not problem.w2:
+        return f"{words}; {loosened}: {in_J}, to first order."
+    cost = step * held.get(name, 0.0)
+    value = (-falls - problem.w1 * cost) / problem.w2
+    v, changed = problem.figure, f"f by {number(cost, 3)} {problem.cost_unit}".rstrip()
+    moves = f"{v.symbol} changes by {v.shown(value, 3)}, {changed} ({in_J})"
+    return f"{words}; {loosened}: {moves}, to first order."
 
 
 def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
@@ -197,4 +225,4 @@ def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
         step = number(0.01 * factor * (problem.upper[i] - problem.lower[i]), 3)
         words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
         return words, 0.01, f"moving the bound outwards by {step} {unit}".rstrip()
-    return f"The constraint “{name}” binds", 1.0, "loosening it by one unit"
+    return f"The constraint “{name}” binds", 1.0, ""

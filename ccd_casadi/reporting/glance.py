@@ -13,7 +13,7 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import S_panel
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
-from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
+from ccd_casadi.reporting.nyquist import loci_of, nyquist_panel
 
 HEIGHT = 3.0  # inches of a row
 
@@ -24,7 +24,9 @@ def glance(
     """Of a design on the plants that it is made for."""
     assert isinstance(move.drawing, Lines)
     S_max = problem.inner.S_max
-    names = ("the model", "other plants") if view.scalar else ("an eigenvalue of L", "the others")
+    names = ("an eigenvalue of L", "the others")
+    if view.scalar:
+        names = ("the model", "plant 2 (and the others)")
     rows: tuple[tuple[Place, ...], ...] = (
         (machine(problem, theta), S_panel(view)),
         (
@@ -41,10 +43,7 @@ def glance(
 
 def loci(view: LoopView) -> list[np.ndarray]:
     """L of one channel on every plant, of several its eigenvalues on the model."""
-    if not view.scalar:
-        return list(loci_of(view.open[0]).T)
-    L = view.open[:, :, 0, 0]
-    return list(np.where(np.abs(L) <= FAR, L, np.nan))
+    return [line for L in view.open for line in loci_of(L).T]
 
 
 def machine(problem: CoDesignProblem, theta: Sequence[float]) -> Modes | Picture | Table:

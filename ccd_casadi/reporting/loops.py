@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import NAMES, LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, Mark, Panel
-from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
+from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.reporting.facts import paragraph
@@ -97,8 +97,15 @@ def gain_panels(views: Sequence[LoopView], *, bounds: bool = True) -> list[Panel
 
 
 def S_panel(view: LoopView) -> Panel:
-    """S of one design with what is asked of it, its highest peak alone marked."""
-    marks = tuple(_peak_marks(_high_peaks(view)[:1], BLACK))
+    """S of one design with what is asked of it, its highest peak alone marked; of several plants
+    that of the model and that of all."""
+    several = len(view.loops) > 1
+    marks = tuple(_peak_marks(_high_peaks(view)[:1], BLACK, ", the model" * several))
+    if several:
+        _, i = np.unravel_index(view.sizes[0].argmax(), view.sizes[0].shape)
+        top = float(view.hz[i]), float(view.sizes[0].max())
+        worst = _peak_marks([top], GREEN, ", worst plant")
+        marks = (*(replace(mark, offset=(0.0, -14.0)) for mark in marks), *worst)
     return _gain_panel([view], 0, view.bounded.asked, marks=marks)
 
 
@@ -190,13 +197,13 @@ def _high_peaks(view: LoopView) -> list[tuple[float, float]]:
     return sorted((p for p in view.peaks if p[1] > PEAK), key=lambda p: -p[1])
 
 
-def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:
+def _peak_marks(tops: Sequence[tuple[float, float]], colour: str, of: str = "") -> list[Mark]:
     """The highest peak labelled above it, up to three others to their far side of it."""
     marks = []
     for hz, gain in tops[:4]:
         text, offset = f"{number(hz, 4)} Hz", (7.0 if hz > tops[0][0] else -7.0, 2.0)
         if hz == tops[0][0]:
-            text, offset = f"{gain:.3g} at {text}", (0.0, 7.0)
+            text, offset = f"{gain:.3g} at {text}{of}", (0.0, 7.0)
         marks.append(Mark(hz, gain, text, colour=colour, offset=offset))
     return marks
 

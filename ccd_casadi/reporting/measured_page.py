@@ -15,7 +15,7 @@ from ccd_casadi.lti.closed_loop import equivalent_open_loop, sensitivity, sigma_
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import facts
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
-from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
+from ccd_casadi.reporting.nyquist import near, nyquist_panel
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number
@@ -77,7 +77,7 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
     ends = (float(hz[0]), float(hz[-1]))
     top = 2.5 * max(bounds.S_max, *(float(curve.y.max()) for curve in curves["S"]))
     at = bandwidth_level(answer["bandwidth_hz"])
-    shown = [np.where(np.abs(L) <= FAR, L, np.nan) for L in loci]
+    shown = [near(L) for L in loci]
     rows = (
         (sensitivity_panel(
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",

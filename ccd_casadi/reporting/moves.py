@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis import loop_figures
+from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.analysis.motor import UNLIMITED, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
@@ -16,17 +16,18 @@ from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.numbers import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, display_unit, with_unit
+from ccd_casadi.support.units import HZ, display_unit, with_unit
 
 POINTS = 600
-SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
-STEPS = 200  # points of it
+STEPS = 200  # points of a force step
 DRAWN = 1200  # points of a curve of a move on the machine
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
@@ -102,19 +103,25 @@ def cycle_chapter(
     return [c.Chapter("The motor", (c.Figure(lines, words),))]
 
 
-def force_step(view: LoopView) -> c.Figure:
-    """The position of every plant after a step of force at the actuator."""
-    loops = view.loops
-    slow = min(float(-loop.poles.real.max()) for loop in loops)
-    times = np.geomspace(0.02 / (HZ * view.bandwidth_hz), SETTLED / slow, STEPS)
-    steps = [loop_figures.force_step(loop, times) for loop in loops]
-    t = steps[0][0]
-    y = np.array([step[1] for step in steps])
-    unit, factor = display_unit("m", float(np.abs(y).max()))
+def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView) -> c.Figure:
+    """The position of every plant after a step of 1 N, of the pair that moves most."""
+    K, bandwidth = view.loop.controller, HZ * view.bandwidth_hz
+    loops = [Loop(one.plant_si(), K, problem.sampling) for one in kind_of(problem).members(theta)]
+    most, seconds = largest_force_step(loops, bandwidth), max(map(rest_time, loops))
+    drawn = []
+    for loop in loops:
+        t, y = force_response(loop, bandwidth, seconds)
+        spread = np.geomspace(t[1], min(t[-1], seconds), STEPS)
+        kept = np.unique(np.searchsorted(t, [*spread[:-1], most.seconds]))
+        drawn.append(y[most.actuator, most.output][kept])
+    t, y = t[kept], np.array(drawn)
+    unit, factor = display_unit("m", most.size)
     curves, bands = of_plants(1e3 * t, factor * y)
-    panel = c.Panel("time (ms)", f"y after a step of 1 N ({unit})", curves, bands, log_x=True)
-    on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
-    words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
+    top = factor * y[most.plant, np.searchsorted(t, most.seconds)]
+    mark = c.Mark(1e3 * most.seconds, top, with_unit(most.size, "m"))
+    panel = c.Panel("time (ms)", f"y after a step of 1 N ({unit})", curves, bands, log_x=True,
+                    marks=(mark,))  # fmt: skip
+    words = paragraph("report.force", most, len(loops), view.scalar)
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
 
@@ -189,9 +196,13 @@ def shown_until(found: Move) -> float:
 def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
-    when = "does not settle" if np.isinf(settled) else (
-        f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "stays within its window"
-    )  # fmt: skip
+    late = [m for m in made if np.isinf(m.settled)]
+    when = "stays within its window" if not settled else f"settled after {with_unit(settled, 's')}"
+    if late:
+        when = "does not settle" if any(m.rest > m.window for m in late) else (
+            f"not settled within {with_unit(min(float(m.time[-1]) for m in late), 's')}"
+        )  # fmt: skip
+        when += f" ({with_unit(max(m.final_error for m in late), 'm')} left)"
     words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:

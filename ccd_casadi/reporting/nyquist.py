@@ -72,4 +72,9 @@ def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:
         for i in range(1, len(values)):
             away = np.abs(values[i - 1][:, None] - values[i][None, :])
             values[i] = values[i][scipy.optimize.linear_sum_assignment(away)[1]]
-    return np.where(np.abs(values) <= far, values, np.nan)
+    return near(values, far)
+
+
+def near(values: np.ndarray, far: float = FAR) -> np.ndarray:
+    """What is drawn of a locus; beyond `far` neither part is known to a reader."""
+    return np.where(np.abs(values) <= far, values, complex(np.nan, np.nan))

@@ -138,7 +138,7 @@ def design_parts(
         "design": lambda: [design_chapter(problem, result)],
         "move": lambda: [c.Chapter("A move", (move(),))],
         "motor": lambda: cycle_chapter(own, theta, result),
-        "force": lambda: [c.Chapter("A step of force", (force_step(view),))],
+        "force": lambda: [c.Chapter("A step of force", (force_step(own, theta, view),))],
         "stage": lambda: stage_chapters(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_chapter(own, theta, view.loop.controller),
         "loop": lambda: _loop(own, theta, view),

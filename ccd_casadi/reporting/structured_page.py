@@ -55,7 +55,8 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
             if own == kind:
                 of = f" of channel {channel}" if channel else ""
                 worth = v.shown(0.01 * mu[name] * most, 3)
-                over_kappa.append(f"{words}{of} binds; 1 % more of it is worth {worth}.")
+                more = f"1 % more of it gives {worth} on this hardware"
+                over_kappa.append(f"{words}{of} binds; {more}.")
     ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
     ends = [f"{name if ': ' in name else name[:1].upper() + name[1:]} is at the {end} end of its "
             "range." for name, _, end in ranges]  # fmt: skip

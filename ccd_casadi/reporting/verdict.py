@@ -5,10 +5,12 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from ccd_casadi.analysis.loop_figures import PERIODS
 from ccd_casadi.codesign.verdict import OwnSet, State
 from ccd_casadi.drawing.content import Head, VerdictLine
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.support.terminal import columns, wrapped
+from ccd_casadi.support.units import with_unit
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 NEXT = {  # what to do about a line that failed
@@ -52,6 +54,15 @@ def worst_state(result: Mapping[str, Any]) -> State:
     return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
 
 
+def unproven(result: Mapping[str, Any]) -> str | None:
+    """Why `survives` is neither passed nor warned; None where it is one of them."""
+    line = next((line for line in lines_of(result) if line.name == "survives"), None)
+    if line is None or line.state != State.UNKNOWN:
+        return None
+    own = result["verdict"]["survives"].get("set")
+    return "searched, not proven" if own == OwnSet.SEARCHED else "not known"
+
+
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """`survives      warned   stable for ...`, wrapped under their words."""
     lines = [f"{line.name:14s}{line.state:9s}{line.words}" for line in lines_of(result)]
@@ -67,6 +78,7 @@ def head_of(
     `decision`: what the page answers, where that is not whether to build the design.
     """
     clean = worst_state(result) is State.PASSED and not loop_concerns(result)
+    clean &= unproven(result) is None
     badge = "bad" if not good else "good" if clean else "warn"
     decision = decision or advice(result)
     return Head(title, badge, status, reason, meta, lead, lines_of(result), decision)
@@ -121,6 +133,11 @@ def advice(result: Mapping[str, Any]) -> str:
             words = "Do not build this yet: it was judged on the model alone."
         return f"{words} Next: {NEXT['survives']}."
     warned = [f"{name} warned" for name, state in states.items() if state == State.WARNED]
+    if states.get("survives") == State.UNKNOWN:
+        if unproven(result) == "not known":
+            words = "Do not build this yet: what it survives is not known."
+            return f"{words} Next: {NEXT['survives']}."
+        warned.append(f"the [robust] set is {unproven(result)}")
     unjudged = states.get("deployable") == State.UNKNOWN
     if warned or looked_at:
         words = f"Build this only if you accept: {'; '.join([*warned, *looked_at])}."
@@ -147,8 +164,12 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
         if overshoot > OVERSHOOT:
             usual = f"usual: at most {100.0 * OVERSHOOT:g}"
             found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
-        if result["settling_ms"] is None:
-            found.append("a step does not settle within 160 periods of the bandwidth")
+        settled = result["settling_ms"]
+        if settled is None:
+            found.append("a step does not settle within 2 %")
+        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > PERIODS:
+            late = f"only after {with_unit(1e-3 * settled, 's')}"
+            found.append(f"a step settles {late}, {PERIODS:g} periods of the bandwidth or more")
     reach = result.get("sensitivity_peak_between_lines")  # of a measured response
     if reach is not None and reach > BETWEEN * result["sensitivity_peak"]:
         where = result.get("sensitivity_peak_between_lines_hz")
@@ -165,6 +186,8 @@ def head_words(result: Mapping[str, Any]) -> str:
     )
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
+    if not warned and unproven(result) is not None:
+        return f"all that could be checked passed; survives: {unproven(result)}"
     if not warned:
         return "all checks passed" + ("; the loop needs a look" if loop_concerns(result) else "")
     return f"with warnings: {', '.join(warned)}"

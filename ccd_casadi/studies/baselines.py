@@ -16,18 +16,25 @@ import numpy as np
 from ccd_casadi.cases.case import Case, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.design_entries import figures_dict
-from ccd_casadi.codesign.structured_entries import active_of, design_dict
+from ccd_casadi.codesign.robust_check import survived
+from ccd_casadi.codesign.structured_entries import active_of, box_words, design_dict
+from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.verdict import VerdictLine, survives
+from ccd_casadi.codesign.verified_mixed import robust_words
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
 from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 
@@ -79,8 +86,10 @@ class Baseline(ABC):
         """A design under the contract's keys, with its status and what is active."""
 
     @abstractmethod
-    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
-        """Its controller, SI."""
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
+    ) -> tuple[StateSpace, VerdictLine]:
+        """Its controller (SI), and what that survives: the line of the verdict of a run."""
 
 
 class MixedBaseline(Baseline):
@@ -108,9 +117,14 @@ class MixedBaseline(Baseline):
         active = list(active_constraints(inner, found))
         return figures_dict(found) | {"status": STATUS[inner.feasible(found)], "active": active}
 
-    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
+    ) -> tuple[StateSpace, VerdictLine]:
         at = (design.figures.omega_S, design.figures.omega_T)
-        return final_design(self.problem, theta, at).controller
+        K = final_design(self.problem, theta, at).controller
+        found, robust = survived(self.problem, loops_of(self.problem, theta, K), design.figures)
+        own = {} if robust is None else robust_words(robust)
+        return K, survives(found, S_max=self.problem.inner.S_max, **own)
 
 
 class StructuredBaseline(Baseline):
@@ -135,9 +149,17 @@ class StructuredBaseline(Baseline):
         entries = design_dict(self.problem, theta, design)
         return entries | {"status": STATUS[design.certified], "active": active_of(design)}
 
-    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
-        assert design.controller is not None
-        return design.controller
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
+    ) -> tuple[StateSpace, VerdictLine]:
+        K, on_box = design.controller, DesignOnBox(self.problem, theta, design)
+        worst = on_box.worst()[0]
+        wide, checked, proof = on_box.judged(worst, workers)
+        found = survived(self.problem, loops_of(self.problem, theta, K), design)[0]
+        drawn = None if proof.conclusive else on_box.fresh_yield(workers)
+        along = found is not None and found.within(*kind_of(self.problem).common_shifts())
+        own = box_words(wide, checked, proof, worst, drawn, along=along)
+        return K, survives(found, S_max=self.problem.inner.S_max, **own)
 
 
 def case_to_compare(path: Path, command: str) -> tuple[Case, CoDesignProblem]:

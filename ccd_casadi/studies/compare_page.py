@@ -20,7 +20,7 @@ from ccd_casadi.reporting.solve_page import stage_chapters
 from ccd_casadi.reporting.verdict import lines_of, worst_state
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
-from ccd_casadi.studies.conclusions import LABELS
+from ccd_casadi.studies.conclusions import LABELS, stable_words
 from ccd_casadi.support.units import HZ, number
 
 
@@ -71,7 +71,7 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[c.Table,
     cost = f"cost f ({problem.cost_unit})" if problem.cost_unit else "cost f"
     head = (
         "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "global check",
-        "s", "certified",
+        "s", "certified", "stable for resonances", "survives",
     )  # fmt: skip
     rows: list[tuple[Any, ...]] = []
     for name, figures in answer["methods"].items():
@@ -81,11 +81,12 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[c.Table,
             continue
         spent = figures["syntheses_to_optimum"]
         own = (str(spent), str(figures["syntheses"] - spent or "–"), number(figures["seconds"], 2),
-               "yes" if figures["certificate"]["passed"] else "no")  # fmt: skip
+               "yes" if figures["certificate"]["passed"] else "no", stable_words(figures),
+               figures["verdict"]["survives"]["state"])  # fmt: skip
         rows.append((LABELS[name], *_row(figures, factors), *own))
     for name, label in (("sequential", "paper: sequential"), ("nested_ccd", "paper: nested CCD")):
         if name in answer["published"]:
-            rows.append((label, *_row(answer["published"][name], factors), *["–"] * 4))
+            rows.append((label, *_row(answer["published"][name], factors), *["–"] * 6))
     words = (
         "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
         "Syntheses are those to the optimum; what the global check over the box adds to them "

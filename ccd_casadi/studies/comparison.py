@@ -104,7 +104,8 @@ def compare(
     problem = _chosen(problem, methods)
     given = replace(given, problem=problem)
     descents = _descents(given)
-    methods += [_best_descent(problem, descents, each) for each in baseline_of(problem).gradients]
+    methods += [_best_descent(problem, descents, each, workers)
+                for each in baseline_of(problem).gradients]  # fmt: skip
     methods += [_sequential(given, "sequential", 0), _sequential(given, "sequential_global", 8)]
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
 
@@ -156,7 +157,7 @@ def _descents(given: _Setting) -> list[Descent]:
 
 
 def _best_descent(
-    problem: CoDesignProblem, descents: Sequence[Descent], gradient: Gradient
+    problem: CoDesignProblem, descents: Sequence[Descent], gradient: Gradient, workers: Pool
 ) -> Method:
     """The descent of that gradient with the best J, fewest syntheses among equals."""
     runs = [descent for descent in descents if descent.gradient is gradient]
@@ -172,13 +173,13 @@ def _best_descent(
         figures = {"status": "infeasible", "reason": best.stop.value, **spent_entry(spent)}
         return Method(name, json_values(figures | extra), (), ())
     theta = best.iterates[-1].theta
-    figures = _figures(problem, theta, best.design, spent, best.seconds) | extra
+    made, figures = _figures(problem, theta, best.design, spent, best.seconds, workers)
+    figures |= extra
     trace = tuple(
         TraceEntry(item.syntheses, item.theta, item.bandwidth, item.objective)
         for item in best.iterates
     )
     path = tuple(item.theta for item in best.iterates)
-    made = baseline_of(problem).controller(theta, best.design)
     return Method(name, json_values(figures), path, trace, controller=made)
 
 
@@ -207,11 +208,10 @@ def _sequential(given: _Setting, name: str, starts: int) -> Method:
         if not sample.feasible:
             figures = {"status": "infeasible", "reason": sample.shortfall, **spent_entry(spent)}
             return Method(name, figures, (hardware.theta,), trace)
-    baseline = baseline_of(problem)
-    design = baseline.design_of(sample)
-    figures = _figures(problem, hardware.theta, design, spent, perf_counter() - began)
+    design = baseline_of(problem).design_of(sample)
+    seconds = perf_counter() - began
+    made, figures = _figures(problem, hardware.theta, design, spent, seconds, given.workers)
     figures |= {"resonance_met": hardware.met, "active": list(sample.active)}
-    made = baseline.controller(hardware.theta, design)
     return Method(name, json_values(figures), (hardware.theta,), trace, controller=made)
 
 
@@ -221,11 +221,16 @@ def _figures(
     design: AnyDesign,
     spent: dict[str, int],
     seconds: float,
-) -> dict[str, Any]:
-    """The contract's keys for a design that no formulation made."""
-    own = baseline_of(problem).figures(theta, design)
-    return {
+    workers: Pool,
+) -> tuple[StateSpace, dict[str, Any]]:
+    """The controller of a design that no formulation made, and the contract's keys for it, with
+    what it survives: it may look better than a run's by not having been asked."""
+    baseline = baseline_of(problem)
+    own = baseline.figures(theta, design)
+    made, line = baseline.judged(theta, design, workers)
+    return made, {
         **own,
+        "verdict": {"survives": line.entry},
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": hardware_cost(plant_of(problem), theta),
         "objective": objective(problem, theta, HZ * own["bandwidth_hz"]),

@@ -3,6 +3,7 @@
 from typing import Any
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.reporting.verdict import advice
 from ccd_casadi.support.units import counted
 
 EQUAL = 1e-6  # relative difference of J that counts as none
@@ -41,7 +42,23 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     for i, name in enumerate(against):  # the best of them stands first: it is the answer
         answer[name], sentence = _sequential(solved[name], solved[cheapest], name)
         sentences.insert(len(sentences) if i else 0, sentence)
+    if said := decision(solved[cheapest]):
+        sentences[0] = f"{said} That is the best design, of {LABELS[cheapest]}. {sentences[0]}"
     return answer | {"sentences": sentences}
+
+
+def decision(figures: dict[str, Any]) -> str:
+    """Whether to build a design: of a baseline, which has no other line, by what it survives."""
+    words = advice(figures)
+    if words and "certified" not in figures.get("verdict", {}) and words.startswith("Build"):
+        return "Solve the case before you build this: a baseline has no whole verdict."
+    return words
+
+
+def stable_words(figures: dict[str, Any]) -> str:
+    """For resonances how far off a loop is stable, in %; what is not known is a dash."""
+    shift = figures.get("verdict", {}).get("survives", {}).get("stable_shift")
+    return "–" if not shift else f"{100.0 * shift[0]:+.2g} to {100.0 * shift[1]:+.2g} %"
 
 
 def _beside(figures: dict[str, Any]) -> str:

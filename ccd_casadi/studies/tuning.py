@@ -74,6 +74,9 @@ class Tuned:
     norms: tuple[float | None, ...]
     judge: Judgement = NOT_JUDGED
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.case.file!r}, {self.design!r})"
+
     @property
     def controller(self) -> StateSpace | None:
         """K(s) in SI, e = r - y to u; it runs by Tustin's rule."""

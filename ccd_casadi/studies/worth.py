@@ -33,6 +33,7 @@ from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import OuterFailure, outer_program, solve_program
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -41,6 +42,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.sequential import design_hardware, first_resonance
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -126,6 +128,11 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         }
         for sample in (known[0], ahead.best)
     ]
+    baseline = baseline_of(sampler.problem)
+    for entry, sample in zip(entries, (known[0], ahead.best), strict=True):
+        if sample.feasible:
+            own = baseline.design_of(sample)
+            entry["survives"] = baseline.judged(sample.theta, own, sampler.workers)[1].entry
     old, bandwidth = entries[0]["hardware_cost"], known[0].bandwidth
     gain = objective(problem, known[0].theta, bandwidth) - objective_of(problem, ahead.best)
     return {
@@ -209,9 +216,13 @@ def worth_words(found: Mapping[str, Any]) -> list[str]:
             " to ".join(dict.fromkeys(f"{v:+z.1f}" for v in found[f"full_solve_{key}_percent"]))
             for key in ("hardware_cost", "bandwidth")
         )
+        weak = found["co_design"].get("survives", {"state": State.UNKNOWN, "words": "not known"})
+        answer = f"Co-design is {'hardly ' * hardly}worth it"
+        if weak["state"] != State.PASSED:
+            answer += f", but its design is not to be built as it is (survives {weak['state']})"
         settled = "" if found["settled"] else f"; {ROUNDS} rounds did not settle it"
         lines = [
-            f"answer        Co-design is {'hardly ' * hardly}worth it: "
+            f"answer        {answer}: "
             f"hardware cost {found['hardware_cost_percent']:+z.1f} %, "
             f"bandwidth {found['bandwidth_percent']:+z.1f} % "
             "against the sequential design. Both designs are certified.",
@@ -221,6 +232,8 @@ def worth_words(found: Mapping[str, Any]) -> list[str]:
     for label, each in (("sequential", found["sequential"]), ("co-design", found["co_design"])):
         hz = f"{number(each['bandwidth_hz'])} Hz"
         lines.append(f"{label:14s}{theta_words(each)}: {cost_words(each)}, {hz}")
+        if line := each.get("survives"):
+            lines.append(f"              survives {line['state']}: {line['words']}")
     met = "met" if found["resonance_met"] else "not met anywhere in the box"
     rule = f"first resonance {number(found['first_resonance_hz'], 4)} Hz, the rule is {met}"
     return [*lines, f"hardware      {rule}", f"cost          {found['syntheses']} syntheses"]

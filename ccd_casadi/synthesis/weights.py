@@ -71,17 +71,22 @@ class Weights:
             ]
         )
 
+    def filters(self) -> NDArray[np.float64]:
+        """Pole, feedthrough and zero (3, 3) of W1, W2 and W3: each is feedthrough times
+        (s + zero)/(s + pole)."""
+        return np.array([
+            (self.omega_S * self.A_S, 1.0 / self.M_S, self.omega_S * self.M_S),
+            (self.c_K * self.omega_K, self.c_K / self.M_K, self.omega_K),
+            (self.omega_T / self.A_u, 1.0 / self.A_u, self.omega_T / self.A_l),
+        ])  # fmt: skip
+
     def responses(self, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
         """The weights of S, KS and T at jω as rows (3, len(omega)); omega in rad/s.
 
         With a disturbance that of T (one channel: KSG) is δ W3.
         """
+        pole, through, zero = self.filters().T[..., None]
         s = 1j * np.asarray(omega)
-        share = self.delta or 1.0
-        return np.array(
-            [
-                (s / self.M_S + self.omega_S) / (s + self.omega_S * self.A_S),
-                self.c_K * (s + self.omega_K) / (self.M_K * (s + self.c_K * self.omega_K)),
-                share * (s + self.omega_T / self.A_l) / (self.A_u * s + self.omega_T),
-            ]
-        )
+        found = through * (s + zero) / (s + pole)
+        found[2] *= self.delta or 1.0
+        return np.asarray(found)

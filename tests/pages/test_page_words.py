@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ccd_casadi import reporting
 from ccd_casadi.analysis.move import Move
@@ -14,16 +16,18 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulation import Iterate
 from ccd_casadi.codesign.verdict import OwnSet
-from ccd_casadi.deployment.words import against
+from ccd_casadi.deployment.robust_set import MemberLoop
+from ccd_casadi.deployment.words import against, deployed_line
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.reporting.facts import conclusion, facts, theta_table, theta_words
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
-from ccd_casadi.reporting.moves import shown_until, ways_figure
-from ccd_casadi.reporting.nyquist import nyquist_panel
+from ccd_casadi.reporting.moves import shown_until, way_words, ways_figure
+from ccd_casadi.reporting.nyquist import near, nyquist_panel
 from ccd_casadi.reporting.prediction import history_blocks
 from ccd_casadi.reporting.robustness_page import shown_peak
 from ccd_casadi.reporting.verdict import LINES, advice, head_of, run_head
@@ -117,6 +121,28 @@ def test_a_page_says_first_whether_to_build_it(states: dict, said: str) -> None:
     alone = result_of(survives="warned")  # nothing was found against it
     alone["verdict"]["survives"]["set"] = OwnSet.NONE
     assert advice(alone).startswith("Do not build this yet: it was judged on the model alone.")
+    unknown = result_of(survives="unknown")  # what could not be checked has not passed
+    assert advice(unknown).startswith("Do not build this yet: what it survives is not known.")
+    unknown["verdict"]["survives"]["set"] = OwnSet.SEARCHED
+    assert "the [robust] set is searched, not proven" in advice(unknown)
+    head = run_head("", unknown, "", "")
+    assert head.badge == "warn"
+    assert "all checks passed" not in head.reason.lower()
+
+
+@given(st.floats(1e-8, 1e-3), st.floats(0.0, 1e-3), st.booleans())
+def test_a_move_does_not_settle_only_where_its_error_stays(
+    window: float, rest: float, known: bool
+) -> None:
+    """What decays and was not watched for long enough has not settled within that time."""
+    time = np.linspace(0.0, 0.5, 200)
+    error = 2.0 * window + max(rest, 2.0 * window) * np.exp(-time)
+    made = Move(time, time, time, error, time[:, None], False, 0.2, window,
+                rest=rest if known else np.nan)  # fmt: skip
+    words = way_words("feedback alone", [made])
+    assert ("does not settle" in words) == (known and rest > window)
+    assert ("not settled within 500 ms" in words) == (not known or rest <= window)
+    assert " left)" in words
 
 
 @pytest.mark.parametrize(
@@ -128,6 +154,11 @@ def test_a_page_says_first_whether_to_build_it(states: dict, said: str) -> None:
         ({"step_overshoot": 0.62, "settling_ms": 14.0}, "a step overshoots by 62 %"),
         ({"step_overshoot": 0.62, "settling_ms": 14.0, "move": {}}, ""),
         ({"step_overshoot": 0.1, "settling_ms": None}, "a step does not settle"),
+        (
+            {"step_overshoot": 0.1, "settling_ms": 4e3, "bandwidth_hz": 50.0},
+            "a step settles only after 4 s",
+        ),
+        ({"step_overshoot": 0.1, "settling_ms": 3e3, "bandwidth_hz": 50.0}, ""),
         ({"loop_warnings": ["the closed loop rings"]}, "the closed loop rings"),
     ],
 )
@@ -206,6 +237,32 @@ def test_insight_and_compare_begin_with_their_answer() -> None:
     said = conclusions(problem, {"lifted": best, "sequential": other})["sentences"]
     assert said[0].endswith("changes the hardware cost by -20.0 % and the bandwidth by +20.0 %.")
     assert conclusions(problem, {"lifted": best})["sentences"][0].startswith("The best J")
+    weak = best | {"status": "verified"} | {"verdict": result_of(survives="warned")["verdict"]}
+    said = conclusions(problem, {"lifted": weak, "sequential": other})["sentences"]
+    assert said[0].startswith("Do not build this: it does not survive small errors of its model.")
+    assert "-20.0 % and the bandwidth by +20.0 %" in said[0]
+
+
+def test_a_deployment_says_bandwidth_and_peak_of_one_plant_together() -> None:
+    """The model's pair, and that of the plant with the largest peak."""
+    model = SimpleNamespace(bandwidth=48.2 * HZ, sensitivity_peak=1.64, stable=True)
+    other = SimpleNamespace(bandwidth=48.4 * HZ, sensitivity_peak=1.72, stable=True)
+    worst = MemberLoop(Perturbation(0.03), other)
+    found = SimpleNamespace(
+        sampled=model, worst=worst, members=(worst,), rate_hz=1e4, delay=1e-4, needed_hz=1e4,
+        realisation=SimpleNamespace(system=SimpleNamespace(A=np.zeros((4, 4)))), stable=True,
+        shortfalls=(), unverified="", target=SimpleNamespace(excess=0.05),
+    )  # fmt: skip
+    run = SimpleNamespace(problem=SimpleNamespace(inner=SimpleNamespace(S_max=1.75)))
+    words = deployed_line(run, found).words
+    assert "on the model bandwidth 48.2 Hz, peak of S 1.64;" in words
+    assert "(resonances +3 %) bandwidth 48.4 Hz, peak of S 1.72" in words
+
+
+def test_what_a_nyquist_plot_leaves_out_has_no_half_of_a_point() -> None:
+    found = near(np.array([1.0 + 2.0j, 1e4 - 3.0j, -0.5j, np.inf]))
+    np.testing.assert_array_equal(np.isnan(found.real), np.isnan(found.imag))
+    np.testing.assert_array_equal(np.isnan(found.real), [False, True, False, True])
 
 
 def test_arrows_of_a_nyquist_plot_point_to_higher_frequencies() -> None:

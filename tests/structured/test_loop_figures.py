@@ -7,12 +7,17 @@ from hypothesis import strategies as st
 from oracles.fixed_structure_loops import FAST, LATE, loop, plant
 
 from ccd_casadi.analysis.loop_figures import (
+    PERIODS,
+    largest_force_step,
     light_roots,
     loop_entry,
     measured_entry,
     ringing,
     step_figures,
 )
+from ccd_casadi.analysis.move import simulate
+from ccd_casadi.analysis.move_limits import LIMITS
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.lti.hold import tustin
 from ccd_casadi.lti.loop import Loop
@@ -82,7 +87,8 @@ def test_a_second_order_loop_has_the_textbook_s_step(damping: float, hz: float) 
     A = np.array([[0.0, 1.0], [-soft * 2.0 * damping * w, -2.0 * damping * w - soft]])
     G = StateSpace(A, np.array([[0.0], [1.0 / mass]]), np.eye(1, 2), np.zeros((1, 1)))
     K = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[mass * w**2]]))
-    overshoot, settling, by_force = step_figures(Loop(G, K), w)
+    overshoot, settling = step_figures(Loop(G, K), w)
+    by_force = largest_force_step([Loop(G, K)], w).size
     expected = np.exp(-np.pi * damping / np.sqrt(1.0 - damping**2))
     assert overshoot == pytest.approx(expected, abs=1e-3)
     assert by_force == pytest.approx((1.0 + expected) / (mass * w**2), rel=2e-3)
@@ -90,6 +96,47 @@ def test_a_second_order_loop_has_the_textbook_s_step(damping: float, hz: float) 
     inside = np.log(0.02 * np.sqrt(1.0 - damping**2)) / (-damping * w)
     assert settling <= inside * 1.01
     assert settling >= inside - np.pi / (w * np.sqrt(1.0 - damping**2)) - 0.02 / hz
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+@pytest.mark.parametrize("soft_hz", [0.05, 0.3])
+def test_a_force_step_is_followed_to_its_largest(soft_hz: float, sampling: Sampling | None) -> None:
+    """Two masses that are apart: a stiff loop, and a soft light spring whose overshoot comes long
+    after 160 periods of ω_b; by the closed form k⁻¹(1 + exp(-πζ/√(1 - ζ²))) of the spring."""
+    w, soft, damping = 50.0 * HZ, soft_hz * HZ, 0.05
+    A = np.zeros((4, 4))
+    A[0, 1] = A[2, 3] = 1.0
+    A[1] = [-(w**2), -w, 0.0, 0.0]
+    A[3] = [0.0, 0.0, -(soft**2), -2.0 * damping * soft]
+    B, C = np.zeros((4, 2)), np.zeros((2, 4))
+    B[1, 0], B[3, 1], C[1, 0], C[0, 2] = 1.0, 1.0, 1.0, 1.0
+    none = np.zeros((2, 2))
+    K = StateSpace(-np.eye(1), np.zeros((1, 2)), np.zeros((2, 1)), none)
+    stiff = StateSpace(A[:2, :2], B[:2, :1], np.eye(1, 2), none[:1, :1])
+    one = StateSpace(-np.eye(1), np.zeros((1, 1)), np.zeros((1, 1)), none[:1, :1])
+    found = largest_force_step([Loop(StateSpace(A, B, C, none), K, sampling)], w)
+    over = np.exp(-np.pi * damping / np.sqrt(1.0 - damping**2))
+    assert found.size == pytest.approx((1.0 + over) / soft**2, rel=1e-3)
+    assert found.seconds == pytest.approx(0.5 / soft_hz, rel=0.05)
+    assert found.seconds > (PERIODS if soft_hz < 0.1 else 0.1 * PERIODS) / 50.0
+    assert found.pair == "output 1 by actuator 2"
+    both = [Loop(stiff, one, sampling), Loop(turned(stiff, 3.0), one, sampling)]
+    assert largest_force_step(both, w).plant == 1
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_the_error_that_stays_is_that_of_a_long_move(sampling: Sampling | None) -> None:
+    """A spring of k and a gain of 3 k: a quarter of the way is left; a free mass: nothing."""
+    w, m, gain = 20.0 * HZ, 3.0, 3.0 * 3.0 * (20.0 * HZ) ** 2
+    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+    for stiffness, left in ((w**2, 0.25 * LIMITS.stroke), (0.0, 0.0)):
+        A = np.array([[0.0, 1.0], [-stiffness, -2.0 * w]])
+        G = StateSpace(A, np.array([[0.0], [1.0 / m]]), np.eye(1, 2), np.zeros((1, 1)))
+        own = Loop(G, StateSpace(*none, np.array([[gain]])), sampling)
+        made = simulate(own, setpoint(LIMITS), axis=0, forces=None, window=1e-9, bandwidth_hz=20.0)
+        assert made.rest == pytest.approx(left, abs=1e-12)
+        assert abs(made.error[-1]) == pytest.approx(left, abs=1e-8)
+        assert np.isinf(made.settled) == (left > 0.0)
 
 
 def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
