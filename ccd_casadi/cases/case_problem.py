@@ -1,6 +1,7 @@
 """A case in SI: the co-design problem that the lower layers take."""
 
 from collections.abc import Mapping
+from secrets import token_hex
 from typing import Any
 
 from ccd_casadi.cases.budget import error_budget
@@ -22,10 +23,12 @@ from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import kept_quiet
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import HZ
-from ccd_casadi.support.user_code import raised_words
+from ccd_casadi.support.user_code import GivenFunction, raised_words
 
 
+@one_blas_thread
 def problem_of(case: Case) -> CoDesignProblem:
     """The case in SI, with its plant, which is made once here.
 
@@ -52,8 +55,10 @@ def problem_of(case: Case) -> CoDesignProblem:
     (('m1', 'm2'), -0.995, 6.283)
     """
     inner = case.inner
-    file = function = None
-    if case.plant.function is not None:
+    file = function = given = None
+    if callable(case.plant.function):
+        function, given = case.plant.name, GivenFunction(case.plant.function)
+    elif case.plant.function is not None:
         name, function = case.plant.function.rsplit(":", 1)
         file = str((case.path.parent / name).resolve())
     structured = case.controller.structure == "sections"
@@ -64,9 +69,11 @@ def problem_of(case: Case) -> CoDesignProblem:
             function,
             _options(case.plant.options),
             case.limits.plant_seconds,
+            content=None if given is None else token_hex(),
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
             motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
             places=places_of(case.places),
+            given=given,
         ).pinned(),
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),

@@ -32,7 +32,7 @@ def plant_report(
     count = min(len(item.modes) for item in facts)
     hertz = np.array([[mode.frequency_hz for mode in item.modes[:count]] for item in facts])
     return {
-        "plant": case.plant.model or case.plant.function,
+        "plant": case.plant.name,
         "inputs": plant.inputs,
         "outputs": plant.outputs,
         "notes": list(plant.notes(problem.start)),

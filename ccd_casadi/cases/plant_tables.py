@@ -50,7 +50,7 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
         hint = checks.closest(str(model), model_names())
         words = f"is {short_repr(model)}, not a known model{hint}; or use function"
         raise fail("plant.model", words)
-    if function is not None:
+    if function is not None and not callable(function):
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
         if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
             raise fail("plant.function", f'is {short_repr(function)}; write "my_plant.py:model"')

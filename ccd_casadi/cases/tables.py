@@ -4,7 +4,7 @@ Units are those of the file (Hz where a name says so).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -14,17 +14,26 @@ from ccd_casadi.cases.checks import key
 from ccd_casadi.cases.motion import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.user_code import name_of
 
 Spectra = tuple[Mapping[str, Any], ...]
 
 
 @dataclass(frozen=True)
 class PlantTable:
-    """[plant]: a model's name or function = "file.py:name"; all other keys are its options."""
+    """[plant]: a model's name or function = "file.py:name"; all other keys are its options.
+
+    In a program the function may be a Python callable.
+    """
 
     model: str | None
-    function: str | None
+    function: str | Callable[..., Any] | None
     options: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Of the model, or of the function."""
+        return self.model or name_of(self.function)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,14 @@
 """The three formulations of the outer problem under one name; the direct one has no surrogate."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ccd_casadi.cases.tables import Case
+from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 
 MANY = 12  # parameters up to which surrogates pay for their fit: docs/development/method.md
 SAMPLES = 1000  # inner problems of a plan over θ, some minutes
@@ -53,9 +57,22 @@ def usual_name(case: Case, parameters: int) -> str:
     With sections, of which each θ takes a second, it is lifted where that samples fewer θ;
     `direct_starts = 1` says that each θ is dear: none is sampled.
     """
-    nested, lifted = formulation_of(case, "nested"), formulation_of(case, "lifted")
     sections = case.controller.structure == "sections"
     dear = case.outer.direct_starts == 1 or any(len(one.values) > 1 for one in case.theta)
+    return _usual(
+        {name: formulation_of(case, name) for name in FORMULATIONS}, parameters, sections, dear
+    )
+
+
+def usual_formulation(problem: CoDesignProblem) -> Formulation:
+    """The same of a problem, whose case's [sampling] and [outer] are not known, with defaults."""
+    sections = isinstance(problem.controller, StructuredProblem)
+    every: dict[str, Formulation] = {"nested": Nested(), "lifted": Lifted(), "direct": Direct()}
+    return every[_usual(every, len(problem.names), sections, bool(problem.listed))]
+
+
+def _usual(every: Mapping[str, Formulation], parameters: int, sections: bool, dear: bool) -> str:
+    nested, lifted = every["nested"], every["lifted"]
     if (sections and dear) or slow_words(nested, parameters):
         return "direct"
     fewer = nested.sampled(parameters) > lifted.sampled(parameters)

@@ -29,6 +29,7 @@ from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import counted
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ class SetCertificate:
     words: str
 
 
+@one_blas_thread
 def certify(
     plants: "Sequence[ScaledPlant | StateSpace]",
     controller: StateSpace,

@@ -34,6 +34,7 @@ from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
@@ -231,6 +232,7 @@ def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:
     return tuple(replace(problem, robust=replace(robust, design_shift=s)) for s in shifts)
 
 
+@one_blas_thread
 def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
     """The true inner problem at θ, by the problem's method: ω_b*(θ), where, and what binds.
 
@@ -276,6 +278,7 @@ def best_choice(
     return best[0], replace(best[1], syntheses=sum(item[1].syntheses for item in found))
 
 
+@one_blas_thread
 def true_design(
     problem: CoDesignProblem, theta: Sequence[float], omega_S: float, omega_T: float
 ) -> Sensitivities:

@@ -28,6 +28,7 @@ from ccd_casadi.plants.response_table import holds_lines
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Tell, silent
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis import interchange
 
@@ -70,6 +71,7 @@ class Tuned:
         return self.design.controller
 
 
+@one_blas_thread
 def tune(
     plants: Any,
     *,
