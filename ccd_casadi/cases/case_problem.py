@@ -1,13 +1,15 @@
 """A case in SI: the co-design problem that the lower layers take."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from secrets import token_hex
 from typing import Any
 
 from ccd_casadi.cases.budget import error_budget
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.diagnosis import diagnose
-from ccd_casadi.cases.findings import Severity
+from ccd_casadi.cases.findings import Severity, suitable_effort
 from ccd_casadi.cases.kinds import structured_problem, weights_of
 from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
@@ -15,7 +17,7 @@ from ccd_casadi.cases.tables import Case, RobustTable
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, Options, RobustSet
 from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.plants.modal import Suspension
@@ -110,6 +112,8 @@ def problem_of(case: Case) -> CoDesignProblem:
         others = problem.controller.plant_options
         plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
         problem.controller.require_plants(plants)
+        if math.isnan(problem.weights.M_K):
+            problem = _with_a_scale(problem)
         if problem.source.motion is not None:
             require_motion(problem)
         model = model_named(case.plant.model)
@@ -127,6 +131,13 @@ def problem_of(case: Case) -> CoDesignProblem:
         words = f"{function} raised {raised_words(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
+
+
+def _with_a_scale(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with an M_K that bounds nothing: loops are computed in units of it."""
+    unit = replace(problem, weights=replace(problem.weights, M_K=1.0))
+    M_K = suitable_effort(unit, scaled_plant(unit, unit.start))
+    return replace(problem, weights=replace(problem.weights, M_K=M_K))
 
 
 def _options(of: Mapping[str, Any]) -> Options:

@@ -190,16 +190,27 @@ def _searched(problem: CoDesignProblem) -> tuple[float, float]:
     return low / HZ, max(inner.omega_S[1], inner.omega_T[1]) / HZ
 
 
+def suitable_effort(problem: CoDesignProblem, plant: ScaledPlant) -> float:
+    """M_K for a third of the first resonance, where nothing else asks for one."""
+    return plant.force / _at_a_third(problem, plant)[1]
+
+
+def _at_a_third(problem: CoDesignProblem, plant: ScaledPlant) -> tuple[float, float]:
+    """A third of the first resonance in Hz, within what [inner] searches, and M_K |G| there."""
+    low, high = _searched(problem)
+    flexible = plant.natural[plant.natural > 0.0] / HZ
+    aim = float(np.clip(flexible[0] / 3.0 if flexible.size else np.sqrt(low * high), low, high))
+    level = np.log(np.maximum(plant.gain, 1e-300))
+    return aim, float(np.exp(np.interp(
+        np.log(aim * HZ / plant.omega_0), np.log(plant.grid), level)))  # fmt: skip
+
+
 def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> list[str]:
     low, high = _searched(problem)
     M_K, effort = problem.weights.M_K, facts.effort_hz
     if np.isfinite(effort) and low <= effort <= FAR * high:
         return []
-    first = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
-    aim = float(np.clip(first[0] / 3.0 if first else np.sqrt(low * high), low, high))
-    gain = float(np.exp(np.interp(
-        np.log(aim * HZ / plant.omega_0), np.log(plant.grid), np.log(np.maximum(plant.gain, 1e-300))
-    )))  # fmt: skip
+    aim, gain = _at_a_third(problem, plant)
     where = (
         f"the plant's gain falls through 1/M_K at {effort:.3g} Hz"
         if np.isfinite(effort)

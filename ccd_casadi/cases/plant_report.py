@@ -39,7 +39,7 @@ def plant_report(
         "theta": dict(zip(problem.names, problem.start, strict=True)),
         "units": {parameter.name: parameter.unit for parameter in case.theta},
         "points": len(facts),
-        "size": size_words(start),
+        "size": size_words(start, case),
         "inertia": start.inertia,
         "rigid_modes": sum(mode.rigid for mode in start.modes),
         "modes": [asdict(mode) for mode in start.modes],
@@ -48,7 +48,7 @@ def plant_report(
         "zeros": [asdict(zero) for zero in start.zeros],
         "effort_hz": start.effort_hz,
         "bandwidth_window_hz": [share * start.effort_hz for share in WINDOW],
-        "M_K": problem.weights.M_K,
+        "M_K": case.weights.M_K,
         "M_K_for_bandwidth": _suitable(problem, start),
         "constraints": [
             {"name": name, "value": float(value), "met": bool(value <= 0.0)}
@@ -65,14 +65,14 @@ def plant_report(
     }
 
 
-def size_words(facts: PlantFacts) -> str:
+def size_words(facts: PlantFacts, case: Case) -> str:
     """How large the plant is: what shows at a glance that numbers are not in SI."""
     parts = []
     if math.isfinite(facts.inertia):
         parts.append(f"an actuator moves {facts.inertia:.3g} kg (kg m2 by a torque)")
     flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
-    if math.isfinite(facts.effort_hz):
+    if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):
         low, high = (share * facts.effort_hz for share in WINDOW)
         parts.append(f"M_K suits a bandwidth of {number(low, 2)} to {number(high, 2)} Hz")
     return ", ".join(parts)

@@ -16,6 +16,7 @@ from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.user_code import name_of
 
+EVERY = (1e-3, 1e6)  # Hz: a range that nothing searches
 Spectra = tuple[Mapping[str, Any], ...]
 
 
@@ -88,19 +89,24 @@ class ObjectiveTable:
 class WeightsTable:
     """[weights] of the paper's Table 1; M_K in force over displacement."""
 
-    M_S: float = key("W_S at high frequency is 1/M_S: the peak of S that the weight allows")
+    M_S: float = key(
+        "W_S at high frequency is 1/M_S: the peak of S that the weight allows", idle=2.0
+    )
     A_S: float = key(
-        "W_S at zero frequency is 1/A_S: the S that the weight allows there", check=checks.FRACTION
-    )
-    c_K: float = key("W_KS grows by this factor above omega_K", check=checks.ABOVE_ONE)
-    omega_K_hz: float = key("W_KS is 1/M_K below this frequency and grows above it")
-    M_K: float = key(
-        "gain of the controller that W_KS allows: about mass times (2π ω_b)²", unit="N/m"
-    )
-    A_l: float = key("W_T at zero frequency is 1/A_l")
+        "W_S at zero frequency is 1/A_S: the S that the weight allows there",
+        check=checks.FRACTION, idle=1e-4,
+    )  # fmt: skip
+    c_K: float = key("W_KS grows by this factor above omega_K", check=checks.ABOVE_ONE, idle=1e4)
+    omega_K_hz: float = key("W_KS is 1/M_K below this frequency and grows above it", idle=100.0)
+    M_K: float = key(  # idle: by the plant, in `problem_of`
+        "gain of the controller that W_KS allows: about mass times (2π ω_b)²", unit="N/m",
+        idle=math.nan,
+    )  # fmt: skip
+    A_l: float = key("W_T at zero frequency is 1/A_l", idle=1.0)
     A_u: float = key(
-        "W_T at high frequency is 1/A_u: the T that the weight allows there", check=checks.FRACTION
-    )
+        "W_T at high frequency is 1/A_u: the T that the weight allows there",
+        check=checks.FRACTION, idle=1e-2,
+    )  # fmt: skip
     disturbance: float | None = key(
         '"h_infinity_disturbance": force that weighs as 1 m of reference; default 10 M_K',
         None,
@@ -121,11 +127,12 @@ class InnerTable:
     S_low: float = key("bound of |S| at omega_low", check=checks.FRACTION)
     omega_low_hz: float = key("where S_low holds")
     omega_S_hz: tuple[float, float] = key(
-        "searched range of the frequency of W_S", check=checks.interval
+        "searched range of the frequency of W_S", check=checks.interval, idle=EVERY
     )
     omega_T_hz: tuple[float, float] = key(
         "searched range of the frequency of W_T; sections: the lower end is that of W_T",
         check=checks.interval,
+        idle=EVERY,
     )
     gamma_backoff: float = key(
         "controllers are synthesised at this multiple of γ_opt",

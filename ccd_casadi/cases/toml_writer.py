@@ -34,7 +34,7 @@ def case_to_toml(case: Case) -> str:
 
 
 def _pairs(table: Mapping[str, Any]) -> list[str]:
-    given = {key: value for key, value in table.items() if value is not None}
+    given = {key: value for key, value in table.items() if value is not None and value == value}
     return [f"{_toml_key(key)} = {toml(value)}" for key, value in given.items()]
 
 

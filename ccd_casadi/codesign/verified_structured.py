@@ -37,7 +37,7 @@ from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.sampling.neighbours import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.units import HZ, counted, of_a_bound
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class VerifiedStructured(Verified):
             "proven": proof.levels,
         }
         where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
-        share, kept = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(self.worst)
+        share, kept = of_a_bound(self.worst.value), kept_words(self.worst)
         words = f"{kept} on {where}, the worst that a search found at {share}"
         own = OwnSet.KEPT if self.set_is_met else OwnSet.BROKEN
         if not self.wide.passed:

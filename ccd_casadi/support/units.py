@@ -50,6 +50,17 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def of_a_bound(excess: float) -> str:
+    """exp(excess) as a share of a bound; one that is missed by far as a multiple.
+
+    >>> of_a_bound(0.0), of_a_bound(-0.1), of_a_bound(10.0)
+    ('100 % of a bound', '90.4837 % of a bound', '2.2e+04 times a bound')
+    """
+    if excess < math.log(10.0):
+        return f"{100.0 * math.exp(excess):.6g} % of a bound"
+    return f"{math.exp(min(excess, 700.0)):.3g} times a bound"
+
+
 def small_share(share: float) -> str:
     """A relative error in per cent; what is below rounding to an engineer is not written out.
 
