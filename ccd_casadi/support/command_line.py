@@ -12,6 +12,7 @@ from time import perf_counter
 from typing import Any
 
 from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.guard import guarded
 from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
 from ccd_casadi.support.options import DEFAULT_CASE, Option, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
@@ -115,6 +116,7 @@ def run(
     except SystemExit as ended:  # after --help or a wrong option
         raise_on_ctrl_c()
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
+    in_order = guarded(Path(_place(options) or ""))
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
@@ -161,6 +163,7 @@ def run(
         say(f"interrupted: {_RESUMABLE}", sys.stderr)
     finally:
         gc.unfreeze()  # cycles that an earlier command had left were frozen too
+        in_order()
     return int(code)
 
 
