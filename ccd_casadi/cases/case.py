@@ -131,6 +131,9 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         if not isinstance(table, Mapping):
             raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
     idle = idle_keys(data)
+    if data.get("plant", {}).get("model") == "measured":
+        words = "is one frequency response and has no theta: it goes with the command inner alone"
+        raise fail("plant.model", words)
     for name in ("plant", "theta", *REQUIRED):
         if name not in data and f"{name}.M_K" not in idle:
             raise fail(name, f"is missing; add a table [{name}]")
@@ -232,6 +235,9 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
             raise fail(
                 f"{short_repr(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
             )
+        if held := next((p for p in case.fixed if p.name == name), None):
+            how = "varies: every design holds at all of its values" if held.varies else "is fixed"
+            raise fail(f"{name} {how}; leave it out, and give {'=..,'.join(names)}=..")
         if name not in names:
             raise fail(
                 f"{short_repr(name)} is not a parameter of the case{checks.closest(name, names)}"

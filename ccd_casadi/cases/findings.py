@@ -76,7 +76,9 @@ def zero_findings(facts: PlantFacts, S_max: float, place: str) -> list[Finding]:
     right = [zero for zero in facts.zeros if zero.damping_ratio < -1e-9]
     if right:
         found.append(_right(min(right, key=lambda z: z.frequency_hz), facts, S_max, place))
-    return found + [_dip(zero) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT]
+    return found + [
+        _dip(zero, place) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT
+    ]
 
 
 def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
@@ -91,10 +93,10 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
     return Finding(severity, Topic.ZERO, words, limit_hz=limit)
 
 
-def _dip(zero: Zero) -> Finding:
+def _dip(zero: Zero, place: str) -> Finding:
     z = zero.frequency_hz
     words = (
-        f"a transmission zero at {z:.4g} Hz, damping {100 * zero.damping_ratio:.2g} %: the "
+        f"a transmission zero at {z:.4g} Hz {place}, damping {100 * zero.damping_ratio:.2g} %: the "
         f"plant's gain falls to {100 * zero.dip:.2g} % of its surroundings, and so much "
         f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
         "Hz unless M_K allows that force"

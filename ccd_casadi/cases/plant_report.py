@@ -29,6 +29,8 @@ def plant_report(
     start = facts[0]
     values = constraint_values(plant, problem.start)
     constraints = zip(plant.constraint_names, values, strict=True)
+    start_of = dict(zip(problem.names, problem.start, strict=True))
+    between = any(start_of[name] not in values for name, values in problem.listed)
     count = min(len(item.modes) for item in facts)
     hertz = np.array([[mode.frequency_hz for mode in item.modes[:count]] for item in facts])
     return {
@@ -37,6 +39,7 @@ def plant_report(
         "outputs": plant.outputs,
         "notes": list(plant.notes(problem.start)),
         "theta": dict(zip(problem.names, problem.start, strict=True)),
+        "varies": {p.name: [p.lower, p.upper] for p in case.fixed if p.varies},
         "units": {parameter.name: parameter.unit for parameter in case.theta},
         "points": len(facts),
         "size": size_words(start, case),
@@ -51,7 +54,7 @@ def plant_report(
         "M_K": case.weights.M_K,
         "M_K_for_bandwidth": _suitable(problem, start),
         "constraints": [
-            {"name": name, "value": float(value), "met": bool(value <= 0.0)}
+            {"name": name, "value": float(value), "met": bool(value <= 0.0), "open": between}
             for name, value in constraints
         ],
         "budget": [  # each source by the RMS of its spectrum; None where it is white

@@ -42,9 +42,6 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
     model, function = table.get("model"), table.get("function")
     if (model is None) == (function is None):
         raise fail("plant", "give either model or function, and not both")
-    if model == "measured":
-        words = "is one frequency response and has no theta: it goes with the command inner alone"
-        raise fail("plant.model", words)
     known = model_named(model) if isinstance(model, str) else None
     if model is not None and known is None:
         hint = checks.closest(str(model), model_names())

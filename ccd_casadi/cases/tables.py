@@ -248,7 +248,7 @@ class PlacesTable:
         "coordinates of each force: numbers, or names of [theta]", (), check=checks.places, unit="m"
     )
     sensors: tuple[tuple[float | str, ...], ...] = key(
-        "coordinates of each sensor; absent: the plant's own outputs",
+        "coordinates of each sensor; absent, without axes: the plant's own outputs",
         (),
         check=checks.places,
         unit="m",

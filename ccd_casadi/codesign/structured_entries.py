@@ -8,7 +8,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
-from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.fixed_structure.bounds import BINDS, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.loop_on_box import Excess
@@ -19,15 +19,6 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.structured_robustness import LOOSE
 from ccd_casadi.support.units import HZ, counted
 
-BINDS = {
-    "S_MAX": "S_max",
-    "SHAPE": "shape",
-    "LEVEL": "|S| below omega_b",
-    "S_LOW": "S_low",
-    "KS": "weighted_level of KS",
-    "T": "weighted_level of T",
-    "GS": "compliance_max",
-}
 WORST = 1.0 + TOLERANCE  # figure over bound up to which the judge counts a bound as met
 
 

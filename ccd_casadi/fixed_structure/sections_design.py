@@ -7,6 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
+from ccd_casadi.fixed_structure.bounds import BINDS, kind_and_channel
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.local_search import Point, ascend
@@ -147,7 +148,9 @@ class DesignSearch:
         outcome, words = SectionsOutcome.CERTIFIED, judged.words
         if short:
             outcome = SectionsOutcome.BOUND_NOT_MET
-            missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
+            missed = ", ".join(
+                f"{_key(name)} by a factor {ratio:.4g}" for name, ratio in short.items()
+            )
             words = f"none found from {starts} starts: the nearest controller misses {missed}"
         elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
             outcome = SectionsOutcome.NOT_CERTIFIED
@@ -194,3 +197,8 @@ class DesignSearch:
         assert best is not None
         self.tell(f"{best.outcome.value}: {number(best.bandwidth / HZ, 4)} Hz")
         return best
+
+
+def _key(name: str) -> str:
+    kind, channel = kind_and_channel(name)
+    return BINDS.get(kind, "|S| at omega_b") + (f" of channel {channel}" if channel else "")

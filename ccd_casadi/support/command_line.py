@@ -116,7 +116,7 @@ def run(
     except SystemExit as ended:  # after --help or a wrong option
         raise_on_ctrl_c()
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
-    in_order = guarded(Path(_place(options) or ""))
+    in_order = guarded(Path(str(_place(options))))
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
