@@ -107,6 +107,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         if structured
         else MixedSensitivityProblem(),
         budget=error_budget(case.budget),
+        spoken=(case.units.output, case.units.input),
     )
     try:
         others = problem.controller.plant_options

@@ -18,7 +18,7 @@ from ccd_casadi.plants.facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, spoken
 
 LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
 FAR = 3.0  # how far above the frequencies that [inner] searches effort may end
@@ -234,7 +234,8 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
     suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
     high = _searched(problem)[1]
     if suits > TWICE * first:
-        against = f"M_K suits {suits:.3g} Hz for the {facts.inertia:.3g} kg that an actuator moves"
+        moved = spoken(f"{facts.inertia:.3g} kg")
+        against = f"M_K suits {suits:.3g} Hz for the {moved} that an actuator moves"
     elif suits > 0.0 and first > 100.0 * high:
         against = f"[inner] searches up to {high:.3g} Hz"
     else:

@@ -13,7 +13,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts
 from ccd_casadi.plants.plant import constraint_values
-from ccd_casadi.support.units import number
+from ccd_casadi.support.units import number, spoken
 
 # ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less where
 # resonances stand in the way.
@@ -72,7 +72,7 @@ def size_words(facts: PlantFacts, case: Case) -> str:
     """How large the plant is: what shows at a glance that numbers are not in SI."""
     parts = []
     if math.isfinite(facts.inertia):
-        parts.append(f"an actuator moves {facts.inertia:.3g} kg (kg m2 by a torque)")
+        parts.append(spoken(f"an actuator moves {facts.inertia:.3g} kg"))
     flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
     if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):

@@ -305,6 +305,14 @@ class BudgetTable:
 
 
 @dataclass(frozen=True)
+class UnitsTable:
+    """[units]: what the plant's outputs and inputs are, in words; numbers are in SI either way."""
+
+    output: str = key("of every output", "m", check=checks.choice("m", "rad"))
+    input: str = key("of every input", "N", check=checks.choice("N", "N m"))
+
+
+@dataclass(frozen=True)
 class Case(NotebookHtml):
     """A checked case file."""
 
@@ -326,6 +334,7 @@ class Case(NotebookHtml):
     limits: controller_tables.LimitsTable
     motor: MotorTable
     move: MoveTable
+    units: UnitsTable
     fixed: tuple[Parameter, ...] = ()
 
 

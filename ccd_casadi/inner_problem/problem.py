@@ -35,6 +35,7 @@ from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.threads import one_blas_thread
+from ccd_casadi.support.units import use_units
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
@@ -73,6 +74,8 @@ class CoDesignProblem(NotebookHtml):
         Of f(θ).
     listed : tuple of (str, tuple of float)
         Parameters that are one of a few values.
+    spoken : (str, str)
+        Units of outputs and inputs in words and on pages.
 
     Examples
     --------
@@ -99,6 +102,7 @@ class CoDesignProblem(NotebookHtml):
     budget: ErrorBudget | None = None
     cost_unit: str = ""
     listed: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    spoken: tuple[str, str] = ("m", "N")
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
@@ -160,6 +164,7 @@ def plant_of(problem: CoDesignProblem) -> Plant:
 
     Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
     """
+    use_units(*problem.spoken)
     return plant_from(problem.source, problem.names, problem.lower, problem.upper)
 
 

@@ -22,12 +22,13 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted, display_unit, with_unit
+from ccd_casadi.support.units import HZ, counted, display_unit, spoken, with_unit
 
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
 STEPS = 200  # points of it
 DRAWN = 1200  # points of a curve of a move on the machine
+HELD = 0.5  # of the largest force: a stage that springs hold takes so much at the end of a move
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
@@ -110,11 +111,12 @@ def force_step(view: LoopView) -> c.Figure:
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = np.array([step[1] for step in steps])
-    unit, factor = display_unit("m", float(np.abs(y).max()))
+    unit, factor = display_unit(spoken("m"), float(np.abs(y).max()))
     curves, bands = of_plants(1e3 * t, factor * y)
-    panel = c.Panel("time (ms)", f"y after a step of 1 N ({unit})", curves, bands, log_x=True)
+    step = f"a step of {spoken('1 N')}"
+    panel = c.Panel("time (ms)", f"y after {step} ({unit})", curves, bands, log_x=True)
     on = f" on {counted(len(y), 'plant')} of the set" if len(y) > 1 else ""
-    words = f"The position after a step of 1 N at the actuator{on}, until it is at rest."
+    words = f"The position after {step} at the actuator{on}, until it is at rest."
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
 
@@ -143,7 +145,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     for large in (True, False):  # those that are flat beside the large ones by themselves
         same = [way for way in kept if (FLAT * way[2] > top) == large]
         most = max((peak for _, _, peak, _ in same), default=0.0)
-        unit, scale = display_unit("m", most)
+        unit, scale = display_unit(spoken("m"), most)
         window = [c.Level(sign * scale * first.window, "window" if sign > 0 else "")
                   for sign in (1, -1) if most < FLAT * first.window]  # fmt: skip
         curves, bands = [], []
@@ -166,9 +168,10 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
-        f"{with_unit(first.window, 'm')}. {words}"
+        f"{with_unit(first.window, spoken('m'))}. {words}"
     )
-    return c.Figure(lines, caption, (c.Table(("way", *FIGURES), rows), *tables_of(lines)))
+    table = c.Table(("way", *map(spoken, FIGURES)), rows)
+    return c.Figure(lines, caption, (table, *tables_of(lines)))
 
 
 def _over(time: Array, m: Move, values: Array) -> Array:
@@ -186,14 +189,21 @@ def shown_until(found: Move) -> float:
     return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
 
 
+def _held(made: Move) -> float:
+    return float(np.abs(made.force[-1]).max())
+
+
 def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     when = "does not settle" if np.isinf(settled) else (
         f"settled after {with_unit(settled, 's')}" if settled > 0.0 else "stays within its window"
     )  # fmt: skip
-    words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
+    words = f"{name}: {when}, error of at most {with_unit(peak, spoken('m'))}"
+    held, most = (max(of(m) for m in made) for of in (_held, lambda m: m.peak_force.max()))
+    if held > HELD * most:
+        words += f"; {with_unit(held, spoken('N'))} hold the stage there"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, after the figure's end {with_unit(float(after.max()), 'm')}"
+    return f"{words}, after the figure's end {with_unit(float(after.max()), spoken('m'))}"
