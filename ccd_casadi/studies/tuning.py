@@ -48,7 +48,7 @@ APART = 1e-6  # relative, of lines
 AT_REST = 1e-7  # of the largest root: below, it lies at 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tuned:
     """A tuned controller.
 
@@ -64,6 +64,11 @@ class Tuned:
     design: MeasuredDesign
     models: tuple[StateSpace | None, ...]
     norms: tuple[float | None, ...]
+
+    def __repr__(self) -> str:
+        made = self.design
+        how = f"{made.bandwidth / HZ:.6g} Hz, {'usable' if made.usable else 'not usable'}"
+        return f"<Tuned {self.case.file}: {how}; {made.words}>"
 
     @property
     def controller(self) -> StateSpace | None:
