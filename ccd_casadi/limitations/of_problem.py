@@ -46,10 +46,10 @@ class Gap:
         """Of the verdict, with a design's ω_b in rad/s."""
         if not np.isfinite(self.upper_bound):
             return "no bound on every controller, gap not known"
+        gap = 100.0 * (self.upper_bound / bandwidth - 1.0)
         return (
             f"no controller of any order exceeds {number(self.upper_bound / HZ)} Hz on "
-            f"{self.plants} here (gap at most {100.0 * (self.upper_bound / bandwidth - 1.0):.0f} %), gap over "
-            "theta not known"
+            f"{self.plants} here (gap at most {gap:.0f} %), gap over theta not known"
         )
 
     def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:
