@@ -3,12 +3,16 @@
 import re
 import tomllib
 
+import numpy as np
+
 import ccd_casadi as ccd
+from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.plant_report import plant_report
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer
 from ccd_casadi.reporting.facts import facts
+from ccd_casadi.reporting.moves import way_words
 from ccd_casadi.support.process_pool import Workers
 
 LINEAR = re.compile(r"\d [kMG]?N\b(?! m)|/N\b|(?<![\w])[nµum]?m\b(?=/N|$)|\bN/|\bkg\b(?! m²)")
@@ -38,3 +42,17 @@ def test_a_rotation_is_spoken_of_in_its_units() -> None:
     moved = words_of({})
     assert [words for words in moved if LINEAR.search(words)]
     assert not [words for words in moved if "rad" in words.replace("rad/s", "")]
+
+
+def test_what_holds_a_stage_on_springs_is_said_with_its_move() -> None:
+    """A scanner cannot make the move that suits a carriage."""
+    time = np.linspace(0.0, 1.0, 50)
+    far, nothing = np.minimum(time, 0.5), np.zeros(50)
+    pushed = 25e6 * far[:, None]
+    free = 10.0 * np.sin(2.0 * np.pi * time)[:, None]
+
+    def words(force: np.ndarray) -> str:
+        return way_words("a", [Move(time, far, nothing, nothing, force, True, 0.5, 1e-6)])
+
+    assert "12.5 MN hold the stage there" in words(pushed)
+    assert "hold" not in words(free)

@@ -1,4 +1,4 @@
-/* H-infinity controller of {{ title }}, made by ccd-casadi.
+/* Controller of {{ title }}, made by ccd-casadi.
  *
  *     v[k] = C x[k] + D e[k] + f[k],   u[k] = v[k]{{ '' if limit is none else ' within +-' ~ limit ~ ' N' }}
  *     x[k+1] = A x[k] + B e[k]{{ '' if L is none else ' + L (u[k] - v[k])' }}
