@@ -165,11 +165,6 @@ def compliance_panel(view: LoopView) -> Panel:
     return over_hz(label, curves, view.ends, levels=levels, bands=bands)
 
 
-def margin_words(view: LoopView) -> str:
-    """Of one channel on the model; empty of several."""
-    return paragraph("report.margins", view)
-
-
 def forbidden(
     S_max: float, S_low: float, low_hz: float, low: float, high: float, top: float
 ) -> tuple[Area, ...]:

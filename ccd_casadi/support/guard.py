@@ -5,6 +5,7 @@ would say that a design is verified. Linux only; elsewhere commands run as they 
 """
 
 import os
+import select
 import signal
 import sys
 import tomllib
@@ -19,7 +20,7 @@ CRASHES = ("SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGABRT")
 DIES_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl
 
 
-def guarded(place: Path) -> Callable[[], None]:
+def guarded(place: Path) -> Callable[[], object]:
     """Go on in another process where the plant of a case or run folder is code; what is given is to
     be called before that ends in order. The process that waits does not return."""
     if not (sys.platform.startswith("linux") and _is_command() and _is_code(place)):
@@ -34,36 +35,22 @@ def guarded(place: Path) -> Callable[[], None]:
         ctypes.CDLL(None).prctl(DIES_WITH_PARENT, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(ExitCode.INTERRUPTED)
-        os.close(read)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-        def in_order() -> None:
-            os.write(write, b".")
-
-        return in_order
+        return lambda: os.write(write, b".")
     os.close(write)
-    os.set_blocking(read, False)
-    _end_as(_waited_for(child, watched), read, place)
-
-
-def _waited_for(child: int, watched: set[signal.Signals]) -> int:
-    """The exit code of a process, or minus its signal; what others send to us goes to it."""
     while True:
         info = signal.sigwaitinfo(watched)
         if info.si_signo == signal.SIGCHLD:
             done, status = os.waitpid(child, os.WNOHANG)
             if done:
-                return os.waitstatus_to_exitcode(status)
+                _end_as(os.waitstatus_to_exitcode(status), read, place)
         elif info.si_code <= 0:  # by kill; a terminal's goes to both
             os.kill(child, info.si_signo)
 
 
 def _end_as(code: int, read: int, place: Path) -> NoReturn:
     """End as a process did, unless it never said that it would."""
-    try:
-        in_order = bool(os.read(read, 1))
-    except BlockingIOError:
-        in_order = False
+    in_order = bool(select.select([read], [], [], 0.0)[0]) and bool(os.read(read, 1))
     crash = code < 0 and signal.Signals(-code).name in CRASHES
     if code < 0 and not crash:
         signal.signal(-code, signal.SIG_DFL)
