@@ -89,10 +89,12 @@ def given_decoupling(
                 words = f"channel {name} is a direction of {len(row)} {word}, {names[0]} of {count}"
                 raise PlantError(f"{words}; give a number for each of the plant's {word}")
         if count > most:
-            words = f"{count} {word} move in {count} directions, and {most} channels are given; add"
+            words = (
+                f"{count} {word} move in {count} directions, and channels for {most} are given; add"
+            )
             raise PlantError(f"{words} {count - most} more, or drop {word} of the plant")
         if count < most and word == "inputs":
-            words = f"{most} channels are given, and {count} {word} drive {count} at most; drop"
+            words = f"{count} {word} drive as many channels, and {most} of these are given; drop"
             raise PlantError(f"{words} {most - count}, or give the plant more {word}")
         M = np.array(rows, float).T
         length = np.linalg.norm(M, axis=0)
