@@ -89,9 +89,7 @@ def given_decoupling(
                 words = f"channel {name} is a direction of {len(row)} {word}, {names[0]} of {count}"
                 raise PlantError(f"{words}; give a number for each of the plant's {word}")
         if count > most:
-            words = (
-                f"{count} {word} move in {count} directions, and channels for {most} are given; add"
-            )
+            words = f"{count} {word} need a channel each, and {most} of these are given; add"
             raise PlantError(f"{words} {count - most} more, or drop {word} of the plant")
         if count < most and word == "inputs":
             words = f"{count} {word} drive as many channels, and {most} of these are given; drop"

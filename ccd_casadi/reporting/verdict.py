@@ -102,7 +102,7 @@ def advice(result: Mapping[str, Any]) -> str:
     failed = [name for name, state in states.items() if state == State.FAILED]
     looked_at = loop_concerns(result)
     if not states:
-        if result.get("status") != "verified":
+        if result.get("status", "verified") != "verified":
             return "Do not run this: it is not verified. Next: see why."
         words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
         lines = all("between two lines" in concern for concern in looked_at)
