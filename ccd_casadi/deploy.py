@@ -11,6 +11,7 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import one_line, option, positive, real, valued
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import inform, say
+from ccd_casadi.support.units import spoken, with_unit
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
@@ -113,7 +114,8 @@ def main(options: argparse.Namespace) -> ExitCode:
 
     if moved is not None:
         last = list(moved.ways)[-1]
-        inform(f"{'a move':13s} {way_words(last, [moved.ways[last]])}")
+        far = with_unit(moved.ways[last].position[-1], spoken("m"))
+        inform(f"{'a move':13s} of {far}, {way_words(last, [moved.ways[last]])}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)

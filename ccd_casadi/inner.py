@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
+    from ccd_casadi.cases.diagnosis import suspicions
     from ccd_casadi.cases.measured_case import measured_case
     from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, structured_answer
     from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
@@ -55,6 +57,10 @@ def main(options: argparse.Namespace) -> ExitCode:
             found = answer[type(problem.controller)](problem, theta, how)
         except UserError as error:
             raise CaseError(f"{case.path}: {error}") from error
+    if found.status == "infeasible":
+        causes = suspicions(problem, case.suspension.rigid_modes)
+        reason = "; ".join(filter(None, [found.figures.get("reason", ""), *causes]))
+        found = replace(found, figures={**found.figures, "reason": reason})
     return _print(found, options)
 
 

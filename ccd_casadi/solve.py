@@ -92,7 +92,7 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
             say(f"warning: {words}", sys.stderr)
         return
     facts, findings = diagnose(problem, case.suspension.rigid_modes)
-    say(f"note: in SI, at the start: {size_words(facts[0])}", sys.stderr)
+    say(f"note: in SI, at the start: {size_words(facts[0], case)}", sys.stderr)
     for item in first_seen(findings):
         if item.severity is not Severity.NOTE:
             of_case = item.topic in (Topic.UNITS, Topic.LOOP, Topic.UNUSED)
@@ -103,15 +103,13 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
 
 
 def with_units(solution: "Solution", case: "Case", problem: "CoDesignProblem") -> "Solution":
-    """The solution, a failed one's reason with what looks like a wrong unit."""
-    from ccd_casadi.cases.diagnosis import diagnose
-    from ccd_casadi.cases.findings import Topic
+    """The solution, a failed one's reason with what looks like a wrong unit, sign or loop."""
+    from ccd_casadi.cases.diagnosis import suspicions
 
     if solution.result["status"] == "verified":
         return solution
-    found = diagnose(problem, case.suspension.rigid_modes)[1]
-    units = [item.words for item in found if item.topic is Topic.UNITS]
-    words = "; ".join(filter(None, [solution.result["reason"], *units]))
+    causes = suspicions(problem, case.suspension.rigid_modes)
+    words = "; ".join(filter(None, [solution.result["reason"], *causes]))
     return replace(solution, result=solution.result | {"reason": words})
 
 

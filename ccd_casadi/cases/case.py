@@ -4,7 +4,7 @@
 """
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from ccd_casadi.cases import checks
 from ccd_casadi.cases.budget import checked_budget
 from ccd_casadi.cases.checks import CaseError, Fail, short_repr
 from ccd_casadi.cases.controller_tables import ChannelTable
-from ccd_casadi.cases.kinds import check_kind
+from ccd_casadi.cases.kinds import check_kind, idle_keys
 from ccd_casadi.cases.motion import check_motion
 from ccd_casadi.cases.places import check_directions, checked_places
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
@@ -130,10 +130,16 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             raise fail(name, f"unknown table{checks.closest(name, known)}")
         if not isinstance(table, Mapping):
             raise fail(name, f"is {short_repr(table)}; write a table [{name}]")
+    idle = idle_keys(data)
+    if data.get("plant", {}).get("model") == "measured":
+        words = "is one frequency response and has no theta: it goes with the command inner alone"
+        raise fail("plant.model", words)
     for name in ("plant", "theta", *REQUIRED):
-        if name not in data:
+        if name not in data and f"{name}.M_K" not in idle:
             raise fail(name, f"is missing; add a table [{name}]")
-    tables = {name: table_of(kind, name, data.get(name, {}), fail) for name, kind in TABLES.items()}
+    tables = {
+        name: table_of(kind, name, data.get(name, {}), fail, idle) for name, kind in TABLES.items()
+    }
     controller = tables["controller"]
     if controller.channel:
         own = data["controller"]["channel"]
@@ -168,8 +174,10 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **tables)
 
 
-def table_of(kind: type, name: str, table: Mapping[str, Any], fail: Fail) -> Any:
-    """A table as its dataclass, every key checked."""
+def table_of(
+    kind: type, name: str, table: Mapping[str, Any], fail: Fail, idle: Collection[str] = ()
+) -> Any:
+    """A table as its dataclass, every key checked; the keys `idle` need not be there."""
     tests: dict[str, checks.Test] = {item.name: checks.check_of(item) for item in fields(kind)}
     if kind is not ChannelTable:
         whole = tests.keys() & set(_OF_THE_WHOLE)
@@ -179,7 +187,9 @@ def table_of(kind: type, name: str, table: Mapping[str, Any], fail: Fail) -> Any
     for item in fields(kind):
         key = item.name
         if key not in table:
-            if item.default is MISSING:
+            if f"{name}.{key}" in idle:
+                values[key] = item.metadata["idle"]
+            elif item.default is MISSING:
                 raise fail(f"{name}.{key}", "is missing; add it")
             continue
         value = table[key]
@@ -225,6 +235,9 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
             raise fail(
                 f"{short_repr(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
             )
+        if held := next((p for p in case.fixed if p.name == name), None):
+            how = "varies: every design holds at all of its values" if held.varies else "is fixed"
+            raise fail(f"{name} {how}; leave it out, and give {'=..,'.join(names)}=..")
         if name not in names:
             raise fail(
                 f"{short_repr(name)} is not a parameter of the case{checks.closest(name, names)}"

@@ -1,12 +1,15 @@
 """A case in SI: the co-design problem that the lower layers take."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
+from secrets import token_hex
 from typing import Any
 
 from ccd_casadi.cases.budget import error_budget
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.diagnosis import diagnose
-from ccd_casadi.cases.findings import Severity, Topic
+from ccd_casadi.cases.findings import Severity, Topic, suitable_effort
 from ccd_casadi.cases.kinds import structured_problem, weights_of
 from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
@@ -14,7 +17,7 @@ from ccd_casadi.cases.tables import Case, RobustTable
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, Options, RobustSet
 from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.plants.modal import Suspension
@@ -22,10 +25,12 @@ from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import kept_quiet
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import HZ
-from ccd_casadi.support.user_code import raised_words
+from ccd_casadi.support.user_code import GivenFunction, raised_words
 
 
+@one_blas_thread
 def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
     """The case in SI, with its plant, which is made once here.
 
@@ -54,8 +59,10 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
     (('m1', 'm2'), -0.995, 6.283)
     """
     inner = case.inner
-    file = function = None
-    if case.plant.function is not None:
+    file = function = given = None
+    if callable(case.plant.function):
+        function, given = case.plant.name, GivenFunction(case.plant.function)
+    elif case.plant.function is not None:
         name, function = case.plant.function.rsplit(":", 1)
         file = str((case.path.parent / name).resolve())
     structured = case.controller.structure == "sections"
@@ -66,9 +73,11 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
             function,
             _options(case.plant.options),
             case.limits.plant_seconds,
+            content=None if given is None else token_hex(),
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
             motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
             places=places_of(case.places),
+            given=given,
         ).pinned(),
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),
@@ -100,11 +109,14 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         if structured
         else MixedSensitivityProblem(),
         budget=error_budget(case.budget),
+        spoken=(case.units.output, case.units.input),
     )
     try:
         others = problem.controller.plant_options
         plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
         problem.controller.require_plants(plants)
+        if math.isnan(problem.weights.M_K):
+            problem = _with_a_scale(problem)
         if problem.source.motion is not None:
             require_motion(problem)
         model = model_named(case.plant.model)
@@ -123,6 +135,13 @@ def problem_of(case: Case, *, at_a_sample: bool = False) -> CoDesignProblem:
         words = f"{function} raised {raised_words(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
+
+
+def _with_a_scale(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with an M_K that bounds nothing: loops are computed in units of it."""
+    unit = replace(problem, weights=replace(problem.weights, M_K=1.0))
+    M_K = suitable_effort(unit, scaled_plant(unit, unit.start))
+    return replace(problem, weights=replace(problem.weights, M_K=M_K))
 
 
 def _options(of: Mapping[str, Any]) -> Options:

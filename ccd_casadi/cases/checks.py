@@ -220,9 +220,15 @@ USUAL = {float: POSITIVE, int: count(0), bool: flag, str: text}  # checks of a k
 SUFFIXES = {"_hz": "Hz", "_us": "µs", "_ms": "ms"}
 
 
-def key(says: str, default: Any = MISSING, *, check: Check | None = None, unit: str = "") -> Any:
-    """The field of a table's dataclass that a key is; `check` where its type has another one."""
-    metadata = {"check": check, "says": says, "unit": unit}
+def key(
+    says: str, default: Any = MISSING, *, check: Check | None = None, unit: str = "",
+    idle: Any = None,
+) -> Any:  # fmt: skip
+    """The field of a table's dataclass that a key is; `check` where its type has another one.
+
+    `idle`: what a required key is where it has no effect, and is not given.
+    """
+    metadata = {"check": check, "says": says, "unit": unit, "idle": idle}
     if default is MISSING:
         return field(metadata=metadata)
     return field(default=default, metadata=metadata)

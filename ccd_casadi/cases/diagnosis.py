@@ -143,6 +143,12 @@ def _unused(problem: CoDesignProblem, plant: Plant, system: Mechanics) -> list[F
     return found
 
 
+def suspicions(problem: CoDesignProblem, rigid_modes: int | None = None) -> list[str]:
+    """What may be the cause where no design is found: numbers in another unit, a sign, the loop."""
+    found = diagnose(problem, rigid_modes)[1]
+    return [item.words for item in found if item.topic in (Topic.UNITS, Topic.LOOP)]
+
+
 def first_seen(findings: Sequence[Finding]) -> list[Finding]:
     """The findings at the first θ where their topic comes up, the serious first.
 

@@ -18,7 +18,7 @@ from ccd_casadi.plants.facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, spoken
 
 LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
 FAR = 3.0  # how far above the frequencies that [inner] searches effort may end
@@ -77,7 +77,9 @@ def zero_findings(facts: PlantFacts, S_max: float, place: str) -> list[Finding]:
     right = [zero for zero in facts.zeros if zero.damping_ratio < -1e-9]
     if right:
         found.append(_right(min(right, key=lambda z: z.frequency_hz), facts, S_max, place))
-    return found + [_dip(zero) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT]
+    return found + [
+        _dip(zero, place) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT
+    ]
 
 
 def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
@@ -92,10 +94,10 @@ def _right(zero: Zero, facts: PlantFacts, S_max: float, place: str) -> Finding:
     return Finding(severity, Topic.ZERO, words, limit_hz=limit)
 
 
-def _dip(zero: Zero) -> Finding:
+def _dip(zero: Zero, place: str) -> Finding:
     z = zero.frequency_hz
     words = (
-        f"a transmission zero at {z:.4g} Hz, damping {100 * zero.damping_ratio:.2g} %: the "
+        f"a transmission zero at {z:.4g} Hz {place}, damping {100 * zero.damping_ratio:.2g} %: the "
         f"plant's gain falls to {100 * zero.dip:.2g} % of its surroundings, and so much "
         f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
         "Hz unless M_K allows that force"
@@ -191,16 +193,27 @@ def _searched(problem: CoDesignProblem) -> tuple[float, float]:
     return low / HZ, max(inner.omega_S[1], inner.omega_T[1]) / HZ
 
 
+def suitable_effort(problem: CoDesignProblem, plant: ScaledPlant) -> float:
+    """M_K for a third of the first resonance, where nothing else asks for one."""
+    return plant.force / _at_a_third(problem, plant)[1]
+
+
+def _at_a_third(problem: CoDesignProblem, plant: ScaledPlant) -> tuple[float, float]:
+    """A third of the first resonance in Hz, within what [inner] searches, and M_K |G| there."""
+    low, high = _searched(problem)
+    flexible = plant.natural[plant.natural > 0.0] / HZ
+    aim = float(np.clip(flexible[0] / 3.0 if flexible.size else np.sqrt(low * high), low, high))
+    level = np.log(np.maximum(plant.gain, 1e-300))
+    return aim, float(np.exp(np.interp(
+        np.log(aim * HZ / plant.omega_0), np.log(plant.grid), level)))  # fmt: skip
+
+
 def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> list[str]:
     low, high = _searched(problem)
     M_K, effort = problem.weights.M_K, facts.effort_hz
     if np.isfinite(effort) and low <= effort <= FAR * high:
         return []
-    first = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
-    aim = float(np.clip(first[0] / 3.0 if first else np.sqrt(low * high), low, high))
-    gain = float(np.exp(np.interp(
-        np.log(aim * HZ / plant.omega_0), np.log(plant.grid), np.log(np.maximum(plant.gain, 1e-300))
-    )))  # fmt: skip
+    aim, gain = _at_a_third(problem, plant)
     where = (
         f"the plant's gain falls through 1/M_K at {effort:.3g} Hz"
         if np.isfinite(effort)
@@ -222,7 +235,8 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
     suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
     high = _searched(problem)[1]
     if suits > TWICE * first:
-        against = f"M_K suits {suits:.3g} Hz for the {facts.inertia:.3g} kg that an actuator moves"
+        moved = spoken(f"{facts.inertia:.3g} kg")
+        against = f"M_K suits {suits:.3g} Hz for the {moved} that an actuator moves"
     elif suits > 0.0 and first > 100.0 * high:
         against = f"[inner] searches up to {high:.3g} Hz"
     else:

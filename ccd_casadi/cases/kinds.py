@@ -38,6 +38,19 @@ _OF_H_INFINITY = {
 }
 
 
+def idle_keys(data: Mapping[str, Any]) -> list[str]:
+    """Required keys that have no effect on the kind of inner problem which a case's tables name."""
+    given = data.get("controller")
+    if not isinstance(given, Mapping) or given.get("structure") != "sections":
+        return []
+    unweighted = given.get("weighted_level") is None
+    tables = {"weights": WeightsTable, "inner": InnerTable}
+    return [
+        f"{name}.{item.name}" for name, table in tables.items() for item in fields(table)
+        if item.metadata["idle"] is not None and (unweighted or item.name == "omega_S_hz")
+    ]  # fmt: skip
+
+
 def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     """Raise where a key is given that has no effect on the chosen kind of inner problem."""
     controller, loop = tables["controller"], tables["loop"]

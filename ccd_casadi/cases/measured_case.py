@@ -18,7 +18,7 @@ from typing import Any
 
 from ccd_casadi.cases.case import read_toml, table_of
 from ccd_casadi.cases.checks import POSITIVE, Fail, count, require_good, short_repr, text
-from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
+from ccd_casadi.cases.kinds import SHAPE, check_kind, idle_keys, structure_of, weights_of
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
@@ -67,7 +67,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
     if "inner" not in data:
         raise fail("inner", "is missing; add a table [inner]")
     tables = {
-        name: table_of(TABLES[name], name, data.get(name, {}), fail)
+        name: table_of(TABLES[name], name, data.get(name, {}), fail, idle_keys(data))
         for name in _TABLES
         if name != "weights" or name in data
     }

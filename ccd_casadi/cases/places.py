@@ -16,6 +16,8 @@ def checked_places(table: PlacesTable, folder: Path, fail: Fail) -> PlacesTable:
     for name in ("nodes", "actuators"):
         if not getattr(table, name):
             raise fail(f"places.{name}", "is missing; add it")
+    if table.axes and not table.sensors:
+        raise fail("places.sensors", "is missing, and axes are of forces and sensors; add it")
     if (table.quiet or table.damped) and not table.axes:
         raise fail("places.axes", "is false, and quiet and damped modes are of axes; give true")
     if table.reference and (table.axes or not table.sensors):

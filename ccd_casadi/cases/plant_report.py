@@ -13,7 +13,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts
 from ccd_casadi.plants.plant import constraint_values
-from ccd_casadi.support.units import number
+from ccd_casadi.support.units import number, spoken
 
 # ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less where
 # resonances stand in the way.
@@ -29,17 +29,20 @@ def plant_report(
     start = facts[0]
     values = constraint_values(plant, problem.start)
     constraints = zip(plant.constraint_names, values, strict=True)
+    start_of = dict(zip(problem.names, problem.start, strict=True))
+    between = any(start_of[name] not in values for name, values in problem.listed)
     count = min(len(item.modes) for item in facts)
     hertz = np.array([[mode.frequency_hz for mode in item.modes[:count]] for item in facts])
     return {
-        "plant": case.plant.model or case.plant.function,
+        "plant": case.plant.name,
         "inputs": plant.inputs,
         "outputs": plant.outputs,
         "notes": list(plant.notes(problem.start)),
         "theta": dict(zip(problem.names, problem.start, strict=True)),
+        "varies": {p.name: [p.lower, p.upper] for p in case.fixed if p.varies},
         "units": {parameter.name: parameter.unit for parameter in case.theta},
         "points": len(facts),
-        "size": size_words(start),
+        "size": size_words(start, case),
         "inertia": start.inertia,
         "rigid_modes": sum(mode.rigid for mode in start.modes),
         "modes": [asdict(mode) for mode in start.modes],
@@ -48,10 +51,10 @@ def plant_report(
         "zeros": [asdict(zero) for zero in start.zeros],
         "effort_hz": start.effort_hz,
         "bandwidth_window_hz": [share * start.effort_hz for share in WINDOW],
-        "M_K": problem.weights.M_K,
+        "M_K": case.weights.M_K,
         "M_K_for_bandwidth": _suitable(problem, start),
         "constraints": [
-            {"name": name, "value": float(value), "met": bool(value <= 0.0)}
+            {"name": name, "value": float(value), "met": bool(value <= 0.0), "open": between}
             for name, value in constraints
         ],
         "budget": [  # each source by the RMS of its spectrum; None where it is white
@@ -65,14 +68,14 @@ def plant_report(
     }
 
 
-def size_words(facts: PlantFacts) -> str:
+def size_words(facts: PlantFacts, case: Case) -> str:
     """How large the plant is: what shows at a glance that numbers are not in SI."""
     parts = []
     if math.isfinite(facts.inertia):
-        parts.append(f"an actuator moves {facts.inertia:.3g} kg (kg m2 by a torque)")
+        parts.append(spoken(f"an actuator moves {facts.inertia:.3g} kg"))
     flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
-    if math.isfinite(facts.effort_hz):
+    if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):
         low, high = (share * facts.effort_hz for share in WINDOW)
         parts.append(f"M_K suits a bandwidth of {number(low, 2)} to {number(high, 2)} Hz")
     return ", ".join(parts)

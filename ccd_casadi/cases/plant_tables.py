@@ -42,15 +42,12 @@ def plant_table(table: Mapping[str, Any], path: Path, fail: Fail) -> PlantTable:
     model, function = table.get("model"), table.get("function")
     if (model is None) == (function is None):
         raise fail("plant", "give either model or function, and not both")
-    if model == "measured":
-        words = "is one frequency response and has no theta: it goes with the command inner alone"
-        raise fail("plant.model", words)
     known = model_named(model) if isinstance(model, str) else None
     if model is not None and known is None:
         hint = checks.closest(str(model), model_names())
         words = f"is {short_repr(model)}, not a known model{hint}; or use function"
         raise fail("plant.model", words)
-    if function is not None:
+    if function is not None and not callable(function):
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
         if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
             raise fail("plant.function", f'is {short_repr(function)}; write "my_plant.py:model"')

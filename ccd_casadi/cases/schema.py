@@ -40,7 +40,8 @@ def case_schema() -> dict[str, Any]:
         }
         entry = tables["budget"]["properties"][kind.value]
         entry["anyOf"] = [spectrum, {"type": "array", "items": spectrum}]
-    found["else"]["required"] += REQUIRED  # what was measured has no θ to choose
+    needed = [name for name in REQUIRED if tables[name]["required"]]
+    found["else"]["required"] += needed  # what was measured has no θ to choose
     return found
 
 
@@ -68,14 +69,19 @@ def _table(kind: type) -> dict[str, Any]:
     return {
         "type": "object",
         "properties": found,
-        "required": [item.name for item in fields(kind) if item.default is MISSING],
+        "required": [item.name for item in fields(kind) if _default(item) == "required"],
         "additionalProperties": False,
     }
 
 
+def _default(item: Field[Any]) -> str:
+    if item.default is MISSING:
+        return "required" if item.metadata["idle"] is None else "required where it has an effect"
+    return "absent" if item.default in (None, ()) else toml(item.default)
+
+
 def _row(item: Field[Any]) -> tuple[str, str, str, str]:
-    default = "absent" if item.default in (None, ()) else toml(item.default)
-    default = "required" if item.default is MISSING else default
+    default = _default(item)
     names = ", ".join(map(toml, check_of(item).schema.get("enum", ())))
     says = item.metadata["says"] + (f" (one of {names})" if names else "")
     return item.name, default, unit_of(item), says

@@ -4,7 +4,7 @@ Units are those of the file (Hz where a name says so).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -14,17 +14,27 @@ from ccd_casadi.cases.checks import key
 from ccd_casadi.cases.motion import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.user_code import name_of
 
+EVERY = (1e-3, 1e6)  # Hz: a range that nothing searches
 Spectra = tuple[Mapping[str, Any], ...]
 
 
 @dataclass(frozen=True)
 class PlantTable:
-    """[plant]: a model's name or function = "file.py:name"; all other keys are its options."""
+    """[plant]: a model's name or function = "file.py:name"; all other keys are its options.
+
+    In a program the function may be a Python callable.
+    """
 
     model: str | None
-    function: str | None
+    function: str | Callable[..., Any] | None
     options: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Of the model, or of the function."""
+        return self.model or name_of(self.function)
 
 
 @dataclass(frozen=True)
@@ -79,19 +89,24 @@ class ObjectiveTable:
 class WeightsTable:
     """[weights] of the paper's Table 1; M_K in force over displacement."""
 
-    M_S: float = key("W_S at high frequency is 1/M_S: the peak of S that the weight allows")
+    M_S: float = key(
+        "W_S at high frequency is 1/M_S: the peak of S that the weight allows", idle=2.0
+    )
     A_S: float = key(
-        "W_S at zero frequency is 1/A_S: the S that the weight allows there", check=checks.FRACTION
-    )
-    c_K: float = key("W_KS grows by this factor above omega_K", check=checks.ABOVE_ONE)
-    omega_K_hz: float = key("W_KS is 1/M_K below this frequency and grows above it")
-    M_K: float = key(
-        "gain of the controller that W_KS allows: about mass times (2π ω_b)²", unit="N/m"
-    )
-    A_l: float = key("W_T at zero frequency is 1/A_l")
+        "W_S at zero frequency is 1/A_S: the S that the weight allows there",
+        check=checks.FRACTION, idle=1e-4,
+    )  # fmt: skip
+    c_K: float = key("W_KS grows by this factor above omega_K", check=checks.ABOVE_ONE, idle=1e4)
+    omega_K_hz: float = key("W_KS is 1/M_K below this frequency and grows above it", idle=100.0)
+    M_K: float = key(  # idle: by the plant, in `problem_of`
+        "gain of the controller that W_KS allows: about mass times (2π ω_b)²", unit="N/m",
+        idle=math.nan,
+    )  # fmt: skip
+    A_l: float = key("W_T at zero frequency is 1/A_l", idle=1.0)
     A_u: float = key(
-        "W_T at high frequency is 1/A_u: the T that the weight allows there", check=checks.FRACTION
-    )
+        "W_T at high frequency is 1/A_u: the T that the weight allows there",
+        check=checks.FRACTION, idle=1e-2,
+    )  # fmt: skip
     disturbance: float | None = key(
         '"h_infinity_disturbance": force that weighs as 1 m of reference; default 10 M_K',
         None,
@@ -112,11 +127,12 @@ class InnerTable:
     S_low: float = key("bound of |S| at omega_low", check=checks.FRACTION)
     omega_low_hz: float = key("where S_low holds")
     omega_S_hz: tuple[float, float] = key(
-        "searched range of the frequency of W_S", check=checks.interval
+        "searched range of the frequency of W_S", check=checks.interval, idle=EVERY
     )
     omega_T_hz: tuple[float, float] = key(
         "searched range of the frequency of W_T; sections: the lower end is that of W_T",
         check=checks.interval,
+        idle=EVERY,
     )
     gamma_backoff: float = key(
         "controllers are synthesised at this multiple of γ_opt",
@@ -232,7 +248,7 @@ class PlacesTable:
         "coordinates of each force: numbers, or names of [theta]", (), check=checks.places, unit="m"
     )
     sensors: tuple[tuple[float | str, ...], ...] = key(
-        "coordinates of each sensor; absent: the plant's own outputs",
+        "coordinates of each sensor; absent, without axes: the plant's own outputs",
         (),
         check=checks.places,
         unit="m",
@@ -289,6 +305,14 @@ class BudgetTable:
 
 
 @dataclass(frozen=True)
+class UnitsTable:
+    """[units]: what the plant's outputs and inputs are, in words; numbers are in SI either way."""
+
+    output: str = key("of every output", "m", check=checks.choice("m", "rad"))
+    input: str = key("of every input", "N", check=checks.choice("N", "N m"))
+
+
+@dataclass(frozen=True)
 class Case(NotebookHtml):
     """A checked case file."""
 
@@ -310,6 +334,7 @@ class Case(NotebookHtml):
     limits: controller_tables.LimitsTable
     motor: MotorTable
     move: MoveTable
+    units: UnitsTable
     fixed: tuple[Parameter, ...] = ()
 
 

@@ -9,10 +9,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from ccd_casadi.cases.tables import TABLES, Case
+from ccd_casadi.support.errors import UserError
 
 
 def case_to_toml(case: Case) -> str:
-    """The resolved case, defaults included, as TOML."""
+    """The resolved case, defaults included, as TOML.
+
+    Raises UserError where its plant is a Python callable.
+    """
+    if callable(case.plant.function):
+        words = "is a Python callable, which no file can hold"
+        raise UserError(f'plant.function: {words}; write "my_plant.py:model"')
     plant = {"model": case.plant.model} if case.plant.model else {"function": case.plant.function}
     lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
     for parameter in (*case.theta, *case.fixed):
@@ -27,7 +34,7 @@ def case_to_toml(case: Case) -> str:
 
 
 def _pairs(table: Mapping[str, Any]) -> list[str]:
-    given = {key: value for key, value in table.items() if value is not None}
+    given = {key: value for key, value in table.items() if value is not None and value == value}
     return [f"{_toml_key(key)} = {toml(value)}" for key, value in given.items()]
 
 

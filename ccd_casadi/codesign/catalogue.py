@@ -14,7 +14,7 @@ begin at what it has found.
 Source: Land and Doig, Econometrica 28 (1960).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from time import perf_counter
@@ -29,6 +29,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import with_all_spent
 from ccd_casadi.support.json_files import json_values
+from ccd_casadi.support.progress import duration
+from ccd_casadi.support.terminal import remark
 from ccd_casadi.support.units import counted
 
 Lists = dict[str, tuple[float, ...]]
@@ -159,6 +161,7 @@ def best_of_lists(
             open_ += [_Part(child, J, theta) for child in _children(width, part.lists, theta)]
         else:
             open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
+        remark(_progress(count, list(nodes.values()), open_, began), sampler.quiet)
     assert best is not None
     result = with_all_spent(best.result, sampler.spent.by_purpose) | {
         "seconds": perf_counter() - began,
@@ -169,6 +172,17 @@ def best_of_lists(
     if result["status"] == "infeasible":
         result["reason"] = "; ".join(filter(None, (result["reason"], words)))
     return replace(best, result=result | {"notes": notes})
+
+
+def _progress(count: int, nodes: Sequence[Node], left: Sequence[_Part], began: float) -> str:
+    """How far the search is, the bound on what is left, and how long searching it all takes."""
+    J = min((node.objective for node in nodes if node.whole), default=np.inf)
+    best = f"best J {J:.6g}" if np.isfinite(J) else "no combination searched yet"
+    rest, bound = sum(part.count for part in left), min((p.bound for p in left), default=np.inf)
+    there = f" with J from {bound:.6g}" if np.isfinite(bound) else ""
+    more = duration((perf_counter() - began) / len(nodes) * rest)
+    left_words = f"{rest} of {counted(count, 'combination')} left{there}, {more} at most"
+    return f"lists: {best}, {left_words if rest else 'none left'}"
 
 
 def _point(solution: Solution) -> dict[str, float]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.inner_problem.figure import FigureOfMerit
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.samples import InnerSample, QuantitySample
@@ -59,6 +60,12 @@ class FormulationResult:
     agreed: bool = False
     message: str = ""
     foreseen: float | None = None
+
+
+def outputs_of(figure: FigureOfMerit) -> dict[str, str]:
+    """What `surrogates` are of, in their order, with units; ln of ratios, and of m/N."""
+    ratios = {"ln_sensitivity_peak": "1", "ln_sensitivity_low": "1"}
+    return {figure.key: figure.si_unit, **ratios, "ln_compliance": "ln(m/N)"}
 
 
 # What a formulation may begin with in place of its own plan: samples at θ, or at (θ, ω_S, ω_T).

@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass
 
+from ccd_casadi.cases.controller_tables import OuterTable, SamplingTable
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 
 MANY = 12  # parameters up to which surrogates pay for their fit: docs/development/method.md
 SAMPLES = 1000  # inner problems of a plan over θ, some minutes
@@ -36,9 +39,10 @@ class Direct:
 Formulation = Nested | Lifted | Direct
 
 
-def formulation_of(case: Case, name: str) -> Formulation:
-    """The formulation of that name with the options of a case file."""
-    outer, sampling = case.outer, case.sampling
+def formulation_of(case: Case | None, name: str) -> Formulation:
+    """The formulation of that name with the options of a case file, or the default ones."""
+    outer = OuterTable() if case is None else case.outer
+    sampling = SamplingTable() if case is None else case.sampling
     rounds = (outer.starts, outer.tolerance, outer.max_refinements, outer.surrogate)
     if name == "nested":
         return Nested(sampling.design, sampling.points, *rounds, outer.box_points)
@@ -53,9 +57,19 @@ def usual_name(case: Case, parameters: int) -> str:
     With sections, of which each θ takes a second, it is lifted where that samples fewer θ;
     `direct_starts = 1` says that each θ is dear: none is sampled.
     """
+    listed = any(len(one.values) > 1 for one in case.theta)
+    return _usual(case, parameters, case.controller.structure == "sections", listed)
+
+
+def usual_formulation(problem: CoDesignProblem) -> Formulation:
+    """The same of a problem, whose case's [sampling] and [outer] are not known: with defaults."""
+    sections = isinstance(problem.controller, StructuredProblem)
+    return formulation_of(None, _usual(None, len(problem.names), sections, bool(problem.listed)))
+
+
+def _usual(case: Case | None, parameters: int, sections: bool, listed: bool) -> str:
     nested, lifted = formulation_of(case, "nested"), formulation_of(case, "lifted")
-    sections = case.controller.structure == "sections"
-    dear = case.outer.direct_starts == 1 or any(len(one.values) > 1 for one in case.theta)
+    dear = listed or (case is not None and case.outer.direct_starts == 1)
     if (sections and dear) or slow_words(nested, parameters):
         return "direct"
     fewer = nested.sampled(parameters) > lifted.sampled(parameters)

@@ -32,7 +32,6 @@ REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated
 # that the truth is feasible there and has nothing left to be polished.
 MARGIN = 1e-7
 FRESH = 4  # of the starts, one in so many is new in a round after the first
-OUTPUTS = ("bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low", "ln_compliance")
 FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polish then mends
 
 

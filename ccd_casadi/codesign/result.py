@@ -20,7 +20,6 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.design_entries import budget_entry, move_entry
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
-from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.verdict import (
     State,
@@ -198,7 +197,8 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
         (folder / name).unlink(missing_ok=True)
     text = case_to_toml(resolved(case, solution))
     write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
-    own = Path((case.plant.function or "").rsplit(":", 1)[0])
+    function = case.plant.function
+    own = Path(function.rsplit(":", 1)[0] if isinstance(function, str) else "")
     if own.is_file() and own.parent != folder.resolve():
         write_whole(folder / own.name, own.read_bytes())  # for who gets the folder alone
     formulation = solution.result["formulation"]
@@ -211,7 +211,8 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
             folder / "surrogate.json",
             {
                 "formulation": formulation,
-                "outputs": list(OUTPUTS[: len(solution.outcome.surrogates)]),
+                "outputs": list(solution.surrogates),
+                "units": [unit for _, unit in solution.surrogates.values()],
                 "loo": [vars(process.loo) for process in solution.outcome.surrogates],
             },
         )

@@ -17,9 +17,8 @@ import numpy as np
 from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Terms, outputs_of
 from ccd_casadi.codesign.formulations import Direct, formulation_of
-from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.search import conclude_at
@@ -191,14 +190,15 @@ class Job:
         """The name of the version that the job's surrogate is kept as."""
         if not outcome.surrogates:
             return None
-        outputs = (self.outer.problem.figure.key, *OUTPUTS[1:])[: len(outcome.surrogates)]
+        units = outputs_of(self.outer.problem.figure)
+        outputs = list(units)[: len(outcome.surrogates)]
         pairs = zip(outputs, outcome.surrogates, strict=True)
         last = outcome.iterates[-1] if outcome.iterates else None
         return keep_version(
             self.folder,
             outcome.surrogates,
             {"formulation": "nested" if self.formulation == "nested" else "lifted",
-             "outputs": list(outputs)},
+             "outputs": outputs, "units": [units[name] for name in outputs]},
             samples=len(outcome.surrogates[0].X),
             errors={name: asdict(process.loo) for name, process in pairs},
             at_optimum=last.error if last and np.isfinite(last.error) else None,

@@ -4,13 +4,17 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from threadpoolctl import threadpool_limits
-
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.formulation import FormulationResult, Terms
-from ccd_casadi.codesign.formulations import MANY, Direct, Formulation
-from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.formulations import (
+    Formulation,
+    formulation_of,
+    usual_formulation,
+    usual_name,
+)
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
@@ -26,10 +30,12 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.threads import one_blas_thread
 
 
+@one_blas_thread
 def solve(
-    problem: CoDesignProblem,
+    problem: CoDesignProblem | Case,
     formulation: Formulation | None = None,
     *,
     seed: int = 0,
@@ -43,10 +49,11 @@ def solve(
 
     Parameters
     ----------
-    problem : CoDesignProblem
-        As `problem_of` gives it.
+    problem : CoDesignProblem or Case
+        As `problem_of` gives it; of a case its [sampling] and [outer] count too.
     formulation : Nested, Lifted or Direct
-        By default lifted, and direct with more than 12 parameters.
+        By default that of the command: nested, and direct with more than 12 parameters; with
+        sections lifted where that samples fewer θ, and direct with lists.
     seed : int
         Of every random choice.
     workers : int
@@ -74,14 +81,19 @@ def solve(
     >>> solution.result["status"], [round(v, 3) for v in solution.verified.theta]
     ('verified', [55.0, 55.0])
     """
+    if isinstance(problem, Case):
+        case, problem = problem, problem_of(problem)
+        usual = formulation_of(case, usual_name(case, len(problem.names)))
+    else:
+        usual = usual_formulation(problem)
+    if workers > 1 and problem.source.given is not None:
+        problem.source.given.require_found()
     with (
         TemporaryDirectory() as folder,
-        threadpool_limits(limits=1),  # the matrices are small
         Workers(workers, PATIENCE) as pool,
         SampleStore(store or Path(folder) / "samples.sqlite") as samples,
     ):
         sampler = Sampler(problem, samples, pool, quiet=quiet)
-        usual = Lifted() if len(problem.names) <= MANY else Direct()
         return co_design(sampler, formulation or usual, seed)
 
 
@@ -120,6 +132,7 @@ OUTERS: dict[type[ControllerProblem], type[Outer]] = {
 }
 
 
+@one_blas_thread
 def verify(sampler: Sampler, x: Array) -> Verified:
     """Polish the design at x on the truth, compare it with the whole inner problem, judge it.
 

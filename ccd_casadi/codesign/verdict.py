@@ -20,7 +20,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import FigureOfMerit
 from ccd_casadi.optim.kkt import STEP, Kink, KktCertificate
-from ccd_casadi.support.units import counted, small_share, with_unit
+from ccd_casadi.support.units import counted, small_share, spoken, with_unit
 from ccd_casadi.synthesis.second_engine import Comparison
 from surrogates import Quality
 
@@ -264,7 +264,8 @@ def survives(
     if rest.differentiates:
         said.append(
             f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
-            f"bandwidth, 1 N at rest moves the stage {with_unit(rest.compliance, 'm', 2)}"
+            f"bandwidth, {spoken('1 N')} at rest moves the stage "
+            f"{with_unit(rest.compliance, spoken('m'), 2)}"
         )
     figures |= {
         "stable_shift": list(survival.stable_shift),

@@ -14,19 +14,20 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ccd_casadi.codesign.design_entries import controller_dict
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, outputs_of
 from ccd_casadi.codesign.judgement import judge_on_model
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence, survives
 from ccd_casadi.fixed_structure.judgement import Judgement
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison
-from surrogates import Quality
+from surrogates import GaussianProcess, Quality
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,3 +160,14 @@ class Solution(NotebookHtml):
     verified: Verified | None
     quality: tuple[Quality, ...] = ()
     problem: CoDesignProblem | None = None
+
+    @property
+    def surrogates(self) -> dict[str, tuple[GaussianProcess, str]]:
+        """The last ones by what they are of, each with its unit: the bandwidth in rad/s; over θ in
+        the case's units, lifted over ln ω_S and ln ω_T (rad/s) too. Direct has none.
+
+        `surrogates.to_casadi` makes functions of them.
+        """
+        names = outputs_of(BANDWIDTH if self.problem is None else self.problem.figure)
+        pairs = zip(names.items(), self.outcome.surrogates, strict=False)
+        return {name: (process, unit) for (name, unit), process in pairs}

@@ -32,6 +32,7 @@ from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import compliance_of, statics
 
@@ -46,6 +47,7 @@ DESIGN_FOR_IT = "shorten it, or design for it with loop.rate_hz and loop.delay_u
 ADDED = 5  # plants between those of the case's set that may be added to it for the rate
 
 
+@one_blas_thread
 def deploy(
     run: FinishedRun,
     timing: Timing,

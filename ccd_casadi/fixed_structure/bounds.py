@@ -10,6 +10,17 @@ import numpy as np
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
+# Rows of a loop's bounds, as a reader knows them: by keys of a case.
+BINDS = {
+    "S_MAX": "S_max",
+    "SHAPE": "shape",
+    "LEVEL": "|S| below omega_b",
+    "S_LOW": "S_low",
+    "KS": "weighted_level of KS",
+    "T": "weighted_level of T",
+    "GS": "compliance_max",
+}
+
 
 def kind_and_channel(name: str) -> tuple[str, str]:
     """A multiplier's name in parts: the kind of bound, and the channel whose own it is, if any.

@@ -39,6 +39,7 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import counted
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ class SetCertificate:
     grid_only: tuple[str, ...] = ()  # names of `worst` that no level test is of
 
 
+@one_blas_thread
 def certify(
     plants: "Sequence[ScaledPlant | StateSpace]",
     controller: StateSpace,

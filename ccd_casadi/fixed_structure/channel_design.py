@@ -37,12 +37,14 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Tell, silent, titled
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.synthesis.interchange import from_control, plant_from_control
 
 SLOWEST = 10.0  # ω₀ over ω_low/S_low, the bandwidth that S of slope one needs at least
 TIGHTENED = (1.0, 0.6, 0.3)  # of the room that S_max leaves above 1, for channels of coupled plants
 
 
+@one_blas_thread
 def synthesise_sections(
     plants: Any,
     structure: Structure | ChannelStructure,

@@ -84,10 +84,16 @@ def given_decoupling(
     found = []
     for word, rows in (("outputs", outputs), ("inputs", inputs)):
         count, most = len(rows[0]), len(names)
-        fits = count == most or (word == "outputs" and 0 < count < most)
-        if len(rows) != most or len({len(row) for row in rows}) != 1 or not fits:
-            words = f"{len(names)} channels need {len(names)} {word} each; give as many numbers"
-            raise PlantError(words)
+        for name, row in zip(names, rows, strict=True):
+            if len(row) != count or not row:
+                words = f"channel {name} is a direction of {len(row)} {word}, {names[0]} of {count}"
+                raise PlantError(f"{words}; give a number for each of the plant's {word}")
+        if count > most:
+            words = f"{count} {word} need a channel each, and {most} of these are given; add"
+            raise PlantError(f"{words} {count - most} more, or drop {word} of the plant")
+        if count < most and word == "inputs":
+            words = f"{count} {word} drive as many channels, and {most} of these are given; drop"
+            raise PlantError(f"{words} {most - count}, or give the plant more {word}")
         M = np.array(rows, float).T
         length = np.linalg.norm(M, axis=0)
         if not (length > 0.0).all() or np.linalg.cond(M / length) > 1e6:

@@ -42,7 +42,7 @@ from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number, spoken
 
 REWARD = 1e-6  # of ln ω_b in ln v
 INSIDE = 0.7  # of the ω_b that its bounds leave a given κ: a search that begins at bounds crawls
@@ -95,7 +95,7 @@ class RmsError:
 
     def shown(self, value: float) -> str:
         """In nm."""
-        return f"{1e9 * value:.4g} nm RMS"
+        return spoken(f"{1e9 * value:.4g} nm RMS")
 
     def _of_mean(
         self, kappa: np.ndarray, moved: Sequence[Sequence[StateSpace]]
@@ -184,7 +184,7 @@ def least_value(
             continue
         made, conditions = _judged(search, end, design, floor)
         value = float(np.exp(end.value + REWARD * end.x[-1]))
-        at = f"{goal.shown(value)} at {made.bandwidth / HZ:.2f} Hz"
+        at = f"{goal.shown(value)} at {number(made.bandwidth / HZ, 4)} Hz"
         tell(f"{at}, {count} steps: {made.words}")
         if made.certified and value < best.value:
             direct = goal.to_theta(made.kappa)

@@ -41,10 +41,10 @@ FEWER = 600  # lines that starts of single channels are designed on
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
 CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
 NEGATIVE = "K has a negative gain, by the sign of the plant's"
-NO_START = (
-    "no start is stable by its winding: this structure may not stabilise the plant; of data state "
-    "its unstable poles (--unstable-poles, unstable_poles) and those at zero (--poles-at-zero, "
-    "poles_at_zero), or measure lower lines"
+NO_START = "no start is stable by its winding: this structure may not stabilise the plant"
+OF_DATA = (
+    "; or state its unstable poles (--unstable-poles, unstable_poles) and those at zero "
+    "(--poles-at-zero, poles_at_zero), or measure lower lines"
 )
 
 
@@ -124,7 +124,8 @@ def design_on_data(
         pool, spent = _pool(problem, starts, np.random.default_rng(seed)), 0
     if not len(pool):
         nothing = np.full(len(structure.names), np.nan)
-        return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent, sign)
+        words = NO_START if all(one.modelled for one in responses) else NO_START + OF_DATA
+        return MeasuredDesign(structure, nothing, None, np.nan, None, False, words, spent, sign)
     best: MeasuredDesign | None = None
     for runner in finished(run_race(problem, np.array(pool), progress, workers)):
         end = ascend(problem, runner.point, iterations=60, radius=1e-2, restoring=True)

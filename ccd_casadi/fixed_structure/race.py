@@ -19,6 +19,7 @@ from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Tell
+from ccd_casadi.support.units import number
 
 ROUNDS, STEPS = 27, 15  # at most, steps of each
 RECENT = 8  # the last steps of a round, which show whether it ended in a crawl
@@ -92,8 +93,8 @@ def run_race(
         lead, going = field[0].point, sum(runner.running for runner in field)
         over = lead.assessment.violation
         kept = f"bounds exceeded by {100.0 * over:.1g} %" if over > WITHIN else "within every bound"
-        best = f"{np.exp(lead.tau) * scale:.2f} Hz, {kept}"
-        tell(f"{best}; {going} of {len(running)} searches continue")
+        best = f"{number(float(np.exp(lead.tau)) * scale, 4)} Hz, {kept}"
+        tell(f"{best}; {going} of {len(running)} searches continue, round {turn + 1} of {ROUNDS}")
     return field
 
 

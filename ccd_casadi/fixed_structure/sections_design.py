@@ -21,7 +21,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 
@@ -192,5 +192,5 @@ class DesignSearch:
             if best.certified:
                 break
         assert best is not None
-        self.tell(f"{best.outcome.value}: {best.bandwidth / HZ:.2f} Hz")
+        self.tell(f"{best.outcome.value}: {number(best.bandwidth / HZ, 4)} Hz")
         return best

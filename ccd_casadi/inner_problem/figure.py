@@ -5,7 +5,7 @@ v(θ) = max ω_b,   min e   or   min t,      J = w1 f(θ) + w2 v(θ)
 
 from dataclasses import dataclass
 
-from ccd_casadi.support.units import HZ, with_unit
+from ccd_casadi.support.units import HZ, spoken, with_unit
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class FigureOfMerit:
         """
         if self is BANDWIDTH:
             return f"{self.factor * value:.{digits}g} {self.unit}"
-        return with_unit(value, self.si_unit, digits)
+        return with_unit(value, spoken(self.si_unit), digits)
 
 
 BANDWIDTH = FigureOfMerit(

@@ -4,7 +4,7 @@ import hashlib
 import importlib.util
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -19,7 +19,13 @@ from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.user_code import MODULE, raised_words, require_user_code, with_time_limit
+from ccd_casadi.support.user_code import (
+    MODULE,
+    GivenFunction,
+    raised_words,
+    require_user_code,
+    with_time_limit,
+)
 
 Names = tuple[str, ...]
 Ends = tuple[float, ...]
@@ -42,6 +48,13 @@ class PlantSource:
     fixed: tuple[tuple[str, float, str], ...] = ()
     places: Places | None = None
     motion: Motion | None = None
+    # of a program, with a `content` of its own: nobody sees what it depends on
+    given: GivenFunction | None = field(default=None, compare=False)
+
+    @property
+    def name(self) -> str:
+        """Of the model, or of the function and its file."""
+        return self.model or ":".join(filter(None, (self.file, self.function)))
 
     @property
     def held(self) -> dict[str, float]:
@@ -100,7 +113,7 @@ def plant_from(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> P
     must not run.
     """
     if source.model is None:
-        require_user_code(f"{source.file}:{source.function}")
+        require_user_code(source.name)
     elif source.motion is None and source.places is None:
         lower = upper = ()  # a shipped model is the same in any box
     return _built(source.pinned(), names, lower, upper)
@@ -160,6 +173,12 @@ class _PlantFile(SourceFileLoader):
 
 
 def _own_function(source: PlantSource) -> ModelFunction:
+    late = PlantError(
+        f"{Path(source.name).name} did not return within {source.seconds:g} s; "
+        "correct it, or give it longer with plant_seconds in a table [limits]"
+    )
+    if source.given is not None:
+        return with_time_limit(source.given.call, source.seconds, late)
     assert source.file is not None
     assert source.function is not None
     path = Path(source.file)
@@ -173,10 +192,6 @@ def _own_function(source: PlantSource) -> ModelFunction:
     spec = importlib.util.spec_from_loader(loader.name, loader)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
-    late = PlantError(
-        f"{path.name}:{source.function} did not return within {source.seconds:g} s; "
-        "correct it, or give it longer with plant_seconds in a table [limits]"
-    )
     try:
         sys.dont_write_bytecode = True  # which is told apart by the second: an edit may be sooner
         with_time_limit(loader.exec_module, source.seconds, late)(module)

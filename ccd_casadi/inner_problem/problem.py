@@ -34,6 +34,8 @@ from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.threads import one_blas_thread
+from ccd_casadi.support.units import use_units
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
@@ -72,6 +74,8 @@ class CoDesignProblem(NotebookHtml):
         Of f(θ).
     listed : tuple of (str, tuple of float)
         Parameters that are one of a few values.
+    spoken : (str, str)
+        Units of outputs and inputs in words and on pages.
 
     Examples
     --------
@@ -98,6 +102,7 @@ class CoDesignProblem(NotebookHtml):
     budget: ErrorBudget | None = None
     cost_unit: str = ""
     listed: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    spoken: tuple[str, str] = ("m", "N")
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
@@ -159,6 +164,7 @@ def plant_of(problem: CoDesignProblem) -> Plant:
 
     Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
     """
+    use_units(*problem.spoken)
     return plant_from(problem.source, problem.names, problem.lower, problem.upper)
 
 
@@ -231,6 +237,7 @@ def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:
     return tuple(replace(problem, robust=replace(robust, design_shift=s)) for s in shifts)
 
 
+@one_blas_thread
 def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
     """The true inner problem at θ, by the problem's method: ω_b*(θ), where, and what binds.
 
@@ -276,6 +283,7 @@ def best_choice(
     return best[0], replace(best[1], syntheses=sum(item[1].syntheses for item in found))
 
 
+@one_blas_thread
 def true_design(
     problem: CoDesignProblem, theta: Sequence[float], omega_S: float, omega_T: float
 ) -> Sensitivities:

@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Kind
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, spoken
 
 NEAR = 1.1  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
 
@@ -79,7 +79,7 @@ def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict
     """
     if isinstance(structure, ChannelStructure):
         return _channels_dict(structure, kappa)
-    units = {Kind.GAIN: "N/m", Kind.FREQUENCY: "Hz", Kind.DAMPING: "1"}
+    units = {Kind.GAIN: spoken("N/m"), Kind.FREQUENCY: "Hz", Kind.DAMPING: "1"}
     rows = zip(structure.names, structure.kinds, np.exp(kappa).tolist(), strict=True)
     return {
         "structure": asdict(structure),

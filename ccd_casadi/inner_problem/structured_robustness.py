@@ -35,7 +35,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, of_a_bound
 
 AT_ONCE = 8  # plants added in a round
 APART = 1e-4  # of the box: plants that are closer are the same plant
@@ -89,8 +89,7 @@ class DesignOnBox:
             found = dict(results(workers, self.worst, {turn: (turn,) for turn in own}))
             seen += [worst for worst, _ in found.values()]
             largest = max(seen, key=lambda one: one.value)
-            words = f"{100.0 * np.exp(largest.value):.6g} % of a bound at most"
-            tell(f"{words}, searched from elsewhere")
+            tell(f"{of_a_bound(largest.value)} at most, searched from elsewhere")
             added = next((found[turn][1] for turn in own if found[turn][1]), ())
             if added:
                 break
@@ -195,7 +194,7 @@ def violations(
     heads = [*(Excess(*one, value) for one, value in zip(known, tried, strict=True)), *heads]
     heads.sort(key=lambda head: -head.value)
     if tell is not None:
-        tell(f"{100.0 * np.exp(heads[0].value):.6g} % of a bound at most on {count} plants")
+        tell(f"{of_a_bound(heads[0].value)} at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
     counted = structured.scenarios
     found: list[Scenario] = []

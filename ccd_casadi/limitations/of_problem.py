@@ -25,7 +25,7 @@ from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 
 MODEL = "the model"
 
@@ -46,10 +46,10 @@ class Gap:
         """Of the verdict, with a design's ω_b in rad/s."""
         if not np.isfinite(self.upper_bound):
             return "no bound on every controller, gap not known"
+        gap = 100.0 * (self.upper_bound / bandwidth - 1.0)
         return (
-            f"no controller of any order exceeds {self.upper_bound / HZ:.2f} Hz on {self.plants} "
-            f"here (gap at most {100.0 * (self.upper_bound / bandwidth - 1.0):.0f} %), gap over "
-            "theta not known"
+            f"no controller of any order exceeds {number(self.upper_bound / HZ)} Hz on "
+            f"{self.plants} here (gap at most {gap:.0f} %), gap over theta not known"
         )
 
     def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:

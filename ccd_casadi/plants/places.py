@@ -102,11 +102,18 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         words = "needs a name for each actuator, choose, and axes or a reference; add them"
         raise PlantError(f"places.present {words}")
     points = Positions(places.actuators, names), Positions(places.sensors, names)
-    for group in points if places.sensors else points[:1]:
+    for word, group in zip(
+        ("actuator", "sensor")[: 1 + bool(places.sensors)], points, strict=False
+    ):
         still, slack = ~group.slope.any(axis=2), 1e-9 * np.ptp(nodes, axis=0)
         beyond = np.clip(group.constant, nodes.min(axis=0) - slack, nodes.max(axis=0) + slack)
-        if (still & (beyond != group.constant)).any():
-            raise PlantError("places: a force or sensor is beyond the nodes; move it between them")
+        for i in np.flatnonzero((still & (beyond != group.constant)).any(axis=1)):
+            at = ", ".join(f"{x:g}" for x in group.constant[i])
+            ends = " and ".join(
+                f"({', '.join(f'{x:g}' for x in end(nodes, axis=0))})" for end in (np.min, np.max)
+            )
+            words = f"{word} {i + 1} at ({at}) is beyond the nodes, which lie between {ends}"
+            raise PlantError(f"places: {words}; move it between them, or add nodes")
 
     def of(evaluate: Evaluate) -> PlacedMechanics:
         return PlacedMechanics(evaluate, places, between, *points, own, there)

@@ -14,7 +14,7 @@ from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import bandwidth_level, of_plants, over_hz
 from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ, number, spoken
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
@@ -123,8 +123,10 @@ def size_panels(loop: LoopView, parts: Parts | None = None) -> tuple[Panel, Pane
         look = {"marks": tuple(_marks(loop, G)), "y_range": gap}
     named = ("|G|", "|K|") if parts or loop.scalar else ("plant σ(G)", "controller σ(K)")
     return (
-        over_hz(f"{named[0]} (m/N)", _curves(loop, size[0]), loop.ends, **look),
-        over_hz(f"{named[1]} (N/m)", _curves(loop, size[1]), loop.ends, levels=at, legend=None),
+        over_hz(spoken(f"{named[0]} (m/N)"), _curves(loop, size[0]), loop.ends, **look),
+        over_hz(
+            spoken(f"{named[1]} (N/m)"), _curves(loop, size[1]), loop.ends, levels=at, legend=None
+        ),
     )
 
 

@@ -11,7 +11,7 @@ from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import paragraph
-from ccd_casadi.support.units import display_unit
+from ccd_casadi.support.units import display_unit, spoken
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
 DECADES = 3.5  # of the error's axis
@@ -32,7 +32,7 @@ def budget_chapter(
 
 def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
     windowed = model.window is not None
-    unit, scale = display_unit("m", model.error)
+    unit, scale = display_unit(spoken("m"), model.error)
     head = ["source", "enters as", f"RMS error ({unit})", "of the variance (%)"]
     head += [f"MA ({unit})", f"MSD ({unit})"] if windowed else []
     head += ["RMS force (N)"]
@@ -56,7 +56,7 @@ def _figure(model: BudgetFigures) -> Figure:
     low = float(hz[np.searchsorted(whole, SHOWN**2 * whole[-1])])
     high = float(hz[min(np.searchsorted(whole, (1.0 - 1e-6) * whole[-1]), len(hz) - 1)])
     x = (low, max(2.0 * high, 10.0 * low))
-    unit, scale = display_unit("m", model.error)
+    unit, scale = display_unit(spoken("m"), model.error)
     curves = [
         Curve(hz, scale * np.sqrt(part), item.source.name, CYCLE[i % (len(CYCLE) - 1)],
               "-" if i < len(CYCLE) - 1 else "--")

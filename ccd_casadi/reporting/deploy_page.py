@@ -24,7 +24,7 @@ from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_pan
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, with_unit
+from ccd_casadi.support.units import HZ, number, spoken, with_unit
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for
@@ -92,9 +92,9 @@ def _loop(run: FinishedRun, found: Deployment) -> c.Figure:
         bandwidth_level(run.figures.bandwidth / HZ, text=", continuous")
     )  # fmt: skip
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named.format('S')} (–)")
-    bottom = over_hz(f"{named.format('K')} (N/m)", drawn, (low, nyquist), legend=None)
+    bottom = over_hz(spoken(f"{named.format('K')} (N/m)"), drawn, (low, nyquist), legend=None)
     title = f"Sensitivity and controller over frequency: {', '.join(k.label for k in drawn)}"
-    ends = ", ".join(f"{with_unit(each.y[-1], 'N/m')} ({each.label})" for each in drawn)
+    ends = ", ".join(f"{with_unit(each.y[-1], spoken('N/m'))} ({each.label})" for each in drawn)
     caption = paragraph("deployment.loop", ends)
     return c.Figure(c.Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption)
 

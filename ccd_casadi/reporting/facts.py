@@ -14,7 +14,15 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_slopes
 from ccd_casadi.support.package_text import template
 from ccd_casadi.support.terminal import plain
-from ccd_casadi.support.units import HZ, counted, display_unit, number, small_share, with_unit
+from ccd_casadi.support.units import (
+    HZ,
+    counted,
+    display_unit,
+    number,
+    small_share,
+    spoken,
+    with_unit,
+)
 
 HOLDS = 1e-6  # of the largest multiplier: one below it holds nothing
 
@@ -128,9 +136,9 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
 def gain_words(controller: Mapping[str, Any]) -> str:
     """`470 kN/m`, of several channels `z: 470 kN/m, tip: …`; of `controller` of result.json."""
     if "gain" in controller:
-        return with_unit(controller["gain"], "N/m", 4)
+        return with_unit(controller["gain"], spoken("N/m"), 4)
     return ", ".join(
-        f"{c['name']}: {with_unit(c['gain'], 'N/m', 4)}" for c in controller["channels"]
+        f"{c['name']}: {with_unit(c['gain'], spoken('N/m'), 4)}" for c in controller["channels"]
     )
 
 
@@ -211,7 +219,8 @@ def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
     if name == "S_low":
         return f"|S| at ω_low is at S_low = {inner.S_low:g}", 0.01, "raising S_low by 1 %"
     if name == "compliance_max" and inner.compliance_max is not None:
-        words = f"‖GS‖∞ is at compliance_max = {with_unit(inner.compliance_max, 'm')}/N"
+        most = with_unit(inner.compliance_max, spoken("m")) + spoken("/N")
+        words = f"‖GS‖∞ is at compliance_max = {most}"
         return words, 0.01, "raising it by 1 %"
     if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
         ends = inner.omega_S if variable == "omega_S" else inner.omega_T

@@ -26,7 +26,7 @@ from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, display_unit, number
+from ccd_casadi.support.units import HZ, display_unit, number, spoken
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 MOST = 12  # designs along the front that are drawn
@@ -96,7 +96,7 @@ def front_figure(
     if not good.all():
         curves.append(c.Curve(cost[~good], values[~good], "not stationary", CYCLE[1], "", "x"))
     mark = c.Mark(design[0], design[1], design[2], "+", offset=(8.0, 3.0))
-    top = c.Panel("", f"{v.words} {v.symbol} ({v.unit})", tuple(curves), marks=(mark,))
+    top = c.Panel("", f"{v.words} {v.symbol} ({spoken(v.unit)})", tuple(curves), marks=(mark,))
     low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
     theta = (np.array([point.theta for point in front.points]) - low) / width
     parts = tuple(
@@ -153,7 +153,7 @@ def _table(problem: CoDesignProblem, front: Front) -> c.Table:
         for point in front.points
     )  # fmt: skip
     heads = (axis_label(name, unit) for name, unit, _ in axes)
-    head = ("f", f"{v.symbol} ({v.unit})", *heads, "what binds", "status")
+    head = ("f", f"{v.symbol} ({spoken(v.unit)})", *heads, "what binds", "status")
     return c.Table(head, rows)
 
 

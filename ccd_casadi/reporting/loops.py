@@ -14,7 +14,7 @@ from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, display_unit, number, with_unit
+from ccd_casadi.support.units import HZ, display_unit, number, spoken, with_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
     if len(curves) == 1 and not found.get("bands"):
         found["legend"] = None
     first, ends = views[0], views[0].ends
-    label = f"{first.named(name)} ({UNITS[name]})"
+    label = f"{first.named(name)} ({spoken(UNITS[name])})"
     if i == 0:
         b = first.bounded
         if alone:
@@ -164,9 +164,9 @@ def figure_gains(
 def compliance_panel(view: LoopView) -> Panel:
     """|GS| of the model in a band of all plants, with its bound in m/N where there is one."""
     most = view.bounded.compliance_max
-    unit, factor = display_unit("m", float(view.sizes[3].max()) if most is None else most)
+    unit, factor = display_unit(spoken("m"), float(view.sizes[3].max()) if most is None else most)
     curves, bands = of_plants(view.hz, factor * view.sizes[3])
-    words = f"compliance_max {with_unit(most or 0.0, 'm')}/N"
+    words = f"compliance_max {with_unit(most or 0.0, spoken('m'))}{spoken('/N')}"
     levels = () if most is None else (Level(factor * most, words, colour=GREY),)
     label = f"{view.named('GS')} ({unit}/N)"
     return over_hz(label, curves, view.ends, levels=levels, bands=bands)

@@ -17,7 +17,7 @@ from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.package_text import template
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ, number, spoken
 
 # in a page's own theme, where it has one
 BLUE, GREEN, ORANGE = (
@@ -79,8 +79,8 @@ def lumped_svg(found: Lumped, modal: ModalPlant, reference: float) -> str:
     )
     return template("drawing/assets/lumped.svg").render(
         wide=STEP * (len(side) + 0.5), at=STEP * (np.arange(len(side)) + 0.75), side=side,
-        masses=[f"{number(float(mass), 4)} kg" for mass in found.masses],
-        springs=[(i, j, f"{number(1e-6 * k, 3)} N/µm") for i, j, k in found.springs],
+        masses=[spoken(f"{number(float(mass), 4)} kg") for mass in found.masses],
+        springs=[(i, j, spoken(f"{number(1e-6 * k, 3)} N/µm")) for i, j, k in found.springs],
         driven=found.driven, measured=found.measured, modes=list(zip(words, shapes, strict=True)),
         blue=BLUE, green=GREEN, orange=ORANGE,
     )  # fmt: skip

@@ -24,11 +24,12 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, display_unit, with_unit
+from ccd_casadi.support.units import HZ, display_unit, spoken, with_unit
 
 POINTS = 600
 STEPS = 200  # points of a force step
 DRAWN = 1200  # points of a curve of a move on the machine
+HELD = 0.5  # of the largest force: a stage that springs hold takes so much at the end of a move
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
@@ -115,12 +116,12 @@ def force_step(problem: CoDesignProblem, theta: Sequence[float], view: LoopView)
         kept = np.unique(np.searchsorted(t, [*spread[:-1], most.seconds]))
         drawn.append(y[most.actuator, most.output][kept])
     t, y = t[kept], np.array(drawn)
-    unit, factor = display_unit("m", most.size)
+    unit, factor = display_unit(spoken("m"), most.size)
     curves, bands = of_plants(1e3 * t, factor * y)
     top = factor * y[most.plant, np.searchsorted(t, most.seconds)]
-    mark = c.Mark(1e3 * most.seconds, top, with_unit(most.size, "m"))
-    panel = c.Panel("time (ms)", f"y after a step of 1 N ({unit})", curves, bands, log_x=True,
-                    marks=(mark,))  # fmt: skip
+    mark = c.Mark(1e3 * most.seconds, top, with_unit(most.size, spoken("m")))
+    step = f"y after a step of {spoken('1 N')} ({unit})"
+    panel = c.Panel("time (ms)", step, curves, bands, log_x=True, marks=(mark,))
     words = paragraph("report.force", most, len(loops), view.scalar)
     lines = c.Lines(((panel,),), "A step of force", (3.2,))
     return c.Figure(lines, words)
@@ -150,7 +151,7 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     for large in (True, False):  # those that are flat beside the large ones by themselves
         same = [way for way in kept if (FLAT * way[2] > top) == large]
         most = max((peak for _, _, peak, _ in same), default=0.0)
-        unit, scale = display_unit("m", most)
+        unit, scale = display_unit(spoken("m"), most)
         window = [c.Level(sign * scale * first.window, "window" if sign > 0 else "")
                   for sign in (1, -1) if most < FLAT * first.window]  # fmt: skip
         curves, bands = [], []
@@ -173,9 +174,10 @@ def ways_figure(ways: Mapping[str, Sequence[Move]], words: str) -> c.Figure:
     ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
         f"{ends[:1].upper()}{ends[1:]}. It has settled when its error stays within "
-        f"{with_unit(first.window, 'm')}. {words}"
+        f"{with_unit(first.window, spoken('m'))}. {words}"
     )
-    return c.Figure(lines, caption, (c.Table(("way", *FIGURES), rows), *tables_of(lines)))
+    table = c.Table(("way", *map(spoken, FIGURES)), rows)
+    return c.Figure(lines, caption, (table, *tables_of(lines)))
 
 
 def _over(time: Array, m: Move, values: Array) -> Array:
@@ -193,6 +195,10 @@ def shown_until(found: Move) -> float:
     return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
 
 
+def _held(made: Move) -> float:
+    return float(np.abs(made.force[-1]).max())
+
+
 def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
     """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
@@ -202,9 +208,12 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
         when = "does not settle" if any(m.rest > m.window for m in late) else (
             f"not settled within {with_unit(min(float(m.time[-1]) for m in late), 's')}"
         )  # fmt: skip
-        when += f" ({with_unit(max(m.final_error for m in late), 'm')} left)"
-    words = f"{name}: {when}, error of at most {with_unit(peak, 'm')}"
+        when += f" ({with_unit(max(m.final_error for m in late), spoken('m'))} left)"
+    words = f"{name}: {when}, error of at most {with_unit(peak, spoken('m'))}"
+    held, most = (max(of(m) for m in made) for of in (_held, lambda m: m.peak_force.max()))
+    if held > HELD * most:
+        words += f"; {with_unit(held, spoken('N'))} hold the stage there"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:
         return words
-    return f"{words}, after the figure's end {with_unit(float(after.max()), 'm')}"
+    return f"{words}, after the figure's end {with_unit(float(after.max()), spoken('m'))}"

@@ -66,8 +66,7 @@ def _(item: CoDesignProblem) -> str:
     for i, (name, unit, factor) in enumerate(theta_axes(item)):
         numbers = (factor * value for value in (item.lower[i], item.upper[i], item.start[i]))
         rows.append((name, unit or "–", *numbers))
-    source = item.source
-    name = source.model or f"{source.file}:{source.function}"
+    name = item.source.name
     table = Table(("θ", "unit", "lower", "upper", "start"), tuple(rows))
     found = facts("problem", item, *kind_of(item).described())
     return _cell(Heading(f"A co-design problem: {name}"), table, Facts(tuple(found)))

@@ -11,7 +11,7 @@ from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table
 from ccd_casadi.drawing.svg import BLUE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import paragraph, theta_axes
-from ccd_casadi.support.units import HZ, number, small_share
+from ccd_casadi.support.units import HZ, number, small_share, spoken
 from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 
@@ -77,7 +77,7 @@ def _predicted(q: Quality) -> Panel:
         Curve(ends, ends, "", GREY, "--", width=0.8),
         Curve(q.true, q.predicted, "", BLUE, "", "o"),
     )
-    unit = AXES[q.name]
+    unit = spoken(AXES[q.name])
     return Panel(f"true ({unit})", f"predicted ({unit})", curves, x_range=span, y_range=span,
                  title=WORDS[q.name])  # fmt: skip
 
@@ -85,7 +85,7 @@ def _predicted(q: Quality) -> Panel:
 def _residuals(q: Quality) -> Panel:
     most = max(LEAST_BAND, 1.1 * float(np.abs(q.standardised).max()))
     return Panel(
-        f"true ({AXES[q.name]})",
+        f"true ({spoken(AXES[q.name])})",
         "residual / deviation (–)",
         (Curve(q.true, q.standardised, "", BLUE, "", "o"),),
         levels=tuple(Level(sign * TWO_SIDED_95, "95 % band") for sign in (1.0, -1.0)),
@@ -101,7 +101,7 @@ def table_trust(qualities: Sequence[Quality]) -> Table:
     )  # fmt: skip
     rows = tuple(
         (WORDS[q.name], len(q.true),
-         *(f"{number(e, 3)} {q.unit}" for e in (q.loo.rms, q.loo.max)),
+         *(f"{number(e, 3)} {spoken(q.unit)}" for e in (q.loo.rms, q.loo.max)),
          number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_are, q.at_design)
         for q in qualities
     )  # fmt: skip

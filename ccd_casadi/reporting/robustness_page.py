@@ -27,7 +27,7 @@ from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number, with_unit
+from ccd_casadi.support.units import HZ, number, spoken, with_unit
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
@@ -118,7 +118,8 @@ def _gains(found: Study) -> Chapter:
     shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
         (found.view.named(name),
-         with_unit(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
+         with_unit(peak, spoken(unit), 5) + spoken("/N") * (name == "GS") if unit else number(peak),
+         _place(omega))
         for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
     ]  # fmt: skip
     drawn = Figure(figure_gains([found.view], compliance=True), paragraph("robustness.gains"))

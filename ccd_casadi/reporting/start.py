@@ -14,7 +14,7 @@ from ccd_casadi.lti.closed_loop import sigma_max
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import paragraph, theta_axes
 from ccd_casadi.reporting.loops import gain_panels, over_hz, synthesised_loop, view_of
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, spoken
 
 if TYPE_CHECKING:
     from ccd_casadi.codesign.verified_mixed import VerifiedDesign
@@ -66,7 +66,7 @@ def _panels(loops: Sequence[LoopView]) -> tuple[tuple[Panel, ...], ...]:
         levels=(Level(0.0, "unstable below", colour=GREY),), y_range=(-0.1, 1.1),
     )  # fmt: skip
     S = gain_panels(loops, bounds=False)[0]
-    return (S,), (over_hz(f"{loops[0].named('G')} (m/N)", G, loops[0].ends), pole_map)
+    return (S,), (over_hz(spoken(f"{loops[0].named('G')} (m/N)"), G, loops[0].ends), pole_map)
 
 
 def _table(

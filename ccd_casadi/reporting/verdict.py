@@ -114,6 +114,8 @@ def advice(result: Mapping[str, Any]) -> str:
     failed = [name for name, state in states.items() if state == State.FAILED]
     looked_at = loop_concerns(result)
     if not states:
+        if result.get("status", "verified") != "verified":
+            return "Do not run this: it is not verified. Next: see why."
         words = f"Look at the loop before you run it: {'; '.join(looked_at)}."
         lines = all("between two lines" in concern for concern in looked_at)
         after = "more lines there, or more averages" if lines else "a smaller S_max"
@@ -171,7 +173,7 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
             late = f"only after {with_unit(1e-3 * settled, 's')}"
             found.append(f"a step settles {late}, {PERIODS:g} periods of the bandwidth or more")
     reach = result.get("sensitivity_peak_between_lines")  # of a measured response
-    if reach is not None and reach > BETWEEN * result["sensitivity_peak"]:
+    if reach is not None and reach > max(1.0, BETWEEN * result["sensitivity_peak"]):
         where = result.get("sensitivity_peak_between_lines_hz")
         at = "" if where is None else f" about {where:.4g} Hz"
         found.append(f"|S| may reach {reach:.3g} between two lines{at}")

@@ -30,6 +30,7 @@ from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import kept_quiet
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics, statics
 
@@ -68,6 +69,7 @@ class Study:
         return all(item.stable for item in (*lines, self.tolerances.worst))
 
 
+@one_blas_thread
 def robustness(
     run: FinishedRun,
     demands: Demands | None = None,

@@ -17,11 +17,10 @@ from concurrent.futures import CancelledError
 from contextlib import suppress
 from typing import Any, Self
 
-from threadpoolctl import threadpool_limits
-
 from ccd_casadi.inner_problem.problem import NUMERICS
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.worker_process import R, T, WorkerLost, answer_message
 
 CONNECT_SECONDS = 10.0  # for the scheduler to answer at first, and for a worker to be there
@@ -157,5 +156,5 @@ def serve(numerics: int, message: bytes) -> bytes:
     """
     if numerics != NUMERICS:
         raise RuntimeError(f"the worker's numerics are version {NUMERICS}, ours are {numerics}")
-    with _one_at_a_time, threadpool_limits(limits=1):
+    with _one_at_a_time, one_blas_thread:
         return answer_message(message)

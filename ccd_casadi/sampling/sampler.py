@@ -69,6 +69,7 @@ class Sampler:
         self.trace: list[TraceEntry] = []
         self.nearest: InnerSample | None = None  # of the infeasible ones
         self.solved: dict[tuple[float, ...], InnerSample] = {}  # the best at each θ asked for
+        self.whole = True  # not of a part of the box, whose best may be worse than another's
         self.improvements = 0  # times that a better controller was found where one had been known
         self._tried: dict[tuple[float, ...], list[tuple[float, ...]]] = {}  # κ, in vain
 
@@ -81,6 +82,7 @@ class Sampler:
         """
         other = Sampler(problem, self.store, self.workers, quiet=quiet or self.quiet)
         other.spent = self.spent
+        other.whole = traced
         if traced:
             other.trace = self.trace
         return other
@@ -248,7 +250,8 @@ class Sampler:
         best = before + int(np.nanargmin(J[before:]))
         if np.isnan(J[:before]).all() or J[best] < np.nanmin(J[:before]) - WORTH * abs(J[best]):
             bandwidth = self.trace[best].bandwidth / HZ
-            remark(f"best so far: J {J[best]:.6g}, {bandwidth:.4g} Hz", self.quiet)
+            label = "best so far" if self.whole else "best of this part"
+            remark(f"{label}: J {J[best]:.6g}, {bandwidth:.4g} Hz", self.quiet)
 
     def _worth(self, sample: Sample) -> float:
         """The bandwidth of a design that meets the bounds, else NaN."""

@@ -28,6 +28,7 @@ from ccd_casadi.studies.steepest_descent import Descent, steepest_descent
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
 from surrogates import latin_hypercube
@@ -78,6 +79,7 @@ class Comparison:
         return next(method for method in self.methods if method.name == name)
 
 
+@one_blas_thread
 def compare(
     case: Case, problem: CoDesignProblem, folder: Path, workers: Pool, *, seed: int, quiet: bool
 ) -> Comparison:

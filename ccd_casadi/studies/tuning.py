@@ -31,6 +31,7 @@ from ccd_casadi.plants.response_table import holds_lines
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Tell, silent
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis import interchange
 
@@ -54,7 +55,7 @@ Plant = MeasuredResponse | StateSpace
 NOT_JUDGED = Judgement(0, {}, None, "no usable controller was found to judge")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tuned:
     """A tuned controller.
 
@@ -75,7 +76,9 @@ class Tuned:
     judge: Judgement = NOT_JUDGED
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.case.file!r}, {self.design!r})"
+        made = self.design
+        how = f"{made.bandwidth / HZ:.6g} Hz, {'usable' if made.usable else 'not usable'}"
+        return f"<Tuned {self.case.file}: {how}; {made.words}>"
 
     @property
     def controller(self) -> StateSpace | None:
@@ -83,6 +86,7 @@ class Tuned:
         return self.design.controller
 
 
+@one_blas_thread
 def tune(
     plants: Any,
     *,

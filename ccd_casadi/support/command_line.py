@@ -11,15 +11,14 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.guard import guarded
 from ccd_casadi.support.interrupts import ctrl_c_noticed, raise_on_ctrl_c, was_ctrl_c
 from ccd_casadi.support.options import DEFAULT_CASE, Option, Parser, integer, one_line, usable_cores
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import option as option
 from ccd_casadi.support.terminal import kept_quiet, say
-from ccd_casadi.support.threads import threads_permitted
+from ccd_casadi.support.threads import one_blas_thread, threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost, import_ahead
 
@@ -117,6 +116,7 @@ def run(
     except SystemExit as ended:  # after --help or a wrong option
         raise_on_ctrl_c()
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
+    in_order = guarded(Path(str(_place(options))))
     # Libraries make a million objects that last, and few cycles: looking for those after every 700
     # new ones was a twelfth of a short solve.
     gc.set_threshold(50_000, 20, 100)
@@ -127,9 +127,8 @@ def run(
     gc.freeze()  # what modules made lasts: a collection without it takes a seventh of the time
     raise_on_ctrl_c()
     try:
-        # One BLAS thread: the matrices are small, and results must not depend on the cores.
         with (
-            threadpool_limits(limits=1),
+            one_blas_thread,
             threads_permitted(getattr(options, "workers", 1)),
             permit_user_code(not options.no_user_code),
             kept_quiet(options.quiet),
@@ -164,6 +163,7 @@ def run(
         say(f"interrupted: {_RESUMABLE}", sys.stderr)
     finally:
         gc.unfreeze()  # cycles that an earlier command had left were frozen too
+        in_order()
     return int(code)
 
 

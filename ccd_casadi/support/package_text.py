@@ -4,6 +4,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ccd_casadi.support.units import spoken
+
 if TYPE_CHECKING:  # no command needs it to start
     from jinja2 import Environment, Template
 
@@ -38,8 +40,10 @@ def _templates() -> "Environment":
     """Texts are escaped where there is mark-up, and a name that nobody gives is an error."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    return Environment(
+    made = Environment(
         loader=FileSystemLoader(package_path("")), undefined=StrictUndefined, finalize=printable,
         autoescape=lambda name: not str(name).endswith(PLAIN), trim_blocks=True, lstrip_blocks=True,
         keep_trailing_newline=True,
     )  # fmt: skip
+    made.globals["spoken"] = spoken
+    return made

@@ -1,4 +1,4 @@
-"""Threads for work that releases Python's lock, such as sparse factorisations.
+"""Threads: one for BLAS, and some for work that releases Python's lock, as sparse factorisations.
 
 A command permits as many as it may have workers; a worker process has one, as the others have the
 rest of the machine.
@@ -7,10 +7,12 @@ rest of the machine.
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ContextDecorator, contextmanager
 from contextvars import copy_context
 from functools import cache
 from typing import TYPE_CHECKING, Generic, TypeVar
+
+from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:  # no command needs it to start
     from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +22,29 @@ R = TypeVar("R")
 
 _permitted = [1]
 _here = threading.local()
+
+
+class _OneBlasThread(ContextDecorator):
+    """The limit is the process's: the first to come sets it, and the last to go lifts it."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside = threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._limits = threadpool_limits(limits=1)
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                self._limits.restore_original_limits()
+
+
+# Around what computes: matrices are small, and results must not depend on the number of cores.
+one_blas_thread = _OneBlasThread()
 
 
 class OwnThreads(Generic[T]):

@@ -1,10 +1,36 @@
 """Units and numbers in words: SI inside, and the one factor that is everywhere."""
 
 import math
+import re
 from typing import Any
 
 HZ = 2.0 * math.pi  # rad/s in one hertz
 LARGE = (("G", 1e-9), ("M", 1e-6), ("k", 1e-3))
+
+
+_spoken = {"m": "m", "N": "N"}
+
+
+def use_units(output: str, input_: str) -> None:
+    """From now on these are the units that `spoken` gives, until the next problem is used."""
+    _spoken.update({"m": output, "N": input_})
+
+
+def spoken(words: str) -> str:
+    """Words with metres of the plant's outputs and newtons of its inputs, in the units they have.
+
+    >>> spoken("1 N moves it 3 mm, 3 mm/N"), use_units("rad", "N m")
+    ('1 N moves it 3 mm, 3 mm/N', None)
+    >>> spoken("1 N moves it 3 mm, 3 mm/N; N/m"), use_units("m", "N")
+    ('1 N m moves it 3 mrad, 3 mrad/(N m); N m/rad', None)
+    """
+    output, force = _spoken["m"], _spoken["N"]
+    words = re.sub(r"(?<!\w)([nµum]?)m(?!\w)", rf"\g<1>{output}", words)
+    if force == "N":
+        return words
+    words = re.sub(r"\bkg\b", "kg m²", words)
+    words = re.sub(r"/N\b", f"/({force})", words)
+    return re.sub(r"(?<![\w(])([kMG]?)N\b", rf"\g<1>{force}", words)
 
 
 def display_unit(unit: str, largest: float) -> tuple[str, float]:
@@ -18,10 +44,10 @@ def display_unit(unit: str, largest: float) -> tuple[str, float]:
     >>> display_unit("N/m", 3.6e7)
     ('MN/m', 1e-06)
     """
-    if unit in ("N", "N/m") and abs(largest) >= 1e4:
+    if unit in ("N", "N/m", "N m", "N m/rad") and abs(largest) >= 1e4:
         prefix, factor = next(one for one in LARGE if abs(largest) * one[1] >= 1.0)
         return prefix + unit, factor
-    if unit not in ("m", "s") or largest == 0.0:
+    if unit not in ("m", "s", "rad") or largest == 0.0:
         return unit, 1.0
     for prefix, factor in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
         if abs(largest) * factor >= 0.9995:  # which rounds to 1
@@ -48,6 +74,17 @@ def counted(number: int, noun: str) -> str:
     ('1 plant', '5 plants')
     """
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def of_a_bound(excess: float) -> str:
+    """exp(excess) as a share of a bound; one that is missed by far as a multiple.
+
+    >>> of_a_bound(0.0), of_a_bound(-0.1), of_a_bound(10.0)
+    ('100 % of a bound', '90.4837 % of a bound', '2.2e+04 times a bound')
+    """
+    if excess < math.log(10.0):
+        return f"{100.0 * math.exp(excess):.6g} % of a bound"
+    return f"{math.exp(min(excess, 700.0)):.3g} times a bound"
 
 
 def small_share(share: float) -> str:

@@ -8,11 +8,14 @@ import functools
 import inspect
 import os
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
+from os.path import isfile
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -36,14 +39,23 @@ class _Ended(BaseException):
 
 
 MODULE = "user_plant_"  # how the module of a plant's file is named, before the file's own name
+_given = set[str]()  # where the code of functions is that came as callables
 _leave = os._exit
+
+
+def name_of(function: object) -> str:
+    """How a plant function is named: as a case file does, or a callable by its own name."""
+    if isinstance(function, str):
+        return function
+    return str(getattr(function, "__qualname__", type(function).__name__))
 
 
 def raised_in_user_code(error: BaseException) -> str:
     """The line of a plant's file that an exception came from last, in words; empty: none."""
     place = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
-        if str(frame.f_globals.get("__name__")).startswith(MODULE):
+        module = str(frame.f_globals.get("__name__"))
+        if module.startswith(MODULE) or frame.f_code.co_filename in _given:
             place = f"line {line} of {os.path.basename(frame.f_code.co_filename)}"
     return place
 
@@ -52,6 +64,33 @@ def raised_words(error: BaseException) -> str:
     """An exception of a user's function, and the line that it came from."""
     place = raised_in_user_code(error)
     return f"{described(error)} in {place}" if place else described(error)
+
+
+@dataclass(frozen=True)
+class GivenFunction:
+    """A plant function that a program gives as a callable; another process finds it by its name."""
+
+    call: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        code = getattr(self.call, "__code__", None)
+        if code is not None:
+            _given.add(code.co_filename)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.require_found()
+        return vars(self)
+
+    def require_found(self) -> None:
+        """Raise UserError where a worker process cannot find it."""
+        name, module = name_of(self.call), sys.modules.get(getattr(self.call, "__module__", ""))
+        found: Any = module
+        for part in name.split("."):
+            found = getattr(found, part, None)
+        file = getattr(module, "__file__", None) or ""
+        if found is not self.call or (module is sys.modules["__main__"] and not isfile(file)):
+            words = f"{name} cannot be found by module and name in a worker process"
+            raise UserError(f"plant.function: {words}; move it into a file, or give workers=1")
 
 
 @contextmanager

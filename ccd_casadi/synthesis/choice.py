@@ -24,6 +24,7 @@ from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
@@ -44,6 +45,7 @@ class InputChoice:
     failed: tuple[tuple[int, ...], ...]
 
 
+@one_blas_thread
 def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoice:
     """The best `count` inputs of a plant for mixed sensitivity with given weights.
 

@@ -22,6 +22,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.mat_files import mat_variables
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.synthesis.matlab_systems import PARTS, strings, system_of, systems_in
 from ccd_casadi.synthesis.realisation import realised
 
@@ -97,6 +98,7 @@ def from_control(system: Any) -> StateSpace:
     return StateSpace(*(part.astype(float) for part in parts), period=float(system.dt or 0.0))
 
 
+@one_blas_thread
 def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
     """A plant of python-control, ready for synthesis.
 

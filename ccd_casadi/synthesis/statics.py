@@ -16,7 +16,7 @@ from ccd_casadi.lti.grid import refine_peak
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ, display_unit, with_unit
+from ccd_casadi.support.units import HZ, display_unit, spoken, with_unit
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
@@ -46,12 +46,13 @@ class Statics:
     @property
     def words(self) -> str:
         """One or two sentences."""
-        low = f"1 N at {self.low_hz:.3g} Hz moves it {with_unit(self.low, 'm')}"
+        low = f"{spoken('1 N')} at {self.low_hz:.3g} Hz moves it {with_unit(self.low, spoken('m'))}"
         if np.isinf(self.stiffness):  # a pole at rest
             return f"The controller integrates: a constant force does not move the stage; {low}."
         found = (
-            f"Static stiffness K(0) = {with_unit(self.stiffness, 'N/m')}: a constant force of 1 N "
-            f"moves the stage {with_unit(self.compliance, 'm')}, {low}."
+            f"Static stiffness K(0) = {with_unit(self.stiffness, spoken('N/m'))}: "
+            f"a constant force of {spoken('1 N')} moves the stage "
+            f"{with_unit(self.compliance, spoken('m'))}, {low}."
         )
         if self.differentiates:
             found += (
@@ -96,8 +97,8 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
     >>> compliance_words(64e-3, 59e-3, 5.5e-3, 1.0)
     '64 mm/N at most, 5.5 mm/N at 1 Hz, 59 mm/N at rest'
     """
-    metres, factor = display_unit("m", most)
-    unit = f"{metres.replace('µ', 'u')}/N"  # as the terminal prints it
+    metres, factor = display_unit(spoken("m"), most)
+    unit = f"{metres.replace('µ', 'u')}{spoken('/N')}"  # as the terminal prints it
     rest = f"{factor * at_rest:.4g} {unit} at rest" if at_rest else "none at rest (an integrator)"
     at_low = f"{factor * low:.4g} {unit} at {low_hz:.3g} Hz"
     return f"{factor * most:.4g} {unit} at most, {at_low}, {rest}"

@@ -18,6 +18,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
 
@@ -101,6 +102,7 @@ class Design(NotebookHtml):
     controller: StateSpace
 
 
+@one_blas_thread
 def synthesise(
     plant: ScaledPlant,
     weights: Weights,

@@ -146,6 +146,7 @@ class OneSampler(SimpleNamespace):
     """What the search asks of a Sampler."""
 
     spent = SynthesisCounts()
+    quiet = True
 
     def of(self, other: CoDesignProblem, *, traced: bool = True) -> "OneSampler":
         return OneSampler(problem=other)

@@ -1,5 +1,6 @@
 """The formulation where the user names none is one that ends; the others say that they do not."""
 
+import tomllib
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 from oracles.helpers import HZ, problem
 
-from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case import load_case, parse_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import run
 from ccd_casadi.codesign.formulations import (
     MANY,
@@ -19,7 +21,6 @@ from ccd_casadi.codesign.formulations import (
     slow_words,
     usual_name,
 )
-from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -89,7 +90,7 @@ def test_the_usual_formulation_has_an_end() -> None:
     assert usual_name(CASE, 2) == "nested"
 
 
-@pytest.mark.parametrize(("masses", "expected"), [(6, Lifted), (7, Direct)])
+@pytest.mark.parametrize(("masses", "expected"), [(2, Nested), (6, Direct)])
 def test_a_script_gets_one_that_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, masses: int, expected: type
 ) -> None:
@@ -97,6 +98,19 @@ def test_a_script_gets_one_that_ends(
     monkeypatch.setattr(run, "co_design", lambda _, formulation, __: asked.append(formulation))
     run.solve(chain_of(masses, tmp_path))
     assert [type(item) for item in asked] == [expected]
+
+
+def test_a_script_gets_the_formulation_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the options of the case, and those of a case without such tables for a problem."""
+    asked = []
+    monkeypatch.setattr(run, "co_design", lambda _, formulation, __: asked.append(formulation))
+    own = replace(CASE, sampling=replace(CASE.sampling, points=4))
+    for given in (own, problem_of(own)):
+        run.solve(given)
+    bare = {key: table for key, table in tomllib.loads(CASE.path.read_text("utf-8")).items()
+            if key not in ("sampling", "outer")}  # fmt: skip
+    plain = parse_case(bare, CASE.path)
+    assert asked == [formulation_of(case, usual_name(case, 2)) for case in (own, plain)]
 
 
 @pytest.mark.parametrize(

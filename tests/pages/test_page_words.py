@@ -181,6 +181,7 @@ def test_a_loop_within_its_bounds_is_looked_at_as_an_engineer_would(
 def test_what_s_may_reach_between_two_lines_is_said_first() -> None:
     tuned = {"sensitivity_peak": 1.8, "sensitivity_peak_between_lines": 4.78}
     assert "4.78 between two lines" in advice(tuned)
+    assert advice(tuned | {"status": "not_verified"}).startswith("Do not run this")
     assert head_of("", True, "verified", "", "", "", tuned).badge == "warn"
     assert not advice(tuned | {"sensitivity_peak_between_lines": 1.85})
 
