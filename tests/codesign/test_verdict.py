@@ -299,7 +299,7 @@ def test_descents_along_a_shelf_reach_its_end() -> None:
     assert ends[0] == pytest.approx(ends[1], rel=1e-5)
 
 
-def test_a_shelf_that_bends_sharply_is_followed_to_its_end(chain_problem) -> None:
+def test_a_shelf_that_bends_sharply_is_followed_to_its_end() -> None:
     """The slope of this edge changes by a fifth within 1e-5 of the box.
 
     A margin that never grew past its first value left ends 3e-5 of J apart.
