@@ -5,6 +5,8 @@ import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +19,13 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.files import deployment_dict
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import _judged, deploy
+from ccd_casadi.deployment.robust_set import as_written, members
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.drawing.paint import page_html
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, uncertain_plant
+from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.reporting.deploy_page import deploy_page
@@ -70,6 +74,7 @@ points = 2
 box_points = 0
 direct_starts = 2
 """
+EXAMPLES = Path(__file__).parents[2] / "examples"
 DIAGONALS = """[controller.channel.sum]
 outputs = [1, 1]
 [controller.channel.difference]
@@ -128,6 +133,15 @@ def test_what_runs_are_the_channels_sections_by_tustin(
     words = deployment_dict(run, found, 0)["channels"]
     assert [item["sections"]["gain"] for item in words] == pytest.approx([3e3, 3e3])
     assert [item["order"] for item in words] == [3, 3]
+
+
+def test_both_ends_of_a_stroke_are_deployed_and_judged() -> None:
+    case = load_case(EXAMPLES / "gantry_stroke" / "case.toml")
+    problem = with_range(problem_of(case))
+    run: Any = SimpleNamespace(problem=problem, theta=problem.start)
+    places = {place for item in members(run) for place in item.at.varies}  # type: ignore[attr-defined]
+    assert places == {("theta.at", -0.3), ("theta.at", 0.3)}
+    assert len(as_written(run)) > len(members(run, dense=True)) > len(places)
 
 
 def test_the_whole_loop_is_judged_on_the_whole_set(
