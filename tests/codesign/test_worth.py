@@ -27,7 +27,11 @@ def test_the_gain_is_that_of_a_full_solve(tmp_path, capsys) -> None:
     assert main([str(TWO_MASS), "--out", str(tmp_path), "--workers", "1"]) == 0
     found = json.loads((tmp_path / "worth.json").read_text())
     said = capsys.readouterr().out
-    assert said.startswith("answer        Co-design is worth it: hardware cost -")
+    assert said.startswith(
+        "answer        Co-design is worth it, but its design is not to be built as it is "
+        "(survives warned): hardware cost -"
+    )
+    assert {found[name]["survives"]["state"] for name in ("sequential", "co_design")} == {"warned"}
     problem = problem_of(load_case(TWO_MASS))
     old, new = found["sequential"], found["co_design"]
     for each in (old, new):  # the bandwidth is that of the true inner problem
