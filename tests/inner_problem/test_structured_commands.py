@@ -113,7 +113,7 @@ def test_no_controller_exceeds_what_the_run_says(
     bound = result["gap"]["bandwidth_bound_hz"]
     assert bound >= result["bandwidth_hz"]
     assert (
-        f"no controller of any order exceeds {number(bound)} Hz"
+        f"no controller of any order exceeds {number(bound, 4)} Hz"
         in (result["verdict"]["optimal"]["words"])
     )
     assert gap_main([str(folder / "run")]) == 0
