@@ -48,7 +48,7 @@ class Gap:
             return "no bound on every controller, gap not known"
         gap = 100.0 * (self.upper_bound / bandwidth - 1.0)
         return (
-            f"no controller of any order exceeds {number(self.upper_bound / HZ)} Hz on "
+            f"no controller of any order exceeds {number(self.upper_bound / HZ, 4)} Hz on "
             f"{self.plants} here (gap at most {gap:.0f} %), gap over theta not known"
         )
 

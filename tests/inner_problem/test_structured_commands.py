@@ -38,7 +38,7 @@ from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.solve import main as solve_main
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import synthesise
 from surrogates.retrain import main as retrain_main
@@ -113,7 +113,7 @@ def test_no_controller_exceeds_what_the_run_says(
     bound = result["gap"]["bandwidth_bound_hz"]
     assert bound >= result["bandwidth_hz"]
     assert (
-        f"no controller of any order exceeds {bound:.2f} Hz"
+        f"no controller of any order exceeds {number(bound, 4)} Hz"
         in (result["verdict"]["optimal"]["words"])
     )
     assert gap_main([str(folder / "run")]) == 0
