@@ -46,7 +46,7 @@ class Processes:
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join(map(str, [*TESTS.iterdir(), TESTS.parent])),
+            "PYTHONPATH": os.pathsep.join(map(str, [*TESTS.iterdir(), TESTS, TESTS.parent])),
             "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "3",
         }
         log = (self.folder / "log.txt").open("ab")
