@@ -102,6 +102,7 @@ def test_the_library_computes_with_one_blas_thread() -> None:
         seen.append(threads())
         return stage(theta, k)
 
+    ccd.problem_of(case_of(stage))  # every BLAS that it needs is loaded before the limit
     with threadpool_limits(limits=2, user_api="blas"):
         ccd.problem_of(case_of(spied))
         after = threads()
