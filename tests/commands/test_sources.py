@@ -18,6 +18,7 @@ PROCESSES = {
     ("ccd_casadi/deployment/fmu.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
     ("ccd_casadi/explorer/background.py", "subprocess.Popen"),
+    ("ccd_casadi/support/guard.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }
 BY_NAME = {
     "ccd_casadi/support/errors.py",

@@ -250,7 +250,7 @@ def test_the_judge_refuses_what_passes_a_channels_bound_alone() -> None:
     assert judged({name: {"S_max": peak * 1.001}}).passed
     found = judged({name: {"S_max": peak * 0.999}})
     assert not found.passed
-    assert f"S_max of {name}" in found.words
+    assert f"S_max of channel {name}" in found.words
     slower = judged({name: {"bandwidth_ratio": 50.0}})
     assert slower.bandwidth < 0.5 * found.bandwidth
 

@@ -148,7 +148,7 @@ def test_a_coarse_and_a_fine_actuator_are_designed_together() -> None:
 
 
 def test_channels_that_do_not_fit_the_plant_are_refused() -> None:
-    with pytest.raises(PlantError, match="give as many"):
+    with pytest.raises(PlantError, match="need a channel each"):
         given_decoupling(("a", "b"), [[1, 0, 0], [0, 1, 0]], [[1, 0], [0, 1]])
     with pytest.raises(PlantError, match="1 outputs and 2 inputs"):
         plant_set([one_sensor()], None, find_decoupling(plant()))
