@@ -43,12 +43,15 @@ def feedforward_slopes(
     nearest = min([*np.abs(zeros), poles.max()])
     if not nearest > 1e-9 * poles.max():
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
-    radius = min(RADIUS * nearest, 1.0 / (delay + 0.5 * period))  # where exp stays of size one
+    late = delay + 0.5 * period
+    radius = RADIUS * nearest
+    if radius * late > 1.0:  # where exp stays of size one
+        radius = 1.0 / late
     s = radius * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
     X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
     G = plant.C @ X + plant.D
     inverse = np.linalg.inv(G) if G.shape[1] == G.shape[2] else np.linalg.pinv(G)
-    ahead = np.exp(s * (delay + 0.5 * period))[:, None, None]
+    ahead = np.exp(s * late)[:, None, None]
 
     def series(values: np.ndarray) -> Array:
         found = np.fft.fft(ahead * values, axis=0).real[: ORDER + 1] / POINTS

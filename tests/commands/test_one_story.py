@@ -1,6 +1,6 @@
 """Terminal, page and result.json of a run tell one story: generated small runs of every kind.
 
-`benchmarks/consistency.py` runs as many as are asked for; a figure that is changed is found.
+`benchmarks/oracle.py consistency` runs as many as are asked for; a figure that is changed is found.
 """
 
 import json
@@ -11,8 +11,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from benchmark_scripts import benchmark
-from page_figures import disagreements, page_of, same
+from oracles import consistency
+from oracles.page_figures import disagreements, page_of, same
 
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.stored import write_page
@@ -23,7 +23,7 @@ SEEDS = [2, 4, *(pytest.param(seed, marks=SLOW) for seed in (1, 5, 9, 13))]
 
 @pytest.fixture(scope="module")
 def consistency() -> ModuleType:
-    return benchmark("consistency")
+    return consistency
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import own_plant
+from oracles.commands import own_plant
 
 from ccd_casadi.support.options import ExitCode
 

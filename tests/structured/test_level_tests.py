@@ -4,9 +4,9 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from fixed_structure_channels import loop as channel_loop
-from fixed_structure_channels import plant as channel_plant
-from fixed_structure_loops import BOUNDS, FAST, loop, plant
+from oracles.fixed_structure_channels import loop as channel_loop
+from oracles.fixed_structure_channels import plant as channel_plant
+from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
 from ccd_casadi.codesign.verdict import OwnSet, State, survives
 from ccd_casadi.fixed_structure import Sampling, Structure, certificate, certify

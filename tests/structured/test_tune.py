@@ -8,9 +8,9 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
-from helpers import few
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from oracles.helpers import few
 from scipy.io import savemat
 from scipy.signal import cont2discrete
 from test_measured import two_by_two

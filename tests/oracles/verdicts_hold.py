@@ -1,11 +1,11 @@
 """Do verdicts hold? Seeded random small co-designs of every kind, each judged by files alone.
 
-`python benchmarks/verdicts_hold.py --cases 200 [--first 0] [--minutes 5] --out FILE.json` draws
+`python benchmarks/oracle.py verdicts_hold --cases 200 [--first 0] [--minutes 5] --out FILE.json` draws
 chains of two or three masses with one or two parameters in a small box and solves each by the
 command, as mixed sensitivity (alone, on a set, with a bound of the compliance, with disturbances)
 or sections (bandwidth, least RMS error; continuous, sampled, on a set), by `nested`, `lifted` or
 `direct`. `verdicts_judge`, which shares no code with the package, then looks at every claim of the
-run; tests/oracles/contradictions.py at its figures among each other. A run that is not verified,
+run; oracles/contradictions at its figures among each other. A run that is not verified,
 or found nothing, is solved again by another formulation: verified there at the same J, it is
 falsely not verified. What FILE holds already is not run again. One in twenty is a measured
 response. `--hard` makes every plant one that design models of ours once mistook: damping of 0.02 to
@@ -27,9 +27,6 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
-
 from oracles.contradictions import contradictions
 from oracles.verdicts_judge import HZ, Chain, Loop, wrong
 

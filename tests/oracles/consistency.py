@@ -1,10 +1,10 @@
 """Does a run say one thing? Terminal, pages and result.json of generated small runs, compared.
 
-`python benchmarks/consistency.py --cases 60 [--first 0] [--minutes 4] [--out FILE.json]` solves
+`python benchmarks/oracle.py consistency --cases 60 [--first 0] [--minutes 4] [--out FILE.json]` solves
 seeded cases of every kind by the commands: mixed sensitivity (by any formulation, alone, on a set,
 with a bound of the compliance, with disturbances), sections (continuous, sampled, on a set, least
 RMS error), two channels, and `tune` of measured lines and of models. What contradicts what is
-printed, by tests/support/page_figures.py and contradictions.py; nothing is expected. The shipped
+printed, by oracles/page_figures and contradictions.py; nothing is expected. The shipped
 example of two channels is one in ten, with bounds of its own.
 """
 
@@ -20,16 +20,15 @@ from typing import Any
 
 import numpy as np
 import scipy.io
-from verdicts_hold import drawn, written
-from verdicts_judge import HZ, Chain, Loop
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from oracles.contradictions import contradictions
+from oracles.page_figures import disagreements, tuned_disagreements
+from oracles.verdicts_hold import drawn, written
+from oracles.verdicts_judge import HZ, Chain, Loop
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tests/support"))
-from contradictions import contradictions  # noqa: E402
-from page_figures import disagreements, tuned_disagreements  # noqa: E402
+ROOT = Path(__file__).parents[2]
 
 
 def called(command: str, *options: str, seconds: float) -> tuple[int | None, str]:
