@@ -32,6 +32,7 @@ def boxed(case: CoDesignProblem, rng: np.random.Generator) -> CoDesignProblem:
     return replace(case, lower=lower, upper=upper, start=start, inner=inner)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formulation", ["nested", "lifted", "direct"])
 def test_case_study_1_agrees_with_itself(solved: Callable[[str], Path], formulation: str) -> None:
     folder = solved(formulation)

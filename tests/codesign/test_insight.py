@@ -136,6 +136,7 @@ def test_every_point_is_the_best_of_all_for_some_weights(traded) -> None:
     assert (np.diff(slopes) < 0.0).all()  # a convex hull: the first hertz are the cheapest
 
 
+@pytest.mark.slow
 def test_no_other_masses_lie_beyond_the_front(traded) -> None:
     """The weights of two neighbours that are as good as each other: a grid has nothing better."""
     problem, front = traded

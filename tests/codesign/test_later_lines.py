@@ -27,6 +27,7 @@ def verdict_of(folder: Path) -> dict:
     return json.loads((folder / "result.json").read_text())["verdict"]
 
 
+@pytest.mark.slow
 def test_after_deploy_and_robustness_no_page_says_what_the_run_no_longer_does(copied: Path) -> None:
     before = verdict_of(copied)
     assert before["deployable"]["state"] == "unknown"

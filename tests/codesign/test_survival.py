@@ -138,6 +138,7 @@ def found_of(loops: LoopsOffModel, S_max: float) -> Survival:
     return survival(loops, S_max=S_max, bandwidth=CROSSOVER, omega_low=1.0)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=25, deadline=None)
 def test_no_range_hides_a_peak_or_an_instability(seed: int) -> None:
@@ -208,6 +209,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
             assert not stable or peak > S_max * (1.0 + 0.5 * PEAK)
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 10**6),
     reach=st.floats(1e-3, 0.2),

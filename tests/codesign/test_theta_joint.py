@@ -117,6 +117,7 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
         assert told == pytest.approx(bent, rel=0.03, abs=0.03 * float(np.abs(H[j]).max()))
 
 
+@pytest.mark.slow
 def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
     """From inside the box: J falls, a mass ends at its bound, and the true value says so."""
     problem = built(start=(58.0, 57.0))
@@ -160,6 +161,7 @@ def test_a_poll_has_the_best_place_along_the_axes(theta: tuple[float, float]) ->
     assert polled(problem, models, at).theta == pytest.approx(places[int(np.argmin(J))])
 
 
+@pytest.mark.slow
 def test_a_local_solve_takes_joint_steps_and_stops_where_another_has_ended(tmp_path: Path) -> None:
     problem = built()
     with SampleStore(tmp_path / "samples.sqlite") as store:

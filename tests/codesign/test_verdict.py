@@ -280,6 +280,7 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
     np.testing.assert_array_equal(through, end)
 
 
+@pytest.mark.slow
 def test_descents_along_a_shelf_reach_its_end() -> None:
     """Where the bandwidth would jump is an edge like another: no start stops on the way along it.
 
@@ -299,6 +300,7 @@ def test_descents_along_a_shelf_reach_its_end() -> None:
     assert ends[0] == pytest.approx(ends[1], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_shelf_that_bends_sharply_is_followed_to_its_end() -> None:
     """The slope of this edge changes by a fifth within 1e-5 of the box.
 

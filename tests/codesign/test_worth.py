@@ -23,6 +23,7 @@ from surrogates import design
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"
 
 
+@pytest.mark.slow
 def test_the_gain_is_that_of_a_full_solve(tmp_path, capsys) -> None:
     assert main([str(TWO_MASS), "--out", str(tmp_path), "--workers", "1"]) == 0
     found = json.loads((tmp_path / "worth.json").read_text())

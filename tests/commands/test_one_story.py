@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from oracles import consistency
@@ -21,13 +20,8 @@ SLOW = pytest.mark.slow
 SEEDS = [2, 4, *(pytest.param(seed, marks=SLOW) for seed in (1, 5, 9, 13))]
 
 
-@pytest.fixture(scope="module")
-def consistency() -> ModuleType:
-    return consistency
-
-
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_run_contradicts_itself_nowhere(seed: int, consistency: ModuleType) -> None:
+def test_a_run_contradicts_itself_nowhere(seed: int) -> None:
     row = consistency.judged(seed, 200.0)
     assert "failed" not in row
     assert row["status"] != "infeasible"  # else there is little to compare

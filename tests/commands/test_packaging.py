@@ -6,6 +6,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from doctest import DocTestFinder
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -47,8 +48,11 @@ def required(path: Path) -> Iterator[tuple[str, str]]:
                 yield str(words[0]).partition(".")[0], str(words[1])
 
 
+installed = cache(packages_distributions)  # reads every distribution
+
+
 def distribution(module: str) -> str:
-    return normal(NAMES.get(module) or packages_distributions().get(module, [module])[0])
+    return normal(NAMES.get(module) or installed().get(module, [module])[0])
 
 
 def test_every_package_that_is_imported_is_declared() -> None:

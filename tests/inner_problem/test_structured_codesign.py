@@ -93,9 +93,8 @@ def test_a_theta_has_one_value_whoever_asks(anchored: CoDesignProblem, tmp_path:
     assert asked([0, 1], 1, "a.sqlite") == first
 
 
-@pytest.mark.parametrize(
-    "structure", [PID.structure, pytest.param(Structure(biquads=1), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("structure", [PID.structure, Structure(biquads=1)])
 def test_three_formulations_agree_and_a_resumed_run_is_the_same(
     structure: Structure, tmp_path: Path
 ) -> None:
@@ -153,6 +152,7 @@ def test_mixed_sensitivity_is_not_answered_for_sections() -> None:
         true_inner(quick(), (60.0, 60.0))
 
 
+@pytest.mark.slow
 def test_an_impossible_case_says_what_falls_short(tmp_path: Path) -> None:
     case = quick(replace(PID, starts=2))
     case = replace(case, inner=replace(case.inner, S_low=1e-5))
@@ -218,6 +218,7 @@ def test_a_controller_that_a_search_at_its_theta_found_is_kept_near_by(
     assert len(searches) > 2
 
 
+@pytest.mark.slow
 def test_few_starts_that_miss_are_not_the_last_word() -> None:
     """No search says that it found nothing from fewer starts than the usual number."""
     impossible = with_structured(quick(), weighted_level=1e-3, starts=1)

@@ -83,6 +83,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.mark.slow
 def test_its_verdict_agrees_with_itself(folder: Path) -> None:
     problem = problem_of(load_case(folder / "run" / "case.toml"))
     result = json.loads((folder / "run" / "result.json").read_text())
@@ -106,6 +107,7 @@ def test_a_run_holds_the_controller_and_its_page(folder: Path) -> None:
         assert result["costs"][easier] >= result["bandwidth_hz"] * (1.0 - 1e-3)
 
 
+@pytest.mark.slow
 def test_no_controller_exceeds_what_the_run_says(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -124,6 +126,7 @@ def test_no_controller_exceeds_what_the_run_says(
     assert bound <= model
 
 
+@pytest.mark.slow
 def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_sees_it(
     folder: Path,
 ) -> None:
@@ -212,6 +215,7 @@ def test_a_run_that_is_not_verified_deploys_as_such(
     assert deployed["status"] == "not_verified"
 
 
+@pytest.mark.slow
 def test_robustness_is_of_the_loop_as_it_runs(folder: Path) -> None:
     """Of the sampled one, and as deploy has it."""
     run, out = folder / "run", folder / "robustness"

@@ -32,8 +32,9 @@ def listed(**changes: object) -> CoDesignProblem:
 
 
 # The lightest is the best; then with the ends and the best beside it each on its own.
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("w2", "beside"), [(-0.995, ()), pytest.param(-0.1, (0, -1), marks=pytest.mark.slow)]
+    ("w2", "beside"), [(-0.995, ()), (-0.1, (0, -1))]
 )
 def test_one_search_seeds_the_next_and_all_is_counted(
     w2: float, beside: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -66,6 +67,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
             assert result["objective"] <= other + 1e-4 * abs(other)
 
 
+@pytest.mark.slow
 def test_a_part_is_not_empty_because_no_step_from_nearby_ends_in_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

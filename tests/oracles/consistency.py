@@ -1,6 +1,6 @@
 """Does a run say one thing? Terminal, pages and result.json of generated small runs, compared.
 
-`python benchmarks/oracle.py consistency --cases 60 [--first 0] [--minutes 4] [--out FILE.json]` solves
+`python benchmarks/oracle.py consistency --cases 60 [--first 0] [--minutes 4] [--out FILE]` solves
 seeded cases of every kind by the commands: mixed sensitivity (by any formulation, alone, on a set,
 with a bound of the compliance, with disturbances), sections (continuous, sampled, on a set, least
 RMS error), two channels, and `tune` of measured lines and of models. What contradicts what is

@@ -1,6 +1,6 @@
 """Do verdicts hold? Seeded random small co-designs of every kind, each judged by files alone.
 
-`python benchmarks/oracle.py verdicts_hold --cases 200 [--first 0] [--minutes 5] --out FILE.json` draws
+`python benchmarks/oracle.py verdicts_hold --cases 200 [--first 0] [--minutes 5] --out FILE` draws
 chains of two or three masses with one or two parameters in a small box and solves each by the
 command, as mixed sensitivity (alone, on a set, with a bound of the compliance, with disturbances)
 or sections (bandwidth, least RMS error; continuous, sampled, on a set), by `nested`, `lifted` or

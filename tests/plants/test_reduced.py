@@ -78,6 +78,7 @@ def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
     assert np.abs(frequencies(more) / true - 1.0).max() < 0.1 * missed(0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", [BARE, LOADED, FADING])
 def test_its_derivatives_are_those_of_the_small_problem(stage: RibStage) -> None:
     known = [HERE, HERE + STEP, HERE - STEP]
@@ -113,6 +114,7 @@ def test_what_fades_is_whole_at_one_end_and_gone_at_the_other(
     assert faded(meet, np.zeros((1, len(meet))), full)[0][full] == 1.0
 
 
+@pytest.mark.slow
 def test_with_fading_modes_an_answer_moves_without_a_jump() -> None:
     """Where the ribs move, the twentieth mode and the next meet and change their shapes."""
     along = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 3.0 * STEP[5]])

@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 def test_jobs_of_a_queue_end_where_one_process_does(
     solved: Callable[[str], Path], tmp_path: Path
 ) -> None:

@@ -57,6 +57,7 @@ def resident_pages() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1])
 
 
+@pytest.mark.slow
 def test_factorisations_of_threads_do_not_pile_up() -> None:
     """SciPy's SuperLU frees nothing that another thread made: 12 MB each here, 7 GB in a solve."""
     n = 120

@@ -67,6 +67,7 @@ def test_a_dip_is_found_by_its_depth_and_a_slope_is_none(slope, depth, width) ->
     assert _dip([step]) == pytest.approx(1.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_search_leaves_no_dip_at_the_bandwidth_unless_the_shape_ends_there() -> None:
     found = {}
     for ends in ShapeEnd:

@@ -244,6 +244,7 @@ def test_the_command_prints_the_bounds(capsys: pytest.CaptureFixture[str]) -> No
     assert "sections" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_more_delay_never_gives_more() -> None:
     plant = lag(40.0)
     bounds = Bounds(1.8, 0.9, 1e-3, shape=1.1)

@@ -39,6 +39,7 @@ def plate(seed: int, outputs: int = 2) -> ScaledPlant:
     return scale_plant(modal, M_K)
 
 
+@pytest.mark.slow
 @few(5)
 @given(st.integers(0, 99))
 def test_the_choice_is_that_of_enumeration(seed: int) -> None:
