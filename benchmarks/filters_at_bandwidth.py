@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 

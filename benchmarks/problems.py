@@ -9,8 +9,8 @@ import numpy as np
 
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
+from ccd_casadi.plants.registry import two_mass
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.plants.two_mass import two_mass
 from ccd_casadi.synthesis.weights import Weights
 
 HZ = 2.0 * np.pi

@@ -26,12 +26,11 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ccd_casadi.fixed_structure import synthesise_sections
-from ccd_casadi.fixed_structure.design import _pool, problem_for
+from ccd_casadi.fixed_structure.design import MARGIN, DesignSearch, _pool, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
-from ccd_casadi.fixed_structure.race import at_its_bandwidth, started
-from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
+from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth, started
 from ccd_casadi.plants.scaling import ScaledPlant
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))

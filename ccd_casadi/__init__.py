@@ -11,7 +11,7 @@ Names are imported when they are first used: this module alone loads neither num
 import sys as _sys
 
 from ccd_casadi.support import interrupts as _interrupts
-from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.terminal import NotebookHtml
 from surrogates.lazy_names import from_stub as _from_stub
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library

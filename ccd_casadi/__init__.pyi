@@ -14,15 +14,15 @@ from ccd_casadi.deployment.pipeline import deploy as deploy
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise_sections
-from ccd_casadi.fixed_structure.sections_design import SectionsDesign as SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure as Structure
+from ccd_casadi.inner_problem.objective import TrueQuantities as TrueQuantities
 from ccd_casadi.inner_problem.problem import CoDesignProblem as CoDesignProblem
 from ccd_casadi.inner_problem.problem import scaled_plant as scaled_plant
 from ccd_casadi.inner_problem.problem import true_design as true_design
 from ccd_casadi.inner_problem.problem import true_inner as true_inner
-from ccd_casadi.inner_problem.true_function import TrueQuantities as TrueQuantities
 from ccd_casadi.interop.frames import samples_frame as samples_frame
-from ccd_casadi.lti.hold import Sampling as Sampling
+from ccd_casadi.lti.loop import Sampling as Sampling
 from ccd_casadi.plants.measured import read_frequency_response as read_frequency_response
 from ccd_casadi.plants.plant import Plant as Plant
 from ccd_casadi.plants.plant import build_plant as build_plant
@@ -32,7 +32,7 @@ from ccd_casadi.studies.comparison import compare as compare
 from ccd_casadi.studies.tuning import Tuned as Tuned
 from ccd_casadi.studies.tuning import tune as tune
 from ccd_casadi.support.errors import UserError as UserError
-from ccd_casadi.support.units import HZ as HZ
+from ccd_casadi.support.text import HZ as HZ
 from ccd_casadi.synthesis.choice import choose_inputs as choose_inputs
 from ccd_casadi.synthesis.interchange import plant_from_control as plant_from_control
 from ccd_casadi.synthesis.synthesis import synthesise as synthesise

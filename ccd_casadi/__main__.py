@@ -10,8 +10,8 @@ from types import ModuleType
 from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.interrupts import raise_on_ctrl_c
 from ccd_casadi.support.options import one_line
-from ccd_casadi.support.package_text import package_text, template
 from ccd_casadi.support.terminal import say
+from ccd_casadi.support.text import package_text, template
 
 # word -> the module of its `main`, and what it does
 COMMANDS = {

@@ -5,7 +5,7 @@ import sys
 
 from ccd_casadi.support.command_line import ExitCode, command, option, program, run_folder
 from ccd_casadi.support.terminal import inform, say
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.text import counted
 
 
 @command(
@@ -22,7 +22,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.plant_report import SHARES, plant_report
     from ccd_casadi.reporting.facts import theta_words
     from ccd_casadi.support.json_files import json_text, json_values, write_json
-    from ccd_casadi.support.package_text import template
+    from ccd_casadi.support.text import template
 
     case = load_case(options.case)
     problem = problem_of(case)

@@ -38,10 +38,10 @@ def table(comparison: "Comparison") -> str:
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.cases.toml_writer import case_to_toml
+    from ccd_casadi.cases.schema import case_to_toml
     from ccd_casadi.sampling.cluster import pool
-    from ccd_casadi.studies.baselines import case_to_compare
     from ccd_casadi.studies.comparison import compare, comparison_dict
+    from ccd_casadi.studies.steepest_descent import case_to_compare
     from ccd_casadi.support.json_files import write_json
 
     case, problem = case_to_compare(options.case, "compare")
@@ -55,7 +55,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     if not options.quiet:
         say(table(comparison))
         say("\n".join(answer["conclusions"]["sentences"]))
-    from ccd_casadi.drawing.stored import write_page  # matplotlib is slow to import
+    from ccd_casadi.drawing.paint import write_page  # matplotlib is slow to import
     from ccd_casadi.studies.compare_page import comparison_page
 
     write_page(folder / "report.html", comparison_page(folder, comparison, answer))

@@ -13,7 +13,7 @@ from ccd_casadi.support.command_line import ExitCode, command, option, run_folde
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import break_frequencies, break_frequency_options, positive, valued
 from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -56,11 +56,11 @@ def _problem(
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
-    from ccd_casadi.codesign.design_entries import figures_dict
+    from ccd_casadi.codesign.result_entries import figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
     from ccd_casadi.studies.backends import RICCATI, TITLES, synthesise_with, verdicts
     from ccd_casadi.support.json_files import write_json
-    from ccd_casadi.support.versions import versions
+    from ccd_casadi.support.text import versions
     from ccd_casadi.support.worker_process import Runner
 
     problem, theta, point = _problem(options)

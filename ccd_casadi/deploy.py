@@ -9,9 +9,8 @@ from ccd_casadi.robust.demands import MOVE_OPTIONS, move_limits
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import one_line, option, positive, real, valued
-from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import inform, say
-from ccd_casadi.support.units import spoken, with_unit
+from ccd_casadi.support.terminal import Progress, inform, say
+from ccd_casadi.support.text import spoken, with_unit
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
@@ -54,11 +53,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
-    from ccd_casadi.deployment import files, fmu, source_code
-    from ccd_casadi.deployment.move import Electronics
-    from ccd_casadi.deployment.on_hardware import on_hardware
+    from ccd_casadi.deployment import files, source_code
+    from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
+    from ccd_casadi.deployment.outcome import deployed_line
     from ccd_casadi.deployment.pipeline import deploy
-    from ccd_casadi.deployment.words import deployed_line
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.facts import run_name
 
@@ -93,7 +91,7 @@ def main(options: argparse.Namespace) -> ExitCode:
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
-    for name in (*files.DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, fmu.FILE):
+    for name in (*files.DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, source_code.FILE):
         (folder / name).unlink(missing_ok=True)
     files.write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
@@ -104,13 +102,13 @@ def main(options: argparse.Namespace) -> ExitCode:
         texts = source_code.write_c(folder, K, **naming, forward=moved.forward)
         code = source_code.structured_text(K, **naming)
         (folder / source_code.ST_FILE).write_text(code, "utf-8")
-        if options.fmu and not fmu.write_fmu(folder / fmu.FILE, K, texts, name):
+        if options.fmu and not source_code.write_fmu(folder / source_code.FILE, K, texts, name):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     finished = with_verdict_line(finished, folder, "deployable", deployed_line(finished, found))
     inform(_summary(finished, found))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
-    from ccd_casadi.reporting.index import index_of, publish
     from ccd_casadi.reporting.moves import way_words
+    from ccd_casadi.reporting.verdict import index_of, publish
 
     if moved is not None:
         last = list(moved.ways)[-1]
@@ -127,10 +125,10 @@ def main(options: argparse.Namespace) -> ExitCode:
 
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
+    from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.deployment.words import figure_rows, order_words, status_words
     from ccd_casadi.reporting.verdict import advice
-    from ccd_casadi.support.package_text import template
+    from ccd_casadi.support.text import template
 
     return template("templates/deploy.txt", place_words=place_words).render(
         d=found, status=status_words(run, found), decision=advice(run.result),

@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, command, option
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 
 @command(
@@ -20,7 +20,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.run_folder import problem_at
     from ccd_casadi.limitations.of_problem import gap_of
     from ccd_casadi.support.json_files import json_text
-    from ccd_casadi.support.versions import versions
+    from ccd_casadi.support.text import versions
 
     problem, theta, finished = problem_at(options.case, options.theta)
     theta = problem.start if theta is None else theta

@@ -77,8 +77,8 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     found, made = measured_answer(case, seed=options.seed, tell=PROGRESS)
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:
-        from ccd_casadi.drawing.stored import write_page
-        from ccd_casadi.reporting.measured_page import measured_page
+        from ccd_casadi.drawing.paint import write_page
+        from ccd_casadi.reporting.structured_page import measured_page
 
         folder = run_folder(options.case, options.out)
         answer = {"status": found.status, **found.figures}
@@ -88,9 +88,9 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
 
 def _print(found: "InnerAnswer", options: argparse.Namespace) -> ExitCode:
     """Print the answer, after controller.json is written: the folder may be refused."""
-    from ccd_casadi.codesign.design_entries import figures_dict
+    from ccd_casadi.codesign.result_entries import figures_dict
     from ccd_casadi.support.json_files import json_text, write_json
-    from ccd_casadi.support.versions import versions
+    from ccd_casadi.support.text import versions
 
     if options.out is not None and found.controller is not None:
         folder = run_folder(options.case, options.out)

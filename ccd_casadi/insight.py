@@ -21,8 +21,7 @@ from ccd_casadi.support.terminal import inform
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.insight import insight_dict
-    from ccd_casadi.codesign.pareto import pareto_front
+    from ccd_casadi.codesign.insight import insight_dict, pareto_front
     from ccd_casadi.codesign.run import outer_of
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
@@ -47,8 +46,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     verified = [point for point in front.points if point.verified]
     inform(f"front         {len(verified)} of {len(front.points)} points verified, "
            f"{front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
-    from ccd_casadi.reporting.index import index_of, publish
     from ccd_casadi.reporting.insight import insight_page
+    from ccd_casadi.reporting.verdict import index_of, publish
 
     page = insight_page(done, front, responses, index_of(folder))
     publish(folder, folder / "insight.html", page)

@@ -13,15 +13,15 @@ from ccd_casadi.support.terminal import inform
 
 @command(
     "ccd_casadi.report", "Draw the pages of a finished folder again; nothing is designed.",
-    needs=["ccd_casadi.drawing.stored"], place=RUN,
+    needs=["ccd_casadi.drawing.paint"], place=RUN,
     without_effect=["--out", "--workers", "--seed"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """Draw every page of the folder, and of those of deployments and the like below it."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.drawing.stored import NAME, draw, read_pages
-    from ccd_casadi.reporting.index import publish, write_index
+    from ccd_casadi.drawing.paint import NAME, draw, read_pages
     from ccd_casadi.reporting.solve_page import page_of_run
+    from ccd_casadi.reporting.verdict import publish, write_index
 
     folder = options.run
     if not folder.is_dir():

@@ -30,9 +30,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.result import write_run
-    from ccd_casadi.codesign.retraining import Job
+    from ccd_casadi.codesign.retraining import Job, only_job, publish
     from ccd_casadi.codesign.run import outer_of, require_solvable
-    from ccd_casadi.codesign.stored import only_job, publish
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore

@@ -36,7 +36,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
     from ccd_casadi.robust.study import robustness, study_dict, survival_line
     from ccd_casadi.support.json_files import write_json
-    from ccd_casadi.support.versions import versions
+    from ccd_casadi.support.text import versions
 
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
@@ -69,8 +69,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     answer = study_dict(finished, found)
     answer |= {"seed": options.seed, "versions": versions(), "seconds": options.seconds()}
     write_json(folder / "robustness.json", answer)
-    from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
     from ccd_casadi.reporting.robustness_page import conclusion, robustness_page
+    from ccd_casadi.reporting.verdict import index_of, publish  # matplotlib is slow to import
 
     own = options.controller is None
     if own:

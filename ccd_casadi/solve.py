@@ -11,7 +11,7 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import inform, say
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.text import counted
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.tables import Case
@@ -30,7 +30,7 @@ def summary(solution: "Solution") -> str:
         theta_words,
     )
     from ccd_casadi.reporting.verdict import advice, terminal_lines
-    from ccd_casadi.support.package_text import template
+    from ccd_casadi.support.text import template
 
     r = solution.result
     words = template("templates/solve.txt", gain_words=gain_words, channel_words=channel_words)
@@ -62,7 +62,7 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
 
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     """What J counts of the controller, and what was predicted of it."""
-    from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
+    from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES
     from ccd_casadi.reporting.facts import prediction_words
 
     where = " on every plant" if "plants" in result["certificate"] else ""

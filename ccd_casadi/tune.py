@@ -33,19 +33,19 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
     from ccd_casadi.deployment.realisation import realised
     from ccd_casadi.deployment.source_code import write_c
-    from ccd_casadi.drawing.stored import write_page
+    from ccd_casadi.drawing.paint import write_page
     from ccd_casadi.fixed_structure import Structure
     from ccd_casadi.inner_problem.kinds import FixedStructure
     from ccd_casadi.inner_problem.sections_words import SectionWords
-    from ccd_casadi.lti.hold import tustin
+    from ccd_casadi.lti.loop import tustin
     from ccd_casadi.reporting.facts import loop_lines
-    from ccd_casadi.reporting.measured_page import measured_page
+    from ccd_casadi.reporting.structured_page import measured_page
     from ccd_casadi.reporting.verdict import advice
     from ccd_casadi.studies.measured_answer import answer_of
     from ccd_casadi.studies.tuning import tune
     from ccd_casadi.support.json_files import json_values, write_json
     from ccd_casadi.support.process_pool import Workers
-    from ccd_casadi.support.versions import versions
+    from ccd_casadi.support.text import versions
 
     folder = run_folder(options.run[0], options.out)
     structure = None if options.biquads is None else Structure(

@@ -18,10 +18,10 @@ def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
-    from ccd_casadi.studies.baselines import case_to_compare
+    from ccd_casadi.studies.steepest_descent import case_to_compare
     from ccd_casadi.studies.worth import worth, worth_words
     from ccd_casadi.support.json_files import write_json
-    from ccd_casadi.support.versions import versions
+    from ccd_casadi.support.text import versions
 
     case, problem = case_to_compare(options.case, "worth")
     out = options.out or options.case.with_name(options.case.stem + "_worth")

@@ -27,7 +27,7 @@ def options() -> str:
 
 def result() -> str:
     """Every key of result.json, as its schema has it."""
-    from ccd_casadi.support.package_text import package_text
+    from ccd_casadi.support.text import package_text
 
     schema = json.loads(package_text("templates/result.schema.json"))
     of_design = schema["else"]["required"]
@@ -40,7 +40,7 @@ def result() -> str:
 
 def files() -> str:
     """Every file that a run's folder may hold, as its index.html lists them."""
-    from ccd_casadi.reporting.index import FILES, PAGES
+    from ccd_casadi.reporting.verdict import FILES, PAGES
 
     rows = [f"| `{name}` | {words} |" for name, words in (PAGES | FILES).items()]
     return "\n".join(["| file | holds |", "|---|---|", *rows])

@@ -9,7 +9,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from surrogates.covariance import Kernel
 from surrogates.fitting import fit
-from surrogates.interface import Array
+from surrogates.samples import Array
 
 
 class SurrogateRegressor(RegressorMixin, BaseEstimator):

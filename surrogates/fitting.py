@@ -9,11 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError
 
-from surrogates.covariance import Hyperparameters, Kernel
+from surrogates.covariance import (
+    LENGTH_BOUNDS,
+    NOISE_BOUNDS,
+    SIGNAL_BOUNDS,
+    Hyperparameters,
+    Kernel,
+    log_likelihood,
+)
 from surrogates.gaussian_process import GaussianProcess, conditioned, loo_errors
-from surrogates.interface import Array, SurrogateFitError
-from surrogates.likelihood import LENGTH_BOUNDS, NOISE_BOUNDS, SIGNAL_BOUNDS, log_likelihood
-from surrogates.samples import Samples, checked
+from surrogates.samples import Array, Samples, SurrogateFitError, checked
 
 Noise = ArrayLike | None
 # Observations that an exact process holds: 200 MB and some ten seconds to factorise.

@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
-from surrogates.covariance import Hyperparameters, Kernel, covariance
-from surrogates.interface import Array, Errors, box, errors, freeze
-from surrogates.likelihood import factorise, symmetric_inverse
-from surrogates.samples import Samples, checked
+from surrogates.covariance import Hyperparameters, Kernel, covariance, factorise, symmetric_inverse
+from surrogates.samples import Array, Errors, Samples, box, checked, errors, freeze
 
 # Rounding leaves the predictive variance at noise-free samples anywhere within a
 # few eps of zero, of either sign; below this share of σ² it is taken as the floor.

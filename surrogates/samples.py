@@ -1,11 +1,81 @@
-"""The samples of one output, checked once and scaled the same way for every surrogate."""
+"""Samples of a function, what is asked of a surrogate of them, and the plans by which samples are
+placed."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from surrogates.interface import Array, SurrogateFitError, box
+Array = NDArray[np.float64]
+
+
+class SurrogateFitError(ValueError):
+    """The samples given cannot be fitted: wrong shapes, non-finite, singular."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Prediction errors on samples left out.
+
+    Parameters
+    ----------
+    rms, max : float
+        In output units.
+    q2 : float
+        Q² = 1 - Σ (y - ŷ)² / Σ (y - ȳ)²: 1 is exact, 0 no better than the mean. Of samples that do
+        not vary it is 1 if they are predicted exactly and 0 otherwise.
+    """
+
+    rms: float
+    max: float
+    q2: float
+
+
+def errors(residuals: ArrayLike, Y: ArrayLike) -> Errors:
+    """Summarise residuals y - ŷ at samples.
+
+    Parameters
+    ----------
+    residuals, Y : array (n,)
+        In output units.
+
+    Returns
+    -------
+    Errors
+
+    Examples
+    --------
+    >>> errors([0.0, 3.0, 4.0], [0.0, 5.0, 10.0])
+    Errors(rms=2.886751345948129, max=4.0, q2=0.5)
+    """
+    e = np.asarray(residuals, dtype=float)
+    y = np.asarray(Y, dtype=float)
+    wrong = float(e @ e)
+    spread = float(np.sum((y - y.mean()) ** 2))
+    q2 = 1.0 - wrong / spread if spread > 0.0 else float(wrong == 0.0)
+    return Errors(float(np.sqrt(wrong / e.size)), float(np.abs(e).max()), q2)
+
+
+def box(lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
+    """Return the bounds of a box as float arrays (d,), lower < upper and finite.
+
+    Raises:
+        ValueError: the bounds differ in shape, are not finite or not increasing.
+    """
+    low = np.array(lower, dtype=float, ndmin=1)
+    high = np.array(upper, dtype=float, ndmin=1)
+    if low.ndim != 1 or low.shape != high.shape or low.size == 0:
+        raise ValueError(f"bounds must be two vectors of one length, got {low.shape}, {high.shape}")
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        raise ValueError("bounds must be finite with lower < upper in every input")
+    return low, high
+
+
+def freeze(*arrays: Array) -> None:
+    """Make arrays that whoever holds the surrogate shares read-only."""
+    for array in arrays:
+        array.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,3 +198,167 @@ def checked(
     if points.shape[1] != low.size:
         raise SurrogateFitError(f"expected X (n >= 2, {low.size}), got {points.shape}")
     return Samples(low, high, points, values, slopes, deviations)
+
+
+class DesignKind(StrEnum):
+    """Names of the sampling plans `design` knows."""
+
+    GRID = "grid"
+    SOBOL = "sobol"
+    LHS = "lhs"
+
+
+def grid(lower: ArrayLike, upper: ArrayLike, points_per_axis: int | list[int]) -> Array:
+    """The full tensor grid, the last input running fastest, bounds included.
+
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+    points_per_axis : int or sequence
+        For all inputs or for each; an axis of one point is in the middle.
+
+    Returns
+    -------
+    array (N, d)
+
+    Raises
+    ------
+    ValueError
+        Bad bounds, or fewer than one point on an axis.
+
+    Examples
+    --------
+    >>> grid([0, 0], [1, 2], 2).tolist()
+    [[0.0, 0.0], [0.0, 2.0], [1.0, 0.0], [1.0, 2.0]]
+    """
+    low, high = box(lower, upper)
+    counts = np.broadcast_to(np.asarray(points_per_axis, dtype=int), low.shape)
+    if (counts < 1).any():
+        raise ValueError("a grid needs at least one point per axis")
+    axes = [
+        np.linspace(a, b, m) if m > 1 else np.array([0.5 * (a + b)])
+        for a, b, m in zip(low, high, counts, strict=True)
+    ]
+    mesh = np.meshgrid(*axes, indexing="ij")
+    return np.stack([m.ravel() for m in mesh], axis=1)
+
+
+def corners(lower: ArrayLike, upper: ArrayLike) -> Array:
+    """The corners of the box, to add to a plan that avoids them.
+
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+
+    Returns
+    -------
+    array (2^d, d)
+    """
+    return grid(lower, upper, 2)
+
+
+def sobol(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
+    """n points of a scrambled Sobol sequence [1]_; plans of one seed are nested.
+
+    Balanced are its first 2^m points: for another n the next power of two is drawn and cut.
+
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+    n, seed : int
+        Number of points, and seed of the scrambling.
+
+    Returns
+    -------
+    array (n, d)
+
+    Raises
+    ------
+    ValueError
+        Bad bounds, or n < 1.
+
+    .. [1] Owen, "Scrambling Sobol' and Niederreiter-Xing points", J. Complexity 1998.
+    """
+    from scipy.stats import qmc  # 0.5 s to import, so only where it is needed
+
+    low, high = _box(lower, upper, n)
+    sequence = qmc.Sobol(low.size, scramble=True, rng=np.random.default_rng(seed))
+    return _spread(sequence.random_base2((n - 1).bit_length())[:n], low, high)
+
+
+def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
+    """n points, exactly one in each of the n slices of every input (McKay et al., 1979).
+
+    Parameters
+    ----------
+    lower, upper : array (d,)
+        The box.
+    n, seed : int
+        Number of points, and seed.
+
+    Returns
+    -------
+    array (n, d)
+
+    Raises
+    ------
+    ValueError
+        Bad bounds, or n < 1.
+    """
+    from scipy.stats import qmc
+
+    low, high = _box(lower, upper, n)
+    cells = qmc.LatinHypercube(low.size, rng=np.random.default_rng(seed))
+    return _spread(cells.random(n), low, high)
+
+
+def design(
+    kind: DesignKind | str, lower: ArrayLike, upper: ArrayLike, n: int, seed: int = 0
+) -> Array:
+    """The plan named `kind` over a box.
+
+    Parameters
+    ----------
+    kind : DesignKind or str
+        "grid", "sobol" or "lhs".
+    lower, upper : array (d,)
+        The box.
+    n, seed : int
+        Points along each axis of a grid, else all points; seed of the others.
+
+    Returns
+    -------
+    array (N, d)
+
+    Raises
+    ------
+    ValueError
+        Unknown kind, bad bounds or n < 1.
+
+    Examples
+    --------
+    >>> design("lhs", [0.0], [1.0], 4, seed=1).shape
+    (4, 1)
+    """
+    match DesignKind(kind):
+        case DesignKind.GRID:
+            return grid(lower, upper, n)
+        case DesignKind.SOBOL:
+            return sobol(lower, upper, n, seed)
+        case DesignKind.LHS:
+            return latin_hypercube(lower, upper, n, seed)
+
+
+def _box(lower: ArrayLike, upper: ArrayLike, n: int) -> tuple[Array, Array]:
+    if n < 1:
+        raise ValueError(f"a plan needs at least one point, got n = {n}")
+    return box(lower, upper)
+
+
+def _spread(unit: Array, low: Array, high: Array) -> Array:
+    # qmc.scale can overshoot the upper bound by one rounding; the sampled function
+    # may be undefined there.
+    return np.clip(low + unit * (high - low), low, high)

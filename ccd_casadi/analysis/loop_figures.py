@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import frequency_and_damping
-from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.loop import Loop, constant_drive
+from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import (
+from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis.closed_loop import (
     ClassicalMargins,
     classical_margins,
     least_margins,

@@ -6,19 +6,20 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.lti.closed_loop import responses_of, sigma_max
-from ccd_casadi.lti.grid import (
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import (
     frequency_grid,
     local_maxima,
     refine_peak,
     resonant,
+    responses_of,
     root_flanks,
+    sigma_max,
     thinned,
 )
-from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import ClassicalMargins, least_margins
+from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis.closed_loop import ClassicalMargins, least_margins
 
 POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
 # In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot is round.

@@ -24,15 +24,13 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.analysis.motor import STEP, MotionAt
 from ccd_casadi.analysis.move import forward_force
+from ccd_casadi.analysis.setpoint import STEP, MotionAt
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
-from ccd_casadi.lti.hold import Sampling, sampled, tustin
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.loop import Sampling, sampled, tustin
+from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.recurrence import states
+from ccd_casadi.support.arrays import Array, states
 
 SHARPNESS = 200.0  # of the largest of the plants: twelve that are equally late add 1.3 %
 ROUNDED, MOST_ROUNDED = 0.005, 0.1  # r: of the window, for each mode; and for all together

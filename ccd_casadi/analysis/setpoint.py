@@ -1,22 +1,18 @@
-"""The symmetric fourth-order setpoint of a move: the shortest with its derivatives in bounds.
+"""Setpoints within the limits of a motor, and the feedforward of them."""
 
-Snap is ± s or 0, with the times t4 of constant snap, t3 of constant jerk, t2 of constant
-acceleration and t1 of constant velocity, so that
-
-    jerk = s t4,   acceleration = jerk (t4 + t3),   velocity = acceleration (2 t4 + t3 + t2),
-    stroke = velocity (4 t4 + 2 t3 + t2 + t1).
-
-Each time is the longest that no later bound forbids, from the innermost outwards. (Lambrechts,
-Boerlage and Steinbuch 2005.)
-"""
-
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -105,3 +101,215 @@ def _longest(*bounds: Any) -> Any:
     """The longest time within all bounds; zero where one of them is negative."""
     time = min(bounds, key=np.real)
     return time if np.real(time) > 0.0 else 0.0 * time
+
+
+ORDER = 4  # highest derivative of the setpoint
+POINTS = 64  # on the circle of Cauchy's integral
+RADIUS = 0.25  # of the nearest singularity of the inverse
+ROUNDING = 1e-11  # of the inverse on the circle: what a coefficient has by rounding there is none
+
+
+def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
+    """F (ORDER + 1, m, p) in N per unit of y and s, of a stable plant; T and τ in s.
+
+    Taylor coefficients by Cauchy's integral on a circle within which the inverse is analytic: its
+    aliasing error is RADIUS^(POINTS - ORDER). Raises UserError where the plant has a zero at s = 0,
+    so that no finite force holds a position. Free bodies have F_0 = 0, without dampers F_1 = 0.
+    """
+    return feedforward_slopes(plant, (), period, delay)[0]
+
+
+def feedforward_slopes(
+    plant: StateSpace, changes: Sequence[tuple[Array, Array, Array]], period: float, delay: float
+) -> tuple[Array, Array]:
+    """F, and dF (k, ORDER + 1, m, p) of k changes (dA, dB, dC) of a square plant.
+
+    dG⁻¹ = -G⁻¹ dG G⁻¹
+    """
+    poles = np.abs(plant.poles)
+    zeros = plant.zeros(float(poles.max()))
+    nearest = min([*np.abs(zeros), poles.max()])
+    if not nearest > 1e-9 * poles.max():
+        raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
+    late = delay + 0.5 * period
+    radius = RADIUS * nearest
+    if radius * late > 1.0:  # where exp stays of size one
+        radius = 1.0 / late
+    s = radius * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
+    X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
+    G = plant.C @ X + plant.D
+    inverse = np.linalg.inv(G) if G.shape[1] == G.shape[2] else np.linalg.pinv(G)
+    ahead = np.exp(s * late)[:, None, None]
+
+    def series(values: np.ndarray) -> Array:
+        found = np.fft.fft(ahead * values, axis=0).real[: ORDER + 1] / POINTS
+        size = np.abs(values).max(axis=0)
+        size = np.minimum(size.max(axis=0), size.max(axis=1)[:, None])  # whatever the units
+        found[np.abs(found) <= ROUNDING * size] = 0.0
+        return np.asarray(found / radius ** np.arange(ORDER + 1)[:, None, None])
+
+    F, dF = series(inverse), np.zeros((len(changes), ORDER + 1, *inverse.shape[1:]))
+    for i, (dA, dB, dC) in enumerate(changes):
+        whole = s[:, None, None] * np.eye(len(poles)) - plant.A
+        dG = dC @ X + plant.C @ np.linalg.solve(whole, dA @ X + dB)
+        dF[i] = series(-inverse @ dG @ inverse)
+    return F, dF
+
+
+STEP = 1e-30  # along the imaginary axis
+UNLIMITED = 1e12  # A: a peak current that is none
+HELD = 1e-6  # of the moving force: a plant that holds its output by more has a spring
+
+
+@dataclass(frozen=True)
+class Motor:
+    """One motor, or a catalogue in rising order of the moving mass: N/A, ohm, A, kg.
+
+    `rms_power` in W of all motors together, None: any. `size` names the parameter of θ that is the
+    moving mass, which is added to the plant at every input: M + mass b bᵀ.
+    """
+
+    force_constant: tuple[float, ...]
+    resistance: tuple[float, ...]
+    peak_current: tuple[float, ...] = (UNLIMITED,)
+    moving_mass: tuple[float, ...] = (0.0,)
+    rms_power: float | None = None
+    size: str = ""
+
+    def at(self, mass: Any) -> tuple[Any, Any, Any]:
+        """k_f, R and the peak current of the motor with this moving mass."""
+        own, columns = self.moving_mass, (self.force_constant, self.resistance, self.peak_current)
+        if len(own) == 1:
+            longer = mass / own[0] if self.size else 1.0
+            return columns[0][0] * longer, columns[1][0] * longer, columns[2][0]
+        i = int(np.clip(np.searchsorted(own, np.real(mass)) - 1, 0, len(own) - 2))
+        share = (mass - own[i]) / (own[i + 1] - own[i])
+        k, R, i_peak = ((1.0 - share) * row[i] + share * row[i + 1] for row in columns)
+        return k, R, i_peak
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A move in SI and its motor: `limits` (acceleration inf: what the motor allows), `window` in
+    which it has settled, `dwell` from its end to the next. The first output moves."""
+
+    limits: MoveLimits
+    window: float
+    dwell: float = 0.0
+    motor: Motor | None = None
+
+    @property
+    def required(self) -> bool:
+        """Whether the acceleration is given."""
+        return bool(np.isfinite(self.limits.acceleration))
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """The setpoint, the largest and the RMS force of any motor, the heat of all.
+
+    `peak_share` and `heat_share` of what the motor allows; `limits` of the move in words.
+    """
+
+    profile: Setpoint
+    peak_force: Any
+    rms_force: Any
+    power: Any = 0.0
+    peak_share: Any = 0.0
+    heat_share: Any = 0.0
+    limits: tuple[str, ...] = ()
+
+
+def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
+    """The cycle with `forces` g (m,) per unit acceleration and a motor of this moving mass."""
+    allowed, motor = motion.limits, motion.motor
+    acceleration, why = allowed.acceleration, "acceleration"
+    if motor is not None and not motion.required:
+        k, _, i_peak = motor.at(mass)
+        acceleration, why = k * i_peak / _largest(forces), "peak force"
+        if np.real(_cycle(motion, acceleration, forces, mass).heat_share) > 1.0:
+            acceleration, why = _heated(motion, np.real(acceleration), forces, mass), "heat"
+    found = _cycle(motion, acceleration, forces, mass)
+    reached = (
+        ("velocity", found.profile.velocity, allowed.velocity),
+        (why, found.profile.acceleration, acceleration),
+        ("jerk", found.profile.jerk, allowed.jerk),
+    )
+    limits = tuple(name for name, value, most in reached if np.real(value / most) > 1.0 - 1e-9)
+    return replace(found, limits=limits)
+
+
+def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle:
+    """With an acceleration of so much at most."""
+    profile, motor = setpoint(replace(motion.limits, acceleration=acceleration)), motion.motor
+    mean = profile.squared_acceleration / (profile.durations.sum() + motion.dwell)
+    largest = _largest(forces)
+    found = Cycle(profile, largest * profile.acceleration, largest * mean**0.5)
+    if motor is None:
+        return found
+    k, R, i_peak = motor.at(mass)
+    power = R / k**2 * (forces**2).sum() * mean
+    heat_share = power / (motor.rms_power or np.inf)
+    return replace(found, power=power, peak_share=found.peak_force / (k * i_peak),
+                   heat_share=heat_share)  # fmt: skip
+
+
+def _largest(forces: Array) -> Any:
+    """The largest of their sizes."""
+    found = max(forces, key=lambda force: abs(np.real(force)))
+    return found if np.real(found) > 0.0 else -found
+
+
+def _heated(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
+    """The acceleration below `most` with which the heat is all that is allowed.
+
+    Newton's last step, at the root, gives its derivatives too.
+    """
+
+    def share(acceleration: Any) -> Any:
+        return _cycle(motion, acceleration, np.real(forces), np.real(mass)).heat_share
+
+    low = most  # far below it durations are so long that rounding fills them
+    while np.real(share(low)) > 1.0:
+        low *= 0.1
+    a = float(scipy.optimize.brentq(lambda a: np.real(share(a)) - 1.0, low, most, xtol=1e-14 * low))
+    slope = np.imag(share(a + 1j * STEP)) / STEP
+    return a - (_cycle(motion, a, forces, mass).heat_share - 1.0) / slope
+
+
+@dataclass(frozen=True)
+class MotionAt:
+    """A move of a plant at one θ, with a motor of this `mass`: its cycle, those with each parameter
+    a `STEP` along the imaginary axis away, and the feedforward F (5, m) per derivative of the
+    setpoint with its slopes."""
+
+    motion: Motion
+    mass: float
+    cycle: Cycle
+    stepped: tuple[Cycle, ...]
+    forward: Array
+    forward_slopes: Array
+
+    def slopes(self, read: Callable[[Cycle], Any]) -> Array:
+        """Derivatives (n,) of a figure of the cycle."""
+        return np.array([np.imag(read(item)) / STEP for item in self.stepped], float)
+
+
+def motion_at(
+    motion: Motion, free: ScaledPlant, mass: float, place: int | None, sampling: Sampling | None
+) -> MotionAt:
+    """Of a plant with its rigid bodies free, square; `mass` of the motor is parameter `place` of θ.
+
+    Raises UserError where a spring holds the output.
+    """
+    hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
+    F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
+    ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
+    found = cycle_of(motion, ahead[2], mass)
+    if np.abs(ahead[0]).max() * motion.limits.stroke > HELD * found.peak_force:
+        raise UserError("move: a spring holds the output that moves, and its force is not counted")
+    stepped = tuple(
+        cycle_of(motion, ahead[2] + 1j * STEP * slope[2], mass + 1j * STEP * (i == place))
+        for i, slope in enumerate(slopes)
+    )
+    return MotionAt(motion, mass, found, stepped, ahead, slopes)

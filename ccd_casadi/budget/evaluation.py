@@ -1,20 +1,197 @@
-"""The error budget of a closed loop: RMS, MA and MSD of the error and RMS of the force by source.
+"""An error budget evaluated for a loop, with derivatives to the controller and to θ."""
 
-Filters by Lyapunov's equation, tables by quadrature; the density over frequency of both. Where a
-filter's densities are integrated too, the two have to agree: `disagreement`.
-"""
-
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
+from scipy.linalg.lapack import dgees, dtrsyl
 
-from ccd_casadi.budget.derivatives import of_source
-from ccd_casadi.budget.frequency import integrated
-from ccd_casadi.budget.moving_average import average_gain
-from ccd_casadi.budget.sources import ErrorBudget, Source
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.budget.frequency import integrated, responses
+from ccd_casadi.budget.loops import (
+    FORCES,
+    Matrix,
+    Process,
+    average_gain,
+    average_matrix,
+    disturbed,
+    process,
+)
+from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
+from ccd_casadi.lti.loop import Loop, Sampling, sampled, tustin
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.text import HZ
+
+STEP = 1e-30  # along the imaginary axis
+
+
+def variances(loop: Loop, budget: ErrorBudget) -> Array | None:
+    """(3,) σ² of error (m²), of its moving average (NaN without a window) and of force (N²) of a
+    loop under all sources; None if it is unstable."""
+    if not loop.stable:
+        return None
+    return np.asarray(
+        np.sum([of_source(loop, source, budget.window) for source in budget.sources], 0)
+    )
+
+
+def of_source(loop: Loop, source: Source, window: float | None) -> Array:
+    """As `variances`, of one source in a stable loop."""
+    average = np.nan
+    if source.shaped:
+        model = process(loop, source).balanced()
+        P = Lyapunov(model.A, sampled=model.sampled).covariance(model.noise)
+        error, force = np.trace(model.C @ P @ model.C.T), np.trace(model.F @ P @ model.F.T)
+        force = np.inf if model.infinite_force else force + (model.V**2).sum()
+        if window is not None:
+            M = average_matrix(model.A, window, loop.period)
+            average = np.trace(model.C @ M @ P @ model.C.T)
+    elif window is None:
+        error, force, _ = integrated(loop, source, np.zeros_like).value
+    else:
+        gain = partial(average_gain, window=window, period=loop.period)
+        error, force, average = integrated(loop, source, gain).value
+    return np.array([error, average, force])
+
+
+@dataclass(frozen=True)
+class ErrorVariance:
+    """σ² of the error of a plant (SI) under a budget, with controllers of one order."""
+
+    plant: StateSpace
+    budget: ErrorBudget
+    hold: Sampling | None
+    order: int
+
+    @cached_property
+    def filters(self) -> tuple[Source, ...]:
+        """The sources with a state space."""
+        return tuple(source for source in self.budget.sources if source.shaped)
+
+    @cached_property
+    def open(self) -> Process:
+        """The process of the filters without a controller."""
+        return disturbed(self.plant, self.filters, self.hold, self.order)
+
+    def at(
+        self, parts: Sequence[Matrix], M: Matrix, plants: Sequence[StateSpace] = ()
+    ) -> tuple[float, Array] | None:
+        """σ² (m²) and its derivatives (n + k,), None for an unstable loop.
+
+        A, B, C, D (n + 1, ·, ·) of the controller, and of it after a step ih along each of n
+        parameters, with their `run_matrix` M; `plants`: k such steps of the plant.
+        """
+        model = self.open.closed(M[0].real)
+        scale = model.scales()
+        model = model.transformed(scale)
+        equation, C = Lyapunov(model.A, sampled=model.sampled), model.C
+        if not equation.stable:
+            return None
+        P, X = equation.covariance(model.noise), equation.adjoint(C.T @ C)
+        out, after = P @ C.T, P + model.A @ P if model.sampled else P
+        to_M = 2.0 * model.L.T @ X @ (after @ model.R.T + model.E @ model.W.T)
+        value, slopes = float(np.sum(C.T * out)), [np.tensordot(M[1:].imag / STEP, to_M, 2)]
+        for G in plants:
+            moved = disturbed(G, self.filters, self.hold, self.order).closed(M[0].real)
+            moved = moved.transformed(scale)
+            dA, dQ, dC = (part.imag / STEP for part in (moved.A, moved.noise, moved.C))
+            half = np.sum(X * (dA @ after.T)) + 0.5 * np.sum(X * dQ) + np.sum(dC.T * out)
+            slopes.append(np.array([2.0 * half]))
+        gradient = np.concatenate(slopes)
+        for source in self.budget.sources:
+            if not source.shaped:
+                found = self._of_table(source, parts, plants)
+                value, gradient = value + found[0], gradient + found[1]
+        return value, gradient
+
+    def _of_table(
+        self, source: Source, parts: Sequence[Matrix], plants: Sequence[StateSpace]
+    ) -> tuple[float, Array]:
+        K, *stepped = (StateSpace(*own) for own in zip(*parts, strict=True))
+        K = StateSpace(*(np.real(part) for part in (K.A, K.B, K.C, K.D)))
+        loop = Loop(self.plant, K, self.hold)
+        whole = integrated(loop, source, np.zeros_like)
+        hz = whole.nodes
+        density, moving = source.density(hz) * whole.weights, _ResponseChanges(loop, hz)
+        at = responses(loop, hz)
+        H = at.of(source.kind)[0]
+        value = density @ (np.abs(H) ** 2).sum((1, 2))
+        gradient = []
+        for dG, dK, dfree in [*map(moving.of_controller, stepped), *map(moving.of_plant, plants)]:
+            d = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
+            if source.kind in FORCES:
+                d = -d @ at.free - at.S @ dfree
+            elif source.kind is not Kind.SETPOINT:
+                d = -d
+            gradient.append(density @ (2.0 * (H.conj() * d).real.sum((1, 2))))
+        return float(value), np.array(gradient)
+
+
+class _ResponseChanges:
+    """dG and dK as in the loop, and d of the disturbed G, at frequencies in Hz.
+
+    d(C X) = C R dA X + dC X + C R dB + dD,   R = (s - A)⁻¹,  X = R B
+    """
+
+    def __init__(self, loop: Loop, hz: Array) -> None:
+        self.hold, self.free = loop.sampling, 1j * HZ * np.asarray(hz, float)
+        self.s = loop.as_run[0].variable(HZ * np.asarray(hz, float))
+        self.none = np.zeros((len(hz), 1, 1))
+        self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def of_controller(self, K: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(dG, dK, d of the disturbed G) of a stepped controller."""
+        run = K if self.hold is None else tustin(K, self.hold.period)
+        return self.none, self._change("K", run, self.s), self.none
+
+    def of_plant(self, G: StateSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """And of a stepped plant."""
+        dG = dfree = self._change("free", G, self.free)
+        if self.hold is not None:
+            dG = self._change("G", sampled(G, self.hold.period, self.hold.delay), self.s)
+        return dG, self.none, dfree
+
+    def _change(self, name: str, system: StateSpace, s: np.ndarray) -> np.ndarray:
+        """By the imaginary parts of a system's matrices over the step."""
+        A, B, C = (np.real(part) for part in (system.A, system.B, system.C))
+        dA, dB, dC, dD = (np.imag(part) / STEP for part in (system.A, system.B, system.C, system.D))
+        if name not in self.known:
+            R = np.linalg.inv(s[:, None, None] * np.eye(len(A)) - A)
+            self.known[name] = (R @ B, C @ R)
+        X, Y = self.known[name]
+        return np.asarray((Y @ dA + dC) @ X + Y @ dB + dD)
+
+
+class Lyapunov:
+    """The equations of a process with this A, and with A', by one Schur form; a sampled one's A is
+    the change over a period."""
+
+    def __init__(self, A: Array, *, sampled: bool) -> None:
+        self.inverse = np.linalg.inv(2.0 * np.eye(len(A)) + A) if sampled else None
+        continuous = A if self.inverse is None else self.inverse @ A
+        self.T, _, real, _, self.U, *_ = dgees(_unsorted, continuous)
+        self.stable = bool(real.max(initial=-np.inf) < 0.0)
+
+    def covariance(self, Q: Array) -> Array:
+        """P of a stable process, Q symmetric."""
+        return self._solved(self.inverse, Q, "N", "T")
+
+    def adjoint(self, W: Array) -> Array:
+        """X at a symmetric weight W."""
+        return self._solved(None if self.inverse is None else self.inverse.T, W, "T", "N")
+
+    def _solved(self, inverse: np.ndarray | None, Q: Array, left: str, right: str) -> Array:
+        if inverse is not None:
+            Q = 2.0 * inverse @ Q @ inverse.T
+        found, scale, _ = dtrsyl(self.T, self.T, -self.U.T @ Q @ self.U, left, right)
+        P = scale * self.U @ found @ self.U.T
+        return np.asarray(0.5 * (P + P.T))
+
+
+def _unsorted(real: float, imaginary: float) -> bool:
+    return False
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,10 @@ import numpy as np
 
 from ccd_casadi.budget.loops import FORCES, process
 from ccd_casadi.budget.sources import Kind, Source
-from ccd_casadi.lti.closed_loop import sensitivity
-from ccd_casadi.lti.grid import frequency_grid, root_flanks
 from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import frequency_grid, root_flanks, sensitivity
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 RELATIVE = 1e-9  # error of the whole that ends the bisections
 ROUNDS = 40

@@ -1,15 +1,5 @@
-"""Sources in one closed loop as a stationary process, continuous or sampled, exactly.
-
-    ẋ = A x + w                x_{k+1} = (1 + A) x_k + w_k
-    e = C x,   u = F x + v
-
-x holds the plant with the filters of forces, of a sampled loop the forces that are under way, the
-controller, and the other filters. Sampled, e is the error at the samples, and white sensor noise
-that of the samples: its density counts up to half the rate. The controller runs by Tustin's rule
-without prewarping. A loop of changes over a period is that of the changes of plant and controller:
-transitions would lose the digits of slow poles next to 1. Everything is analytic in the matrices of
-both, so that a step along the imaginary axis gives derivatives to rounding (Squire and Trapp 1998).
-"""
+"""RMS error and force of a loop under disturbances by Lyapunov equations, and their split over a
+moving window."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +10,41 @@ import numpy as np
 from scipy.linalg import block_diag, expm, matrix_balance
 
 from ccd_casadi.budget.sources import Kind, Source
-from ccd_casadi.lti.hold import Sampling, delay_parts, delayed
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, delayed
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+
+
+def samples_of(window: float, period: float) -> int:
+    """N of a window in a sampled loop, at least 1."""
+    return max(1, round(window / period))
+
+
+def average_gain(hz: Array, window: float, period: float | None) -> Array:
+    """|MA|² at frequencies in Hz; MSD has what is left to 1."""
+    if period is None:
+        return np.asarray(np.sinc(hz * window) ** 2)
+    N = samples_of(window, period)
+    x = np.pi * hz * period
+    bottom = N * np.sin(x)
+    near = np.abs(bottom) < 1e-8 * N
+    return np.where(near, 1.0, np.sin(N * x) / np.where(near, 1.0, bottom)) ** 2
+
+
+def average_matrix(A: Array, window: float, period: float | None) -> Array:
+    """F of σ²_MA = C F P C'; of a sampled process A is the change over a period."""
+    n, one = len(A), np.eye(len(A))
+    A = A if period is None else A + one
+    none = np.zeros((n, n))
+    if period is None:
+        joint = np.block([[A * window, one, none], [none, none, one], [none, none, none]])
+        return 2.0 * expm(joint)[:n, 2 * n :]
+    N = samples_of(window, period)
+    joint = np.block([[A, one, none], [none, one, one], [none, none, one]])
+    # Σ_{j=0}^{N-2} (N - 1 - j) A^j: the block of a path of two steps right in N steps.
+    power = np.linalg.matrix_power(joint, N)[:n, 2 * n :]
+    return (N * one + 2.0 * A @ power) / N**2
+
 
 FORCES = (Kind.FORCE, Kind.FLOOR_MOTION)
 Matrix = np.ndarray[Any, Any]  # real, or complex with a step along the imaginary axis

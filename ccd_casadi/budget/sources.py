@@ -18,7 +18,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 Corner = tuple[float, ...]  # (Hz,) of a real root, (Hz, damping ratio) of a pair
 

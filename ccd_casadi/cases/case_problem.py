@@ -6,18 +6,17 @@ from dataclasses import replace
 from secrets import token_hex
 from typing import Any
 
-from ccd_casadi.cases.budget import error_budget
+from ccd_casadi.cases.budget import error_budget, places_of
 from ccd_casadi.cases.case import CaseError
+from ccd_casadi.cases.controller_tables import motion_problem
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity, Topic, suitable_effort
 from ccd_casadi.cases.kinds import structured_problem, weights_of
-from ccd_casadi.cases.motion import motion_problem
-from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.tables import Case, RobustTable
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, Options, RobustSet
-from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.structured_bandwidth import require_motion
 from ccd_casadi.inner_problem.structured_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.plants.modal import Suspension
@@ -25,9 +24,9 @@ from ccd_casadi.plants.registry import model_named
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.terminal import kept_quiet
-from ccd_casadi.support.threads import one_blas_thread
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.support.user_code import GivenFunction, raised_words
+from ccd_casadi.support.worker_process import one_blas_thread
 
 
 @one_blas_thread

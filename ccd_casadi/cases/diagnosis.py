@@ -43,8 +43,8 @@ from ccd_casadi.plants.plant import (
 )
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.terminal import Progress
+from ccd_casadi.support.text import HZ
 
 MAX_CORNERS = 16
 CHECKED = 2  # of the points, start and middle: where derivatives by differences are looked at

@@ -13,12 +13,12 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ, spoken
+from ccd_casadi.support.text import HZ, spoken
 
 LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
 FAR = 3.0  # how far above the frequencies that [inner] searches effort may end

@@ -9,14 +9,13 @@ from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable
 from ccd_casadi.cases.tables import Case, InnerTable, WeightsTable
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
-from ccd_casadi.inner_problem.controller_problem import Options
-from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES, RMS_ERROR, Options
 from ccd_casadi.inner_problem.structured_problem import (
     ChannelProblem,
     StructuredProblem,
     Uncertainty,
 )
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.weights import Weights
 
 SHAPE = 1.1  # of a fixed structure, where the case gives none

@@ -23,7 +23,7 @@ from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustT
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 MODEL = "measured"
 _TABLES = ("weights", "inner", "controller", "loop")

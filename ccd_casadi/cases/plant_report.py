@@ -13,7 +13,7 @@ from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts
 from ccd_casadi.plants.plant import constraint_values
-from ccd_casadi.support.units import number, spoken
+from ccd_casadi.support.text import number, spoken
 
 # ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less where
 # resonances stand in the way.

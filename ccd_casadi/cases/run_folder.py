@@ -19,6 +19,7 @@ from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
+from ccd_casadi.inner_problem.objective import final_design
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of, scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
@@ -28,17 +29,15 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import ChannelProblem, StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import with_range, with_warm_start
-from ccd_casadi.inner_problem.true_function import final_design
-from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.notebook import NotebookHtml
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.terminal import NotebookHtml
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
 from ccd_casadi.synthesis.synthesis import DesignFigures

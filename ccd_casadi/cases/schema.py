@@ -1,10 +1,8 @@
-"""The keys of a case file for an editor (JSON Schema) and for a person (a page), from one source.
-
-Both are made of the definitions that check a case (`tables`), so that they cannot say otherwise.
-The schema lets more pass than the checks do: what hangs on several keys is left to them.
-"""
+"""The keys of a case file as JSON Schema and as text, and the resolved case as TOML."""
 
 import json
+import re
+from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields
 from typing import Any
 
@@ -13,10 +11,55 @@ from ccd_casadi.cases.checks import check_of, unit_of
 from ccd_casadi.cases.controller_tables import ChannelTable
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.plant_tables import KEYS as THETA
-from ccd_casadi.cases.tables import REQUIRED, TABLES
-from ccd_casadi.cases.toml_writer import toml
+from ccd_casadi.cases.tables import REQUIRED, TABLES, Case
 from ccd_casadi.plants.registry import model_names
-from ccd_casadi.support.package_text import package_text, template
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.text import package_text, template
+
+
+def case_to_toml(case: Case) -> str:
+    """The resolved case, defaults included, as TOML.
+
+    Raises UserError where its plant is a Python callable.
+    """
+    if callable(case.plant.function):
+        words = "is a Python callable, which no file can hold"
+        raise UserError(f'plant.function: {words}; write "my_plant.py:model"')
+    plant = {"model": case.plant.model} if case.plant.model else {"function": case.plant.function}
+    lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
+    for parameter in (*case.theta, *case.fixed):
+        lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(parameter.table)]
+    for name in TABLES:
+        entries = dict(vars(getattr(case, name)))
+        tables = entries.pop("channel", ())
+        lines += ["", f"[{name}]", *_pairs(entries)]
+        for key, entry in tables:
+            lines += ["", f"[{name}.channel.{_toml_key(key)}]", *_pairs(vars(entry))]
+    return "\n".join(lines) + "\n"
+
+
+def _pairs(table: Mapping[str, Any]) -> list[str]:
+    given = {key: value for key, value in table.items() if value is not None and value == value}
+    return [f"{_toml_key(key)} = {toml(value)}" for key, value in given.items()]
+
+
+def _toml_key(key: str) -> str:
+    return key if re.fullmatch("[A-Za-z0-9_-]+", key) else toml(key)
+
+
+def toml(value: Any) -> str:
+    """A value as TOML writes it; tables in one line."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        marked = re.sub(r'(["\\])', r"\\\1", value)
+        shown = (c if c.isprintable() else f"\\U{ord(c):08X}" for c in marked)
+        return f'"{"".join(shown)}"'
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(_pairs(value)) + "}"
+    return repr(value)
 
 
 def case_schema() -> dict[str, Any]:

@@ -11,9 +11,9 @@ from typing import Any, get_type_hints
 
 from ccd_casadi.cases import checks, controller_tables
 from ccd_casadi.cases.checks import key
-from ccd_casadi.cases.motion import MotorTable, MoveTable
+from ccd_casadi.cases.controller_tables import MotorTable, MoveTable
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
-from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.terminal import NotebookHtml
 from ccd_casadi.support.user_code import name_of
 
 EVERY = (1e-3, 1e6)  # Hz: a range that nothing searches

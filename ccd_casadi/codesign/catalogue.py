@@ -24,14 +24,13 @@ import numpy as np
 
 from ccd_casadi.codesign.design_plants import order
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.spent import with_all_spent
+from ccd_casadi.sampling.samples import with_all_spent
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.progress import duration
-from ccd_casadi.support.terminal import remark
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.terminal import duration, remark
+from ccd_casadi.support.text import counted
 
 Lists = dict[str, tuple[float, ...]]
 Search = Callable[[Sampler, Solution | None], Solution]

@@ -23,9 +23,9 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, pl
 from ccd_casadi.inner_problem.sweep import missed_bounds
 from ccd_casadi.plants.plant import named_values
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.spent import with_all_spent
+from ccd_casadi.sampling.samples import with_all_spent
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 FIRST = 0.25  # share of the range of the first step of a continuation
 POLISHES = 5  # at most in a continuation

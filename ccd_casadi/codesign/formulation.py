@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.inner_problem.figure import FigureOfMerit
+from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.samples import InnerSample, QuantitySample

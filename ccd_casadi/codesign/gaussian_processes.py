@@ -11,7 +11,7 @@ import numpy as np
 
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import Progress
 from surrogates import GaussianProcess, Kernel, Quality, SurrogateFitError, condition, quality_of
 from surrogates.fitting import calibrated
 

@@ -9,18 +9,20 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.run_folder import sections_kappa
-from ccd_casadi.codesign.design_entries import budget_entry, controller_dict, mixed_dict, move_entry
-from ccd_casadi.codesign.judgement import judge_on_model
-from ccd_casadi.codesign.second_check import second_on_set, second_on_weighted
-from ccd_casadi.codesign.structured_entries import (
+from ccd_casadi.codesign.judgement import judge_on_model, second_on_set, second_on_weighted
+from ccd_casadi.codesign.result_entries import (
     active_of,
+    budget_entry,
+    controller_dict,
     design_dict,
+    mixed_dict,
+    move_entry,
     proof_dict,
     robust_dict,
     sections_controller,
 )
 from ccd_casadi.fixed_structure.judgement import judgement_of
-from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.objective import final_design, objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
@@ -33,14 +35,13 @@ from ccd_casadi.inner_problem.structured_plant_set import structure_of, with_str
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.structured_search import least_from, prepared, with_range
 from ccd_casadi.inner_problem.sweep import active_constraints
-from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 

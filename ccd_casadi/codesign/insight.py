@@ -1,13 +1,150 @@
-"""insight.json: the front around a design and the derivatives of its optimum, as plain values."""
+"""The front of hardware cost against bandwidth, and the derivatives of its optimum."""
 
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.pareto import Front
+from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.support.units import HZ
-from ccd_casadi.support.versions import versions
+from ccd_casadi.codesign.result_entries import bound_words
+from ccd_casadi.inner_problem.objective import objective_of, violated
+from ccd_casadi.inner_problem.problem import box, plant_of
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.terminal import Progress
+from ccd_casadi.support.text import HZ, versions
+from surrogates import design
+
+LOOKED_AT = 64  # θ whose hardware cost is computed, for its range
+FLAT = 1e-9  # relative: a hardware cost that moves less over the box is constant
+EXTREME = 1e-3  # share of the range of one that counts as much as all of the other, at the ends
+ROUNDED = 1e-9  # relative: a design that is faster by less is as fast
+GAIN = 1e-3  # of the triangle between two neighbours: a lesser one is none
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrontPoint(InnerSample):
+    """A design that is the best for some weights; `worth`: v(θ), and -v where less is better.
+
+    `verified`: the inner problem at θ has a certified design, and the solve ended at a stationary
+    point of its J.
+    """
+
+    hardware_cost: float
+    worth: float
+    verified: bool
+
+
+@dataclass(frozen=True)
+class Front:
+    """The points in order of their cost. `whole`: no weights lead to a design between two of them,
+    as far as local solves find."""
+
+    points: tuple[FrontPoint, ...]
+    whole: bool
+    syntheses: int
+
+
+def pareto_front(
+    outer_of: Callable[[Sampler], Outer],
+    sampler: Sampler,
+    own: Sequence[float],
+    *,
+    points: int = 20,
+    seed: int = 0,
+) -> Front:
+    """The front by at most so many `points`, from `own`, the θ of a good design, on.
+
+    Raises UserError where the hardware cost is constant, or `own` has no certified design.
+    """
+    problem, plant = sampler.problem, plant_of(sampler.problem)
+    looked = np.vstack([own, design("sobol", *box(problem), LOOKED_AT, seed)])
+    costs = np.array([hardware_cost(plant, theta) for theta in looked])
+    f_range = np.ptp(costs)
+    if not f_range > FLAT * np.abs(costs).max():
+        raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
+    allowed = [i for i in np.argsort(costs) if not violated(problem, looked[i])]
+    begun = sampler.values(looked[[0, allowed[0], allowed[-1]]], "starts of the front")
+    if not begun[0].feasible:
+        raise UserError(f"the run's design is not certified: {begun[0].shortfall}")
+    begun = [sample for sample in begun if sample.feasible]
+    size, sign = begun[0].value, 1.0 if problem.figure.larger_is_better else -1.0
+
+    def solved(a: float, b: float, begin: Sequence[InnerSample]) -> FrontPoint | None:
+        """The best design for these weights, of local solves from some designs; where each value
+        is a search over the controller, from the best of them alone."""
+        weighted = replace(problem, w1=a, w2=-sign * b)
+        outer = outer_of(sampler.of(weighted, traced=False, quiet=True))
+        if not outer.global_check_is_cheap:
+            begin = [min(begin, key=lambda sample: objective_of(weighted, sample))]
+        places = [outer.local_solve(sample, ()) for sample in begin]
+        found = [place for place in places if place is not None]
+        if not found:
+            return None
+        best = min(found, key=lambda place: place.objective)
+        return _point(sampler, outer.theta_of(best.x), best.stationary)
+
+    straight: set[tuple[FrontPoint, FrontPoint]] = set()
+    with Progress(points, "points of the front", quiet=sampler.quiet) as progress:
+        ends = [solved(w / f_range, EXTREME / w / size, begun) for w in (1.0, EXTREME)]
+        kept = hull([_point(sampler, own, True), *(end for end in ends if end is not None)])
+        while True:
+            progress.advance(len(kept) - progress.done)
+            pairs = [pair for pair in pairwise(kept) if pair not in straight]
+            if not pairs or len(kept) >= points:
+                return Front(tuple(kept), not pairs, sampler.syntheses)
+            steps = [
+                (two.worth - one.worth, two.hardware_cost - one.hardware_cost) for one, two in pairs
+            ]
+            widest = int(np.argmax([np.hypot(up / size, along / f_range) for up, along in steps]))
+            (light, fast), (a, b) = pairs[widest], steps[widest]
+            new = solved(a, b, sampler.values(np.array([light.theta, fast.theta])))
+            if new is None or _gain(light, new, a, b) <= GAIN:
+                straight.add((light, fast))
+            else:
+                kept = hull([*kept, new])
+
+
+def _gain(light: FrontPoint, new: FrontPoint, a: float, b: float) -> float:
+    """How far a point lies beyond the line from `light` that has this slope, as a share of both."""
+    lighter = (light.hardware_cost - new.hardware_cost) / b
+    return lighter + (new.worth - light.worth) / a
+
+
+def _point(sampler: Sampler, theta: Sequence[float] | np.ndarray, stationary: bool) -> FrontPoint:
+    up = sampler.problem.figure.larger_is_better
+    sample = sampler.values(np.asarray(theta, float), "verifying")[0]
+    active = tuple(bound_words(sample.active)) if sample.kappa else sample.active
+    return FrontPoint(
+        **vars(sample) | {"active": active},
+        hardware_cost=hardware_cost(plant_of(sampler.problem), sample.theta),
+        worth=sample.value if up else -sample.value,
+        verified=sample.feasible and stationary,
+    )
+
+
+def hull(points: Sequence[FrontPoint]) -> list[FrontPoint]:
+    """In order of cost, the points that are the best of all for some weights."""
+    kept: list[FrontPoint] = []
+    for point in sorted(points, key=lambda point: (point.hardware_cost, -point.worth)):
+        if not np.isfinite(point.worth):
+            continue
+        if kept and point.worth - kept[-1].worth <= ROUNDED * abs(point.worth):
+            continue
+        while len(kept) > 1 and _slope(kept[-2], kept[-1]) <= _slope(kept[-1], point):
+            kept.pop()
+        kept.append(point)
+    return kept
+
+
+def _slope(light: FrontPoint, fast: FrontPoint) -> float:
+    return (fast.worth - light.worth) / (fast.hardware_cost - light.hardware_cost)
 
 
 def natural_hz(run: FinishedRun) -> tuple[float, ...]:

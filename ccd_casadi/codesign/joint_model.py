@@ -1,26 +1,21 @@
-"""J over θ, the controller and ω_b at once, on the plants of a set as models know them.
+"""J over θ, the controller and ω_b at once, on the plants of a set that hold it."""
 
-    min w1 f(z) + w2 e^τ ω₀,   c(κ, τ; z) <= 0,  λ(z) <= 0      over z, κ and τ = ln ω_b/ω₀
-
-z is θ in shares of its box. The rows of `local_search` have slopes to z here, and second
-derivatives by differences of loops beside, so that one search of `optim.trust_region` serves all.
-"""
-
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.fixed_structure.channel_structure import in_units_of
 from ccd_casadi.fixed_structure.composite import on_plants
-from ccd_casadi.fixed_structure.decoupling import in_units_of
-from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
 from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
 from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.fixed_structure.worst_plant import LATTICE
 from ccd_casadi.inner_problem.objective import hardware_at
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -28,10 +23,14 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     structure_of,
     structured_of,
     uncertain_plant,
+    with_structured,
 )
+from ccd_casadi.inner_problem.structured_problem import Scenario
+from ccd_casadi.inner_problem.structured_robustness import violations
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
 from ccd_casadi.plants.plant import Evaluate, Mechanics, hardware_cost, to_first_order
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 
 # A few times the sum of multipliers: less, and a violation of second order counts less.
@@ -251,3 +250,100 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
             np.concatenate([found.value, unmet]), np.vstack([slopes, of_z]),
             hessians=second, curved=int((kept < peaks).sum()),
         )  # fmt: skip
+
+
+MANY = 12  # plants up to which all stay
+NEAR = 0.1  # ln: below its bound, where a row counts, and between frequencies of one peak
+EQUAL = 1e-6  # ln: rows that differ by rounding, as of rigid bodies alike
+
+
+@dataclass(frozen=True)
+class WorkingSet:
+    """The sampler of the problem with the plants that count, those that are aside, and those that
+    came back from there: they stay."""
+
+    sampler: Sampler
+    aside: tuple[Scenario, ...] = ()
+    back: frozenset[Scenario] = frozenset()
+
+    @property
+    def whole(self) -> "WorkingSet":
+        """With those aside too: at an end plants that bind in turns would bring each other back."""
+        return WorkingSet(with_scenarios(self.sampler, self.aside)) if self.aside else self
+
+    def reduced(self, models: Sequence[Evaluate], at: JointPoint) -> "WorkingSet":
+        """Without the plants that do not hold the controller there."""
+        problem = self.sampler.problem
+        scenarios = structured_of(problem).scenarios
+        if len(scenarios) <= MANY:
+            return self
+        model = JointModel(problem, models, at, 0.0)
+        here = model.at(model.start)
+        if here is None:
+            return self
+        loops, peaks = here.data[0], here.data[1].peaks
+        assert peaks is not None
+        near = np.flatnonzero(peaks.value > -NEAR)
+        rows = peaks.only(near[np.argsort(-peaks.value[near], kind="stable")])
+        gains = np.column_stack([rows.curve, loops.gains_of(rows)]).tolist()
+        kept = holding(loops.plants_of(rows), list(map(tuple, gains)), np.log(rows.v), rows.value)
+        kept |= {number for number, one in enumerate(scenarios) if one in self.back}
+        counted = tuple(one for number, one in enumerate(scenarios) if number in kept)
+        aside = (one for number, one in enumerate(scenarios) if number not in kept)
+        changed = with_structured(problem, scenarios=counted)
+        return WorkingSet(self.sampler.of(changed), (*self.aside, *aside), self.back)
+
+    def on_worse_plants(
+        self,
+        models: Sequence[Evaluate],
+        best: JointPoint,
+        looks: Sequence[int],
+        within: float,
+        tell: Callable[[str], None] | None,
+        count: int = LATTICE,
+    ) -> tuple["WorkingSet", JointPoint, float]:
+        """With the plants on which the controller exceeds a bound, the controller adapted to them,
+        and J there; `looks`: the searches for worse plants, one after the other, each elsewhere in
+        the box, from a lattice of `count`."""
+        sampler, aside, back, J = self.sampler, self.aside, self.back, np.inf
+        for look in looks:
+            problem, known = sampler.problem, [model(best.theta) for model in models]
+            uncertain, kappa = uncertain_plant(problem, best.theta, known), np.array(best.kappa)
+            scenarios = violations(
+                problem, uncertain, kappa, best.bandwidth, look, tell, within, aside, count
+            )[1]
+            if scenarios:
+                sampler = with_scenarios(sampler, scenarios)
+                back |= set(aside) & set(scenarios)
+                aside = tuple(one for one in aside if one not in scenarios)
+            best, J = JointModel(sampler.problem, models, best, 0.0).adapted()
+            if not np.isfinite(J):
+                break
+        working = self if sampler is self.sampler else WorkingSet(sampler, aside, back)
+        return working, best, J
+
+
+def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:
+    """The sampler of the problem with more plants: on these what was found before is worth
+    nothing."""
+    trace = sampler.trace
+    trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
+    known = structured_of(sampler.problem).scenarios
+    return sampler.of(with_structured(sampler.problem, scenarios=(*known, *scenarios)))
+
+
+def holding(
+    plants: np.ndarray, gains: Sequence[tuple[int, ...]], log_v: Array, value: Array
+) -> set[int]:
+    """Plants of rows, the largest first, without those whose every row lies below one of a plant
+    before it: of one gain, within `NEAR` in ln of frequency."""
+    kept, seen = set[int](), defaultdict[tuple[int, ...], list[int]](list)
+    of = [np.flatnonzero(plants == plant) for plant in range(plants.max(initial=-1) + 1)]
+    for row, (plant, gain) in enumerate(zip(plants.tolist(), gains, strict=True)):
+        above = [i for i in seen[gain] if value[i] >= value[row] - EQUAL]
+        if plant in kept or (np.abs(log_v[above] - log_v[row]) < NEAR).any():
+            continue
+        kept.add(plant)
+        for i in of[plant].tolist():
+            seen[gains[i]].append(i)
+    return kept

@@ -1,20 +1,23 @@
-"""The final judgement of a design: its loop on the plants as their function returned them.
-
-M, D, K, B and C at θ and at each plant of the set, free bodies free, in the person's own
-coordinates (`plants.as_written`), the loop rebuilt from controller and plant
-(`fixed_structure.certificate`). No modes, suspension, reduction or scaling of a search takes part.
-"""
+"""The final judgement of a design on the plants as written, by our judge and by SLICOT."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import zip_longest
+from math import inf
 
-from ccd_casadi.fixed_structure import certify
+import numpy as np
+
+from ccd_casadi.fixed_structure import SectionsDesign, certify
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncertain_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison, compared, second_opinion
+from ccd_casadi.synthesis.synthesis import Design
 
 
 def written_plants(
@@ -41,3 +44,40 @@ def judge_on_model(
     """
     model = written_plants(problem, theta)[:1]
     return judgement_of(certify(model, controller, kind_of(problem).bounds()), 1)
+
+
+def second_on_weighted(
+    problem: CoDesignProblem, theta: Sequence[float], design: Design
+) -> Comparison:
+    """Of mixed sensitivity: the norm that γ was reached with and ‖GS‖∞ on the model, and the
+    largest ‖S‖∞ of its set."""
+    figures = design.figures
+    opinions = [
+        second_opinion(plant, design.controller, weights=weights)
+        for plant, weights in zip_longest(written_plants(problem, theta), [design.weights])
+    ]
+    worst = max(opinions, key=lambda one: one.norms.get("S", inf))
+    found = compared([
+        (opinions[0], {"weighted_loop": figures.certificate.norm, "GS": figures.compliance}),
+        (worst, {"S": figures.sensitivity_peak}),
+    ])  # fmt: skip
+    return replace(found, loops=len(opinions))
+
+
+def second_on_set(
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
+) -> Comparison:
+    """Of a fixed structure: ‖S‖∞, and those of KS and T, of a continuous loop of GS too, on every
+    plant that its certificate is of, as the loop runs."""
+    judged, K = design.certificate, design.controller
+    if judged is None or K is None:
+        return NOT_COMPARED
+    uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
+    points = [(option, np.array(point)) for option, point in scenarios] or uncertain.corners()
+    pairs = zip(uncertain.as_written(points), judged.plants, strict=True)
+    of_GS = ("GS",) if problem.sampling is None else ()
+    return compared(
+        (second_opinion(plant, K, problem.sampling),
+         {"S": figures.S_peak} | {name: getattr(figures, name) for name in ("KS", "T", *of_GS)})
+        for plant, figures in pairs
+    )  # fmt: skip

@@ -15,11 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.kkt import INSIDE, TrueDesign, first_order, newton_step
+from ccd_casadi.codesign.kkt import (
+    INSIDE,
+    SAME_PEAK,
+    TrueDesign,
+    first_order,
+    newton_step,
+    other_peaks,
+)
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.peak_constraints import SAME_PEAK, other_peaks
-from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.optim.quadratic import damped_bfgs
+from ccd_casadi.inner_problem.objective import TrueQuantities
+from ccd_casadi.optim.kkt import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, minimise
 from ccd_casadi.support.arrays import Array
 

@@ -1,22 +1,4 @@
-"""Certificate of first- and second-order optimality on the true lifted problem.
-
-    min J(x) = w1 f(θ) + w2 ω_b(x),  x = (θ, ln ω_S, ln ω_T),
-    g(x) = (ln‖S‖∞ - ln S_max, ln σ_max(S(jω_low)) - ln S_low, λ(θ)) <= 0,  bounds,
-
-and ln‖GS‖∞ - ln compliance_max where that is given, with the total derivatives of the true
-synthesis, scaled as `optim.kkt` has it.
-
-‖S‖∞ has a kink where two local peaks are equal (or two plants of a robust set), and ω_b jumps where
-a local maximum of σ_max(S) below it reaches -3 dB. Where the plain conditions fail, every such peak
-within `ACTIVE` is a constraint of its own.
-
-Newton's step on these conditions (`newton_step`) is for what J's rounding hides from a descent:
-
-    min ∇Jᵀd + ½ dᵀ∇²L d   s.t.  Ad = -(g + ε) on active constraints, d = 0 on active bounds
-
-J is good to some 1e-9 of its terms, so that a method which watches it fall ends where the residual
-of its gradient is 1e-6; the gradients themselves are good to 1e-10.
-"""
+"""Peaks of S as constraints, and the certificate of optimality on the true lifted problem."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -26,15 +8,14 @@ import numpy as np
 from scipy.linalg import null_space
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.peak_constraints import PeakConstraint, other_peaks
 from ccd_casadi.inner_problem.objective import (
+    TrueQuantities,
     constraint_sizes,
     hardware_at,
     objective_terms,
     violated,
 )
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.optim.kkt import (
     ACTIVE,
     ActiveSet,
@@ -45,7 +26,80 @@ from ccd_casadi.optim.kkt import (
     reduced_curvature,
 )
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis.derivatives import LocalPeak, Sensitivities, local_peaks_with_gradients
+
+HALF_POWER = -0.5 * np.log(2.0)
+SAME_PEAK = 0.03  # ln ω within which peaks of one plant are one
+OTHER_PEAK = "S_max at "  # begins the name of a local peak besides the largest
+
+
+@dataclass(frozen=True)
+class PeakConstraint:
+    """A local peak of S as a constraint: its name, ln of it minus ln of its bound, unit-box slope.
+
+    `omega` in rad/s and `member` of the robust set tell which peak it is.
+    """
+
+    name: str
+    value: float
+    row: Array
+    omega: float
+    member: int
+
+    @property
+    def tag(self) -> tuple[str, float, int]:
+        """What it is, ln ω and its plant: by these it is found again at another x."""
+        kind = "peak" if self.name.startswith(OTHER_PEAK) else "shelf"
+        return kind, float(np.log(self.omega)), self.member
+
+
+def other_peaks(
+    problem: CoDesignProblem, x: Array, design: Sensitivities, band: float
+) -> tuple[PeakConstraint, ...]:
+    """Local peaks of S besides the largest that are within `band` (ln) of what they must not pass.
+
+    That is S_max anywhere, on every plant of a robust set, and -3 dB below ω_b, which is the first
+    crossing only as long as they do not pass it.
+    """
+    figures, width = design.figures, lifted_bounds(problem).width
+    peaks = local_peaks_with_gradients(
+        scaled_plant(problem, tuple(x[:-2])),
+        problem.weights.at(figures.omega_S, figures.omega_T),
+        design,
+        gamma_backoff=problem.inner.gamma_backoff,
+        least=float(np.exp(min(HALF_POWER, np.log(problem.inner.S_max)) - band)),
+    )
+    S_max, found = np.log(problem.inner.S_max), []
+    norm = _of_norm(peaks, design)
+    for peak in peaks:
+        if peak is norm:
+            continue  # the row S_max itself
+        on = f" on plant {peak.member} of the set" if peak.member else ""
+        place = f"{peak.omega / HZ:.4g} Hz{on}"
+        shelf = peak.member == 0 and peak.omega < figures.bandwidth
+        if peak.ln_gain >= S_max - band:
+            level, kind = S_max, OTHER_PEAK
+        elif shelf and abs(peak.ln_gain - HALF_POWER) <= band:
+            level, kind = HALF_POWER, "-3 dB at "
+        else:
+            continue
+        found.append(PeakConstraint(
+            kind + place, peak.ln_gain - level, peak.gradient * width, peak.omega, peak.member
+        ))  # fmt: skip
+    return tuple(found)
+
+
+def _of_norm(peaks: tuple[LocalPeak, ...], design: Sensitivities) -> LocalPeak | None:
+    """The peak that ‖S‖∞ is read at: by its plant and frequency, as others may be as high."""
+    if design.made is None:
+        return None
+    place = np.log(design.figures.sensitivity_peak_frequency)
+    own = [peak for peak in peaks if peak.member == design.made.worst]
+    nearest = min(own, key=lambda peak: abs(np.log(peak.omega) - place), default=None)
+    far = nearest is None or abs(np.log(nearest.omega) - place) > SAME_PEAK
+    return None if far else nearest
+
 
 INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is feasible as given
 SMOOTH = 1e-6  # residual up to which nothing speaks of a kink

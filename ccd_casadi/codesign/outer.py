@@ -21,12 +21,12 @@ from ccd_casadi.codesign.outer_problem import distinct
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import KktCertificate
+from ccd_casadi.optim.pieces import Box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.text import counted
 from surrogates import design
 
 BASIN = 1e-2  # of the box: ends of local solves on the truth that are closer are of one optimum

@@ -12,24 +12,23 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.judgement import second_on_weighted
 from ccd_casadi.codesign.kinked import SETTLED, descend, polish
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, other_damping, survived
-from ccd_casadi.codesign.second_check import second_on_weighted
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.objective import final_design, objective
 from ccd_casadi.inner_problem.problem import box, plant_of
-from ccd_casadi.inner_problem.true_function import final_design
-from ccd_casadi.optim.box import Box
+from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import Progress
 from surrogates import design
 
 POLISH_ROUNDS = 3

@@ -17,7 +17,7 @@ import numpy as np
 from ccd_casadi.inner_problem.objective import constraint_shares, constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
-from ccd_casadi.optim.box import Box
+from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.interrupts import interrupts_kept, raise_dropped

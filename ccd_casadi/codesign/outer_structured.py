@@ -17,11 +17,12 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
+from ccd_casadi.codesign.joint_model import with_scenarios
+from ccd_casadi.codesign.judgement import second_on_set
 from ccd_casadi.codesign.outer import End, Place, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
-from ccd_casadi.codesign.second_check import second_on_set
 from ccd_casadi.codesign.stored_searches import (
     multistart_at,
     printer,
@@ -32,28 +33,26 @@ from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
-from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.loop_on_box import Excess
-from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
-from ccd_casadi.inner_problem.move_figures import stated_time
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.objective import objective, objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
+from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue, stated_time
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertified
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.neighbours import WORTH
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.units import WORTH
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Workers, results
-from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.threads import alongside
+from ccd_casadi.support.terminal import Progress
+from ccd_casadi.support.worker_process import alongside
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known

@@ -19,22 +19,27 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import null_space
 
-from ccd_casadi.codesign.kkt import TrueDesign, active_at, lagrangian_hessian
+from ccd_casadi.codesign.kkt import (
+    OTHER_PEAK,
+    TrueDesign,
+    active_at,
+    lagrangian_hessian,
+    other_peaks,
+)
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.codesign.theta_kkt import active_theta, theta_kkt
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
+from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of
-from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import ACTIVE, ActiveSet, KktCertificate
+from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import Progress
 
 WEAK = 1e-6  # a multiplier below this share of ‖∇J‖∞ holds nothing
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.design_entries import budget_entry, move_entry
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.codesign.result_entries import budget_entry, move_entry
 from ccd_casadi.codesign.verdict import (
     State,
     VerdictLine,
@@ -31,10 +31,10 @@ from ccd_casadi.codesign.verdict import (
 )
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.sampling.spent import spent_entry
+from ccd_casadi.sampling.samples import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values, write_json
-from ccd_casadi.support.versions import versions
+from ccd_casadi.support.text import versions
 from surrogates import Quality, save
 from surrogates.files import write_whole
 

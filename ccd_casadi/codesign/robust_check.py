@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.codesign.loops_off_model import LoopsOffModel
-from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, highest, survival
+from ccd_casadi.codesign.survival import PEAK, LoopsOffModel, Survival, excess_of, highest, survival
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
@@ -27,7 +26,7 @@ from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import Progress
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
 

@@ -30,7 +30,7 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.threads import one_blas_thread
+from ccd_casadi.support.worker_process import one_blas_thread
 
 
 @one_blas_thread

@@ -1,8 +1,4 @@
-"""The outer problem from a formulation to a verified design, for every kind of controller.
-
-A formulation, a polish of its end on the truth and the whole inner problem there; where that finds
-better the search begins anew with it. Then a global check over the box, and on from what is better.
-"""
+"""The outer problem from a formulation to a verified design, with a check of the whole box."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,12 +9,142 @@ import numpy as np
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
 from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
-from ccd_casadi.codesign.global_check import global_check, perturbed
-from ccd_casadi.codesign.outer import End, Outer
+from ccd_casadi.codesign.outer import End, Outer, Place, is_expensive
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.inner_problem.objective import objective_of, violated
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
+from surrogates import design
 from surrogates.fitting import recalibrated
+
+POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
+FEW = 8  # points at most where each takes a search over the controller, seconds or more
+BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
+NEARLY = 0.03  # relative: an end of a range that is worse by less may lead to a better optimum
+CLUSTER = 0.02  # of the box: inner problems that are closer are one look
+SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
+PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
+TRIES = 4
+
+
+def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
+    """Look at `points` θ over the box for a J lower than that of an end.
+
+    What the run has solved itself counts among the points. Where these are dear no more than `FEW`
+    are made up, away from what is known: the way to one optimum says nothing of another.
+    """
+    problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
+    if not outer.global_check_is_cheap:
+        points = min(points, FEW)
+    samples, fresh = _spread(outer, points, seed) if points else ([], 0)
+    able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
+    values = np.array([objective_of(problem, sample) for sample in able])
+    margin = BETTER * abs(J) if np.isfinite(J) else 0.0
+    best_x, best, begun = None, J, 0
+    stationary = np.isfinite(J) and end.kkt.stationarity <= outer.kkt_level
+    known = [Place(end.x, J, bool(stationary))]
+
+    def solve_from(starts: Sequence[InnerSample]) -> None:
+        nonlocal best_x, best, begun
+        begun += len(starts)
+        for sample in starts:
+            place = outer.local_solve(sample, known)
+            if place is not None:
+                known.append(place)
+                if place.objective < best - margin:
+                    best_x, best = place.x, place.objective
+
+    lowest, others = _starts(problem, able, values, here)
+    starts = [*lowest, *others] if outer.global_check_is_cheap else lowest
+    if outer.global_check_is_cheap or is_expensive(problem):
+        starts = starts[: -(-points // POINTS_A_START)]
+    solve_from(starts)
+    ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
+    if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
+        room = 0.0 if is_expensive(problem) else NEARLY * abs(best)
+        least = np.inf if outer.global_check_is_cheap else best + room
+        ends = outer.promising(ends, least)
+        found = outer.sampler.values(ends, "search from the ends of each parameter")
+        solve_from([sample for sample in found if objective_of(problem, sample) < least])
+    return GlobalCheck(
+        points=len(samples),
+        fresh=fresh,
+        feasible=len(able),
+        better=int((values < J - margin).sum()),
+        starts=begun,
+        seed=seed,
+        before=J,
+        after=best,
+        x=best_x,
+    )
+
+
+def _ends(problem: CoDesignProblem, theta: Array) -> Array:
+    """θ (k, n_θ) with one parameter at a time at an end of its range, but for where it is so."""
+    lower, upper = box(problem)
+    found = [
+        np.where(np.arange(len(theta)) == i, end, theta)
+        for i in range(len(theta))
+        for end in (lower[i], upper[i])
+        if abs(end - theta[i]) > SAME * (upper[i] - lower[i])
+    ]
+    allowed = [x for x in found if not violated(problem, x)]
+    return np.array(allowed).reshape(-1, len(theta))
+
+
+def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
+    """Ends of local solves from a few starts around x: the last try where x is not stationary."""
+    here, bounds = outer.theta_of(x), box(outer.problem)
+    found = []
+    for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, here.size)):
+        theta = np.clip(here + step * bounds.width, *bounds)
+        sample = outer.sampler.values(theta, "perturbed starts")[0]
+        place = outer.local_solve(sample, (), 1e-13) if sample.feasible else None
+        if place is not None:
+            found.append(place.x)
+    return found
+
+
+def _spread(outer: Outer, points: int, seed: int) -> tuple[list[InnerSample], int]:
+    """The inner problems that the run has solved, and as many more as make up `points`; where these
+    are dear, those of a spread set that none is near. Second, how many these are."""
+    sampler, bounds = outer.sampler, box(outer.problem)
+    known: list[InnerSample] = []
+    for sample in sampler.solved.values():
+        if all(bounds.away(sample.theta, one.theta) > CLUSTER for one in known):
+            known.append(sample)
+    spread = design("sobol", *bounds, points, seed)
+    if outer.global_check_is_cheap:
+        spread = spread[len(known) :]
+    else:
+        n = spread.shape[1]
+        solved = np.reshape([one.theta for one in known], (-1, n))
+        away = bounds.away(spread[:, None], solved)
+        spread = spread[(away > 0.5 * points ** (-1.0 / n)).all(axis=1)]
+    more = [theta for theta in spread if not violated(outer.problem, theta)]
+    if more:
+        known = [*known, *sampler.values(np.array(more), "global check")]
+    return known, len(more)
+
+
+def _starts(
+    problem: CoDesignProblem, samples: Sequence[InnerSample], values: Array, theta: Array
+) -> tuple[list[InnerSample], list[InnerSample]]:
+    """Samples with a lower J than their n_θ + 1 nearest neighbours, and the rest; away from θ, the
+    best first."""
+    if not samples:
+        return [], []
+    bounds, thetas = box(problem), np.array([sample.theta for sample in samples])
+    lowest: list[InnerSample] = []
+    others: list[InnerSample] = []
+    for i in np.argsort(values):
+        near = np.argsort(bounds.away(thetas, thetas[i]))[1 : theta.size + 2]
+        if bounds.away(thetas[i], theta) > SAME:
+            (lowest if (values[near] >= values[i]).all() else others).append(samples[i])
+    return lowest, others
+
 
 AGAIN = 3  # times at most that a search begins with what the inner problem has found better
 

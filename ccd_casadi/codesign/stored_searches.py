@@ -7,7 +7,7 @@ ends, and the values of samples with their designs.
 from dataclasses import dataclass, replace
 from functools import partial
 
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import (
     ProblemAt,
@@ -27,12 +27,11 @@ from ccd_casadi.inner_problem.structured_search import (
     with_range,
     with_warm_start,
 )
-from ccd_casadi.sampling.neighbours import from_controller
-from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
-from ccd_casadi.support.progress import Tell
-from ccd_casadi.support.terminal import remark
+from ccd_casadi.sampling.store import problem_hash, sample_key
+from ccd_casadi.sampling.units import from_controller
+from ccd_casadi.support.terminal import Tell, remark
 
 
 @dataclass(frozen=True)

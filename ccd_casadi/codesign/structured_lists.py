@@ -28,7 +28,7 @@ from ccd_casadi.codesign.stored_searches import printer
 from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -44,7 +44,7 @@ from ccd_casadi.inner_problem.structured_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from surrogates import design
 
 INSIDE = 1e-7  # of λ

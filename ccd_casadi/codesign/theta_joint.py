@@ -22,10 +22,10 @@ from ccd_casadi.codesign.joint_model import (
     JointModel,
     JointPoint,
     Proposal,
+    WorkingSet,
     proposed,
 )
-from ccd_casadi.codesign.working_set import WorkingSet
-from ccd_casadi.fixed_structure.loop_on_box import WITHIN
+from ccd_casadi.fixed_structure.worst_plant import WITHIN
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import nearby, structured_of

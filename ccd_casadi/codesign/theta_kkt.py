@@ -25,7 +25,7 @@ import numpy as np
 import scipy
 from scipy.linalg import qr
 
-from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.fixed_structure.local_search import Envelope
 from ccd_casadi.inner_problem.objective import (
     constraint_sizes,
     hardware_at,
@@ -33,7 +33,6 @@ from ccd_casadi.inner_problem.objective import (
     objective_gradient,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.optim.box import Box
 from ccd_casadi.optim.kkt import (
     STEP,
     ActiveSet,
@@ -44,6 +43,7 @@ from ccd_casadi.optim.kkt import (
     hessian_products,
     reduced_curvature,
 )
+from ccd_casadi.optim.pieces import Box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array

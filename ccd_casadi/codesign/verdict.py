@@ -18,9 +18,9 @@ from typing import Any
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.figure import FigureOfMerit
+from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
 from ccd_casadi.optim.kkt import STEP, Kink, KktCertificate
-from ccd_casadi.support.units import counted, small_share, spoken, with_unit
+from ccd_casadi.support.text import counted, small_share, spoken, with_unit
 from ccd_casadi.synthesis.second_engine import Comparison
 from surrogates import Quality
 

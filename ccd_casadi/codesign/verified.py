@@ -13,19 +13,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.codesign.design_entries import controller_dict
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, outputs_of
 from ccd_casadi.codesign.judgement import judge_on_model
+from ccd_casadi.codesign.result_entries import controller_dict
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence, survives
 from ccd_casadi.fixed_structure.judgement import Judgement
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.terminal import NotebookHtml
 from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison
 from surrogates import GaussianProcess, Quality
 

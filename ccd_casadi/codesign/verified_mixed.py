@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar
 
-from ccd_casadi.codesign.design_entries import mixed_dict
+from ccd_casadi.codesign.result_entries import mixed_dict
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import OwnSet, State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import Design
 
 

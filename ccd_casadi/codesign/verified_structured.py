@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck
-from ccd_casadi.codesign.structured_entries import (
+from ccd_casadi.codesign.result_entries import (
     active_of,
     bound_words,
     box_words,
@@ -23,8 +23,8 @@ from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.design import TWICE
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
-from ccd_casadi.fixed_structure.loop_on_box import Excess
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import binding
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -35,10 +35,10 @@ from ccd_casadi.inner_problem.structured_plant_set import (
     with_structured,
 )
 from ccd_casadi.limitations.of_problem import Gap
-from ccd_casadi.sampling.neighbours import from_controller
+from ccd_casadi.sampling.units import from_controller
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.text import HZ, counted
 
 
 @dataclass(frozen=True)

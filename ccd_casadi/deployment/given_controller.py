@@ -22,11 +22,11 @@ from ccd_casadi.budget.sources import polynomial
 from ccd_casadi.cases.case import read_toml
 from ccd_casadi.cases.checks import POSITIVE, Fail, require_good, tables
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.lti.hold import Sampling, tustin
+from ccd_casadi.lti.loop import Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.robust.sampled import sampled_figures
+from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.interchange import read_mat
 
 UNSEEN = StateSpace(-np.eye(1), np.zeros((1, 1)), np.zeros((1, 1)), np.eye(1))

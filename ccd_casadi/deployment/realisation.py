@@ -1,21 +1,80 @@
-"""The difference equation that is deployed: block-diagonal, its order of operations fixed.
-
-Controller poles lie close to z = 1 at high sampling rates, where the coefficients of a companion
-form, or of a long cascade, lose digits. Here A is block-diagonal: blocks of one real pole or one
-complex pair, larger ones only where poles nearly coincide. Each pole then is as exact as its own
-block's four numbers.
-"""
+"""The difference equation that is deployed, channel by channel, with back-calculation while it
+saturates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import block_diag, schur, solve_sylvester
+from scipy.linalg import block_diag, lstsq, null_space, schur, solve_discrete_are, solve_sylvester
 
-from ccd_casadi.deployment.channels import LoopChannel, assemble
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+DIAGONAL = 1e-8  # share of the gain that may lie off the diagonal and count as rounding
+
+
+@dataclass(frozen=True)
+class LoopChannel:
+    """Uᵀ G V and Vᵀ K U, controller in SI; U = `outputs` (p, k), V = `inputs` (m, k)."""
+
+    name: str
+    outputs: Array
+    inputs: Array
+    plant: ScaledPlant
+    controller: StateSpace
+
+
+def whole_loop(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
+    """The loop as one channel."""
+    p, m = plant.C.shape[0], plant.B.shape[1]
+    return (LoopChannel("all", np.eye(p), np.eye(m), plant, controller),)
+
+
+def scalar_channels(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
+    """The scalar channels of the loop, or the whole loop as one channel."""
+    p, m = plant.C.shape[0], plant.B.shape[1]
+    U = np.hstack([c.outputs for c in plant.channels] or [np.eye(p)])
+    V = np.hstack([c.inputs for c in plant.channels] or [np.eye(m)])
+    if not (U.shape == (p, p) and V.shape == (m, m) and p == m > 1):
+        return whole_loop(plant, controller)
+    omega = plant.grid * plant.omega_0
+    G, K = plant.plant_si().response(omega), controller.response(omega)
+    if not (_diagonal(U.T @ G @ V) and _diagonal(V.T @ K @ U)):
+        return whole_loop(plant, controller)
+    found = []
+    for i in range(p):
+        u, v = U[:, [i]], V[:, [i]]
+        part = StateSpace(
+            controller.A, controller.B @ u, v.T @ controller.C, v.T @ controller.D @ u
+        )
+        found.append(LoopChannel(str(i + 1), u, v, along_directions(plant, u, v), part))
+    return tuple(found)
+
+
+def along_directions(plant: ScaledPlant, u: Array, v: Array) -> ScaledPlant:
+    """uᵀ G v, of directions u of its outputs and v of its inputs."""
+    B, C = np.ascontiguousarray(plant.B @ v), np.ascontiguousarray(u.T @ plant.C)
+    return replace(plant, B=B, C=C, channels=())
+
+
+def _diagonal(response: np.ndarray) -> bool:
+    off = response * (1.0 - np.eye(response.shape[1]))
+    return bool(np.abs(off).max() <= DIAGONAL * np.abs(response).max())
+
+
+def assemble(channels: Sequence[LoopChannel], controllers: Sequence[StateSpace]) -> StateSpace:
+    """K = Σ V_i K_i U_iᵀ, its states one channel after the other."""
+    pairs = list(zip(channels, controllers, strict=True))
+    return StateSpace(
+        block_diag(*(K.A for _, K in pairs)),
+        np.vstack([K.B @ c.outputs.T for c, K in pairs]),
+        np.hstack([c.inputs @ K.C for c, K in pairs]),
+        np.sum([c.inputs @ K.D @ c.outputs.T for c, K in pairs], axis=0),
+    )
+
 
 CONDITION = 1e4  # most of the block-diagonalising transformation, its columns of unit length
 
@@ -174,3 +233,60 @@ def literals(values: Array, indent: int) -> str:
 def plain_title(title: str) -> str:
     """Of letters that no comment of a program ends at."""
     return "".join(c if c.isalnum() or c in " ._-" else "_" for c in title)
+
+
+# Error of the force, as the filter sees it, over the limit. On rigid stages with PID, 0.01 to 0.1
+# settle alike and sooner than 1; the others are tried where the Riccati equation fails.
+TRUSTS = (0.1, 0.01, 1.0)
+
+
+def with_anti_windup(realisation: Realisation, bandwidth: float) -> Realisation:
+    """The same with back-calculation where it has a saturation; ω_b in rad/s."""
+    if realisation.saturation is None:
+        return realisation
+    L = back_calculation(realisation.system, realisation.saturation, bandwidth)
+    return replace(realisation, back_calculation=L)
+
+
+def back_calculation(K: StateSpace, limit: float, bandwidth: float) -> Array:
+    """L (n, m) for a limit in N and ω_b in rad/s; raises UserError where K has no such gain."""
+    n, m = K.B.shape[0], K.C.shape[0]
+    if not n:
+        return np.zeros((0, m))
+    gain = np.abs(K.response(np.array([bandwidth]))[0]).max()
+    noise = K.B / gain  # in units of the limit, as all forces here: L does not depend on it
+    for trust in TRUSTS:
+        weight = trust**2 * np.eye(m)
+        try:
+            P = solve_discrete_are(K.A.T, (K.C / limit).T, noise @ noise.T, weight)
+        except np.linalg.LinAlgError:
+            continue
+        spread = K.C @ P @ K.C.T / limit**2 + weight
+        L = np.linalg.solve(spread, K.C @ P @ K.A.T).T / limit**2
+        if np.abs(np.linalg.eigvals(K.A - L @ K.C)).max() < 1.0:
+            return np.asarray(L)
+    if np.abs(np.linalg.eigvals(K.A)).max() < 1.0:
+        return np.zeros((n, m))  # its states need no help to come back
+    raise UserError(
+        "no anti-windup gain was found: the controller may have an unstable mode that its force "
+        "does not show; deploy without --saturation"
+    )
+
+
+def takeover(K: StateSpace) -> Array:
+    """X (n, p + m): the state [e₀; u₀] -> x₀ from which the first force is u₀ and least moves on.
+
+    min ‖(A - I) x + B e‖ subject to C x = u - D e; where C has dependent rows (no state can make
+    two forces apart) the force is met in the least squares.
+    """
+    n, p = K.B.shape
+    m = len(K.C)
+    if not n:
+        return np.zeros((0, p + m))
+    wanted = np.hstack([-K.D, np.eye(m)])  # C x for unit [e; u]
+    particular = np.asarray(lstsq(K.C, wanted)[0])
+    free = null_space(K.C)
+    if not free.size:
+        return particular
+    moved = (K.A - np.eye(n)) @ particular + np.hstack([K.B, np.zeros((n, m))])
+    return particular - free @ np.asarray(lstsq((K.A - np.eye(n)) @ free, moved)[0])

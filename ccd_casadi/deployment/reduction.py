@@ -19,9 +19,8 @@ import numpy as np
 from scipy.linalg import block_diag, eigh, schur, solve_sylvester, svd
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
 
-from ccd_casadi.deployment.channels import LoopChannel
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.deployment.realisation import LoopChannel
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import measure

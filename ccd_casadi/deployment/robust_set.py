@@ -12,7 +12,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.judgement import written_plants
 from ccd_casadi.codesign.robust_check import DENSE
-from ccd_casadi.deployment.channels import LoopChannel, along_directions
+from ccd_casadi.deployment.realisation import LoopChannel, along_directions
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.structured_plant_set import structured_of, uncerta
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.robust.sampled import SampledFigures
+from ccd_casadi.robust.perturbed import SampledFigures
 from ccd_casadi.support.arrays import Array
 
 LATTICE = 41  # plants of a box that a deployed loop of sections is looked at on, besides its set

@@ -9,8 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ccd_casadi.drawing.pictures import ModeShapes
-from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE, require_shapes
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE, ModeShapes, require_shapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values
 

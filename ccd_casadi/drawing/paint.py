@@ -1,28 +1,108 @@
-"""A page's content as HTML: for each of its kinds a macro of `assets/blocks.html`.
-
-A page is one HTML file, and nothing is external. Figures take the colours of the page, which follow
-the reader's theme and are light in print.
-"""
+"""A page's content as HTML with the numbers behind its figures, and kept as report.json."""
 
 import base64
 import hashlib
+import json
 import re
+from collections.abc import Iterator
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Template
 from markupsafe import Markup
 from markupsafe import escape as escaped
 
 from ccd_casadi.drawing import content as c
+from ccd_casadi.drawing.content import Drawing, Landscape, Lines, Page, Panel, Table
 from ccd_casadi.drawing.lines import panel_html
 from ccd_casadi.drawing.maps import figure_landscape
-from ccd_casadi.drawing.numbers import tables_of
-from ccd_casadi.drawing.svg import SUPERSCRIPT, THEME
-from ccd_casadi.drawing.turntable import data, legend, still
-from ccd_casadi.support.package_text import package_text, printable, template
+from ccd_casadi.drawing.surface import data, legend, still
+from ccd_casadi.drawing.svg import SUPERSCRIPT, THEME, axis_label
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.json_files import plain, restored
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.units import number
+from ccd_casadi.support.text import number, package_text, printable, template
+from surrogates.files import write_whole
+
+ROWS = 40  # of a table, besides marked places
+STEP = 4  # of a landscape's grid
+FREQUENCY = "frequency (Hz)"
+Column = tuple[str, str, Array, Array, bool]  # its axis, its name, x, y, whether a line joins them
+
+
+def tables_of(drawing: Drawing) -> tuple[Table, ...]:
+    """One for each axis, whose panels share it, with a column for each curve; of dots by themselves
+    all. Of a landscape its grid, thinned, and the true samples; nothing of a picture."""
+    if isinstance(drawing, Landscape):
+        return _of_landscape(drawing)
+    rows = drawing.rows if isinstance(drawing, Lines) else ()
+    panels = [panel for row in rows for panel in row if isinstance(panel, Panel)]
+    groups: dict[tuple[str, bytes], dict[str, tuple[Array, Array]]] = {}
+    for axis, name, x, y, joined in (column for panel in panels for column in _columns(panel)):
+        group = groups.setdefault((axis, b"" if joined else x.tobytes()), {})
+        group.setdefault(name, (x, y))  # one of each name
+    return tuple(
+        Table.of((axis, *found), *_rows(axis, found, panels, bool(dots)))
+        for (axis, dots), found in groups.items()
+    )
+
+
+def _columns(panel: Panel) -> Iterator[Column]:
+    """What a panel shows, of loci over frequency both parts."""
+    named = any(curve.label for curve in panel.curves if curve.hz is not None)
+    for curve in panel.curves:
+        same = panel.y_label.startswith(curve.label)
+        name = panel.y_label if same else f"{panel.y_label}, {curve.label}"
+        if curve.hz is not None and not curve.label and named:
+            continue  # no reader knows which of the others it is
+        if curve.hz is not None:
+            real = name.replace(panel.y_label, panel.x_label)
+            yield from ((FREQUENCY, real, curve.hz, curve.x, True),
+                        (FREQUENCY, name, curve.hz, curve.y, True))  # fmt: skip
+        elif curve.readable or not curve.line:
+            yield panel.x_label, name, curve.x, curve.y, bool(curve.line)
+    for band in panel.bands:
+        if band.label:
+            for word, y in (("least", band.low), ("largest", band.high)):
+                yield panel.x_label, f"{panel.y_label}, {band.label}: {word}", band.x, y, True
+
+
+def _rows(
+    axis: str, found: dict[str, tuple[Array, Array]], panels: list[Panel], every: bool
+) -> Iterator[Array]:
+    """Points spread along the axis, those next to marked places, and where a curve is largest; of
+    curves over another grid what lies between their points. `every`: all."""
+    x = max((over for over, _ in found.values()), key=len)
+    own = [panel for panel in panels if panel.x_label == axis]
+    rows = list(range(len(x)))
+    if not every:
+        marked = [m.x for p in own for m in p.marks]
+        marked += [level.value for p in own for level in p.levels if level.vertical]
+        marked += [float(at[np.nan_to_num(y, nan=-np.inf).argmax()]) for at, y in found.values()]
+        even = x[np.linspace(0, len(x) - 1, ROWS).astype(int)]
+        even = np.geomspace(x[0], x[-1], ROWS) if any(p.log_x for p in own) else even
+        rows = sorted({int(np.abs(x - value).argmin()) for value in (*marked, *even)})
+    yield x[rows]
+    for over, y in found.values():
+        same = len(over) == len(x) and np.allclose(over, x, rtol=1e-9)
+        yield y[rows] if same else np.interp(x[rows], over, y, left=np.nan, right=np.nan)
+
+
+def _of_landscape(land: Landscape) -> tuple[Table, ...]:
+    tables = []
+    first, second = land.names
+    if land.bandwidth_hz.size:
+        thinned = slice(0, None, STEP)
+        heads = (number(float(value)) for value in land.second[thinned])
+        values = land.bandwidth_hz[thinned, thinned].T
+        head = (f"ω_b* in Hz; {first} ↓ {second} →", *heads)
+        tables.append(Table.of(head, land.first[thinned], *values))
+    head = (axis_label(first, land.units[0]), axis_label(second, land.units[1]), "true ω_b* (Hz)")
+    return (*tables, Table.of(head, *land.truths.T))
+
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request, no script but ours
 # Our scripts, in assets/, and what in a body needs them; some bring their style.
@@ -57,8 +137,8 @@ def typeset(text: str) -> str:
     >>> typeset("KKT residual 0.0e+00")
     'KKT residual 0.0'
     """
-    for plain, sign in (("+-", "±"), ("<=", "≤"), (">=", "≥")):
-        text = text.replace(plain, sign)
+    for word, sign in (("+-", "±"), ("<=", "≤"), (">=", "≥")):
+        text = text.replace(word, sign)
     text = re.sub(r"(?<=\d) u(?=[ms]\b)", " µ", text)
     text = re.sub(r"\b(\d(?:\.\d+)?)e([+-]?\d+)\b", _power, text)  # and no line ends in it
     return re.sub(r"(?<=\d) (?=(?:%|°|[GMkmµn]?(?:Hz|kg|N|m|s)\b))", "\xa0", text)
@@ -102,3 +182,50 @@ def _blocks() -> Template:
         landscape=figure_landscape, typeset=typeset, tables_of=tables_of, still=still, data=data,
         scale=legend,
     )  # fmt: skip
+
+
+NAME = "report.json"
+FORMAT = 1
+
+
+def write_page(path: Path, page: Page, workers: Pool | None = None) -> None:
+    """Draw a page and keep what it shows in report.json beside it, each atomically."""
+    try:
+        pages = read_pages(path.parent)
+    except UserError:  # what cannot be read is written anew
+        pages = {}
+    pages[path.name] = plain(page, listed=True)
+    content = {"format": FORMAT, "pages": pages}
+    write_whole(path.with_name(NAME), json.dumps(content, ensure_ascii=False, allow_nan=False))
+    draw(path, pages[path.name], workers)
+
+
+def draw(path: Path, stored: Any, workers: Pool | None = None) -> None:
+    """Draw a page from an entry of report.json, whose chapters may be called sections. Raises
+    UserError where it is none."""
+    try:
+        page = restored(Page, {"chapters": stored.get("sections"), **stored})
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError):
+        words = f"pages.{path.name}: is not what a page shows; repeat the command that wrote it"
+        raise UserError(f"{path.with_name(NAME)}: {words}") from None
+    write_whole(path, page_html(page, workers))
+
+
+def read_pages(folder: Path) -> dict[str, Any]:
+    """The entries of a folder's report.json; none where there is no such file.
+
+    Raises UserError where it is damaged, or of a later version.
+    """
+    path = folder / NAME
+    if not path.exists():
+        return {}
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        pages = dict(found["pages"]) if found["format"] == FORMAT else None
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UserError(f"{path}: is not a report.json; repeat the command") from None
+    if pages is not None and any(name != Path(name).name or "." not in name for name in pages):
+        raise UserError(f"{path}: pages: names a file that is not a page of this folder")
+    if pages is None:
+        raise UserError(f"{path}: format: is not {FORMAT}; draw it with the version that wrote it")
+    return pages

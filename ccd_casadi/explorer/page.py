@@ -16,26 +16,33 @@ from bokeh.models.widgets.markups import Div
 
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.drawing.paint import escape
-from ccd_casadi.explorer.background import Background, Solve
-from ccd_casadi.explorer.controls import Controls
-from ccd_casadi.explorer.curves import curves_of, sampled_of, with_sampled
-from ccd_casadi.explorer.designs import How, Look
-from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.explorer.landscape import landscape_of, run_surrogate, steepest_axes
-from ccd_casadi.explorer.map_figure import MapFigure
-from ccd_casadi.explorer.message import Message
-from ccd_casadi.explorer.painter import ON_DARK, PanelFigure, cursor, legend_html
-from ccd_casadi.explorer.panels import EMPTY, FIGURES, LOOKS, OVER_HZ, Drawn, drawn
+from ccd_casadi.explorer.controls import Controls, PlacesFigure, moves
+from ccd_casadi.explorer.curves import (
+    EMPTY,
+    FIGURES,
+    LOOKS,
+    OVER_HZ,
+    Drawn,
+    curves_of,
+    drawn,
+    machine_html,
+    move_words,
+    sampled_of,
+    standing_html,
+    with_sampled,
+)
+from ccd_casadi.explorer.designs import How, Knobs, Look
+from ccd_casadi.explorer.known_plant import Background, Solve
+from ccd_casadi.explorer.map_figure import MapFigure, landscape_of, run_surrogate, steepest_axes
+from ccd_casadi.explorer.painter import ON_DARK, Message, PanelFigure, cursor, legend_html
 from ccd_casadi.explorer.pins import Kept, Pins
-from ccd_casadi.explorer.places_figure import PlacesFigure, moves
 from ccd_casadi.explorer.session import Session, searched_exactly
 from ccd_casadi.explorer.structured import Designed, anchored, designed
-from ccd_casadi.explorer.words import machine_html, move_words, standing_html
 from ccd_casadi.reporting.landscape import known_bandwidths, read_truths
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import ExitCode
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.text import package_text
 
 TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is

@@ -16,12 +16,11 @@ from bokeh.models.widgets.tables import (
 
 from ccd_casadi.cases.tables import Parameter
 from ccd_casadi.drawing.svg import AMBER, BROWN, GREEN, ORANGE, PURPLE
-from ccd_casadi.explorer.designs import Look
-from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.explorer.curves import EMPTY, Drawn
+from ccd_casadi.explorer.designs import Knobs, Look
 from ccd_casadi.explorer.painter import ON_DARK, PanelFigure
-from ccd_casadi.explorer.panels import EMPTY, Drawn
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import display_unit
+from ccd_casadi.support.text import display_unit
 
 HEIGHT = 150
 COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)

@@ -19,9 +19,9 @@ from tornado.ioloop import IOLoop
 from tornado.web import StaticFileHandler
 
 from ccd_casadi.drawing.paint import theme
-from ccd_casadi.explorer.background import Background
+from ccd_casadi.explorer.curves import FIGURES
+from ccd_casadi.explorer.known_plant import Background
 from ccd_casadi.explorer.page import SOLVED, Page
-from ccd_casadi.explorer.panels import FIGURES
 from ccd_casadi.explorer.pins import Kept
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.structured import designed

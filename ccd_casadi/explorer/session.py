@@ -9,29 +9,31 @@ from time import perf_counter
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.explorer.curves import surface_modes_html
 from ccd_casadi.explorer.designs import (
     Elements,
     How,
+    Knobs,
     Look,
+    Problems,
+    case_at,
     elements_at,
+    knobs_of,
     present,
     searched,
     without_controller,
 )
-from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.explorer.known_plant import KnownPlant
 from ccd_casadi.explorer.structured import Designed, anchored, judged_look
-from ccd_casadi.explorer.words import surface_modes_html
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.machine import lumped
-from ccd_casadi.sampling.rows import hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
-from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.store import SampleStore, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.units import unit_of
-from ccd_casadi.support.progress import Tell
+from ccd_casadi.support.terminal import Tell
 from surrogates.files import write_whole
 
 QUICK = 0.4  # s of a full search that a drag of S_max waits for

@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.explorer.designs import How, Look, Standing, elements_at, without_controller
-from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.explorer.designs import How, Knobs, Look, Standing, elements_at, without_controller
 from ccd_casadi.fixed_structure import SetCertificate
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
-from ccd_casadi.sampling.rows import Sample, hashes_of, sample_key
+from ccd_casadi.sampling.store import Sample, hashes_of, sample_key
 from ccd_casadi.sampling.units import structured_unit
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.progress import Tell
+from ccd_casadi.support.terminal import Tell
 from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome
 
 Unit = tuple[str, str, tuple[float, ...], dict[str, Any]]

@@ -7,9 +7,9 @@ from ccd_casadi.fixed_structure.certificate import SetCertificate as SetCertific
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections as synthesise_sections
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure as ChannelStructure
-from ccd_casadi.fixed_structure.sections_design import SectionsDesign as SectionsDesign
-from ccd_casadi.fixed_structure.sections_design import SectionsOutcome as SectionsOutcome
+from ccd_casadi.fixed_structure.design import SectionsDesign as SectionsDesign
+from ccd_casadi.fixed_structure.design import SectionsOutcome as SectionsOutcome
 from ccd_casadi.fixed_structure.structure import Structure as Structure
-from ccd_casadi.lti.hold import Sampling as Sampling
+from ccd_casadi.lti.loop import Sampling as Sampling
 
 synthesise = synthesise_sections

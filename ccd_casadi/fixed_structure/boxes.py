@@ -14,7 +14,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, variable
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.sections import INTEGRATOR, REAL
-from ccd_casadi.lti.hold import delay_parts
+from ccd_casadi.lti.loop import delay_parts
 from ccd_casadi.support.arrays import Array
 
 Pair = tuple[Affine, Affine]  # D and N of N/D, or a pole and its residue

@@ -34,13 +34,13 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     with_crossings,
 )
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable, norms
-from ccd_casadi.lti.hold import Sampling, delayed
+from ccd_casadi.lti.loop import Sampling, delayed
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.threads import one_blas_thread
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.text import counted
+from ccd_casadi.support.worker_process import one_blas_thread
 
 if TYPE_CHECKING:
     from ccd_casadi.plants.scaling import ScaledPlant

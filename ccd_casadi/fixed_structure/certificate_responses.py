@@ -12,10 +12,9 @@ import numpy as np
 from scipy.linalg import schur
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.lti.closed_loop import sigma_max
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.support.arrays import Array
 
 AT_ONCE = 8192  # numbers of an array that stays in a processor's cache

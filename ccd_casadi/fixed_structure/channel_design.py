@@ -16,28 +16,32 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
+    channel_plant,
+    in_units_of,
+)
 from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike
-from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
-from ccd_casadi.fixed_structure.design import of_one_channel, problem_for
-from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.race import LocalOptimum, run_race, started
-from ccd_casadi.fixed_structure.sections_design import (
+from ccd_casadi.fixed_structure.design import (
     DesignSearch,
     SectionsDesign,
     in_problem_units,
+    of_one_channel,
+    problem_for,
     span_of,
 )
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import Point
+from ccd_casadi.fixed_structure.multi_start import LocalOptimum, run_race, started
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, leading_gain
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Tell, silent, titled
-from ccd_casadi.support.threads import one_blas_thread
+from ccd_casadi.support.terminal import Tell, silent, titled
+from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.interchange import from_control, plant_from_control
 
 SLOWEST = 10.0  # ω₀ over ω_low/S_low, the bandwidth that S of slope one needs at least

@@ -13,8 +13,12 @@ from typing import TypeVar
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of, is_decoupled
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
+    channel_plant,
+    in_units_of,
+    is_decoupled,
+)
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
@@ -25,10 +29,10 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Problem,
 )
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.threads import side_by_side
+from ccd_casadi.support.worker_process import side_by_side
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -27,8 +27,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.boxes import Axis, Boxes, Chart, axis_of, gain_of
-from ccd_casadi.fixed_structure.largest_norm import GUARD, Terms, norm
-from ccd_casadi.fixed_structure.mode_discs import discs_of
+from ccd_casadi.fixed_structure.discs import GUARD, Terms, discs_of, norm
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array

@@ -18,11 +18,11 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import TOLERANCE, SetCertificate, as_run, certify, holds
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError, described
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.text import HZ, counted
 
 ENGINE = "NumPy, on the matrices as the plant function returned them, free bodies free"
 AS_GIVEN = "NumPy, on the plants as they were given, with the coefficients of the code"

@@ -21,28 +21,35 @@ from typing import Protocol
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.budget.derivatives import STEP, ErrorVariance
+from ccd_casadi.budget.evaluation import STEP, ErrorVariance
 from ccd_casadi.budget.loops import run_matrix
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
-from ccd_casadi.fixed_structure.loop_problem import Assessment
-from ccd_casadi.fixed_structure.optimality import Envelope, Optimality, envelope_of, optimality
-from ccd_casadi.fixed_structure.race import at_its_bandwidth
-from ccd_casadi.fixed_structure.sections_design import (
+from ccd_casadi.fixed_structure.design import (
     DesignSearch,
     SectionsDesign,
     SectionsOutcome,
     in_problem_units,
+    problem_for,
 )
+from ccd_casadi.fixed_structure.local_search import (
+    Envelope,
+    LoopModel,
+    Optimality,
+    Point,
+    descend,
+    envelope_of,
+    optimality,
+)
+from ccd_casadi.fixed_structure.loop_problem import Assessment
+from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.units import HZ, number, spoken
+from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import HZ, number, spoken
 
 REWARD = 1e-6  # of ln ω_b in ln v
 INSIDE = 0.7  # of the ω_b that its bounds leave a given κ: a search that begins at bounds crawls

@@ -28,13 +28,11 @@ from ccd_casadi.fixed_structure.loop_problem import (
 from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
-from ccd_casadi.kernels.loop_curvature import second
-from ccd_casadi.kernels.loop_grid import NONE
-from ccd_casadi.kernels.loop_point import LoopArrays
-from ccd_casadi.kernels.loop_rows import levels, rows
+from ccd_casadi.kernels.loop_grid import NONE, second
+from ccd_casadi.kernels.loop_point import LoopArrays, levels, rows
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 OCTAVES = np.log(2.0) * np.linspace(-1.0, 1.0, 33)  # about ω_b
 STEP = 1e-5  # of τ

@@ -23,11 +23,16 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels, in_units_of
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
+    Decoupling,
+    in_channels,
+    in_units_of,
+)
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels import modes, plant_slopes
-from ccd_casadi.lti.hold import Sampling, delay_parts, delayed, in_w, moment_slopes, moments
+from ccd_casadi.kernels import modes
+from ccd_casadi.kernels.modes import PlantSlopes
+from ccd_casadi.lti.loop import Sampling, delay_parts, delayed, in_w, moment_slopes, moments
 from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.rigid_modes import driven_and_measured, placed
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -176,14 +181,14 @@ class PlantSet:
         return G, slope
 
     @cached_property
-    def slopes(self) -> plant_slopes.PlantSlopes:
+    def slopes(self) -> PlantSlopes:
         """What the kernels need for derivatives to θ; the shorter plants with zeros."""
         C, B, *parts = (padded([getattr(plant, name) for plant in self.plants], dtype=complex)
                         for name in ("reading", "drive", "dA", "dB", "dC"))  # fmt: skip
-        kinds = np.full(self.poles.shape, plant_slopes.SIMPLE, np.int8)
+        kinds = np.full(self.poles.shape, modes.SIMPLE, np.int8)
         for i, plant in enumerate(self.plants):
             q, v = plant.chains.T
-            kinds[i, q], kinds[i, v] = plant_slopes.POSITION, plant_slopes.VELOCITY
+            kinds[i, q], kinds[i, v] = modes.POSITION, modes.VELOCITY
             s = plant.system.A[q, v]
             C[i, :, v], C[i, :, q] = s[:, None] * C[i, :, q], 0.0
             B[i, q] = s[:, None] * B[i, v]
@@ -197,9 +202,7 @@ class PlantSet:
             steeper = moment_slopes(self.poles, T, self.delay)
             terms[..., 1:] = np.stack([late, early, np.exp(self.poles * T), *steeper], axis=-1)
         both = np.stack([dA.real, dA.imag], axis=3)
-        return plant_slopes.PlantSlopes(
-            terms, C, B, gaps, both, dB, dC, self.period or 0.0, d, kinds
-        )
+        return PlantSlopes(terms, C, B, gaps, both, dB, dC, self.period or 0.0, d, kinds)
 
 
 def plant_set(

@@ -22,10 +22,10 @@ from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.limits import HALF_POWER, Limit, LoopCurve
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.modes import responses
-from ccd_casadi.lti.grid import root_flanks
+from ccd_casadi.kernels.sections import HALF_POWER, Limit, LoopCurve
+from ccd_casadi.lti.state_space import root_flanks
 from ccd_casadi.support.arrays import Array
 
 FIRST = float(np.log(0.1))  # τ, ω_b over ω₀

@@ -19,14 +19,13 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
 from ccd_casadi.fixed_structure.channel_design import TIGHTENED
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.decoupling import Decoupling
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, Decoupling
+from ccd_casadi.fixed_structure.design import MARGIN, in_problem_units
 from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge
-from ccd_casadi.fixed_structure.race import finished, run_race
-from ccd_casadi.fixed_structure.sections_design import MARGIN, in_problem_units
+from ccd_casadi.fixed_structure.multi_start import finished, run_race
 from ccd_casadi.fixed_structure.starts import at_random, by_rules
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
@@ -34,8 +33,8 @@ from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Tell, silent, titled
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.terminal import Tell, silent, titled
+from ccd_casadi.support.text import HZ
 
 FEWER = 600  # lines that starts of single channels are designed on
 EXCEEDED = 1e-5  # relative: of a bound, by rounding

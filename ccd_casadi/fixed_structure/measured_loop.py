@@ -25,14 +25,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, LoopPeaks, ShapeEnd
-from ccd_casadi.kernels.limits import HALF_POWER
-from ccd_casadi.lti.closed_loop import responses_of, sensitivity, sigma_max
-from ccd_casadi.lti.hold import tustin
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.kernels.sections import HALF_POWER
+from ccd_casadi.lti.loop import tustin
+from ccd_casadi.lti.state_space import StateSpace, responses_of, sensitivity, sigma_max
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
 SAFETY = 2.0  # on the error of interpolation

@@ -18,9 +18,8 @@ from functools import cached_property, partial
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.fixed_structure.affine import Affine, inverse, root, variable
+from ccd_casadi.fixed_structure.affine import Affine, inverse, moving_modes, root, variable
 from ccd_casadi.fixed_structure.boxes import Pair
-from ccd_casadi.fixed_structure.moving_modes import moving_modes
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import (

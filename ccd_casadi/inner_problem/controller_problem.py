@@ -1,8 +1,4 @@
-"""What a co-design problem states of its controller, besides bounds and weights.
-
-One class for each kind of inner problem, with plain values: it is hashed, sent to workers and
-compared. How such a problem is solved stands elsewhere (`kinds`, and `outer` of the co-design).
-"""
+"""What a co-design problem states of its controller, and what of it J counts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +8,50 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.figure import BANDWIDTH, FigureOfMerit
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import Plant
+from ccd_casadi.support.text import HZ, spoken, with_unit
 from ccd_casadi.synthesis.weights import Weights
+
+
+@dataclass(frozen=True)
+class FigureOfMerit:
+    """A value v of the inner problem: its key, its symbol, and how it is shown.
+
+    `unit` and `factor` (per SI unit) are for the eye, `entry` is its stem in result.json.
+    """
+
+    key: str
+    words: str
+    symbol: str
+    si_unit: str
+    unit: str
+    factor: float
+    larger_is_better: bool
+    entry: str
+
+    def gain(self, other: float, than: float) -> float:
+        """By how much (relative) a value is better than another; negative where it is worse."""
+        return (other / than if self.larger_is_better else than / other) - 1.0
+
+    def shown(self, value: float, digits: int = 4) -> str:
+        """The value with its unit, a length or a time with the prefix that its size needs.
+
+        >>> RMS_ERROR.shown(12.3456e-9)
+        '12.35 nm'
+        """
+        if self is BANDWIDTH:
+            return f"{self.factor * value:.{digits}g} {self.unit}"
+        return with_unit(value, spoken(self.si_unit), digits)
+
+
+BANDWIDTH = FigureOfMerit(
+    "bandwidth", "bandwidth", "ω_b", "rad/s", "Hz", 1.0 / HZ, True, "bandwidth"
+)
+RMS_ERROR = FigureOfMerit("rms_error", "RMS error", "e", "m", "nm", 1e9, False, "error_rms")
+MOVE_TIME = FigureOfMerit("move_time", "move time", "t", "s", "ms", 1e3, False, "move_time")
+FIGURES = {figure.key: figure for figure in (BANDWIDTH, RMS_ERROR, MOVE_TIME)}
+
 
 Options = tuple[tuple[str, object], ...]
 

@@ -1,23 +1,14 @@
-"""The kinds of inner problem, and what each of them knows of a problem at any θ.
-
-    v(θ) = max ω_b or min e over the controllers of a kind, within their bounds on every plant
-
-A kind knows no hardware cost and no weights of J. What works on problems of any kind is written
-against `InnerKind`.
-
-That of ω_b*(θ) by mixed sensitivity has its gradient by the envelope theorem,
-
-    dω_b*/dθ = ∂ω_b/∂θ - Σ μ_i ∂g_i/∂θ,   ∂ω_b/∂x = Σ μ_i ∂g_i/∂x at the inner optimum,
-
-x = (ln ω_S, ln ω_T), g the active constraints, ends of the ranges included.
-"""
+"""The kinds of inner problem, what each knows of a problem at a θ, and the loops of its design."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import Bounded
+from ccd_casadi.analysis.loop_view import Bounded, LoopView, loop_view
+from ccd_casadi.budget import BudgetFigures, evaluate_budget
+from ccd_casadi.budget.evaluation import variances
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
@@ -25,11 +16,13 @@ from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
@@ -224,3 +217,57 @@ def bandwidth_gradient(
         return np.full_like(none[0], np.nan)
     slopes = np.reshape([rows[name][1] for name in active], (len(mu), none.shape[1]))
     return np.asarray(theta[0] - mu @ slopes)
+
+
+def design_loops(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> list[Loop]:
+    """The loops that a controller (SI) is designed for at θ: the model's first, as they run."""
+    plants = kind_of(problem).plants(theta)
+    return [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
+
+
+def design_view(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    controller: StateSpace,
+    *,
+    bandwidth_hz: float,
+    weights: Weights | None = None,
+    gamma: float = np.nan,
+    label: str = "",
+) -> LoopView:
+    """The view of a design; `weights` and γ of a mixed-sensitivity one."""
+    bounded = kind_of(problem).bounded(weights or problem.weights, gamma, bandwidth_hz)
+    plants = kind_of(problem).members(theta)  # whose figures the result has
+    loops = [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
+    return loop_view(loops, bounded, bandwidth_hz=bandwidth_hz, label=label)
+
+
+@dataclass(frozen=True)
+class LoopBudget:
+    """The budget on the model, and the largest RMS error (m) and force (N) on `plants` of them.
+
+    None where the loop with the model is not stable; a plant with which it is not counts as
+    infinite.
+    """
+
+    model: BudgetFigures | None
+    plants: int
+    largest_error: float
+    largest_force: float
+    sampled: bool
+
+
+def loop_budget(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> LoopBudget | None:
+    """None for a problem without a budget; the controller in SI, as `controller.json` has it."""
+    if problem.budget is None:
+        return None
+    loops = design_loops(problem, theta, controller)
+    model = evaluate_budget(loops[0], problem.budget)
+    found = [variances(loop, problem.budget) for loop in loops]
+    largest = np.max([np.full(3, np.inf) if item is None else item for item in found], axis=0)
+    error, force = np.sqrt(largest[[0, 2]]).tolist()
+    return LoopBudget(model, len(loops), error, force, problem.sampling is not None)

@@ -13,14 +13,14 @@ from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import (
     ControllerProblem,
+    FigureOfMerit,
     MixedSensitivityProblem,
     RobustSet,
 )
-from ccd_casadi.inner_problem.figure import FigureOfMerit
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult, evaluate, sweep_inner
-from ccd_casadi.optim.box import Box
+from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.modal import (
     NOMINAL,
     ModalPlant,
@@ -33,9 +33,9 @@ from ccd_casadi.plants.modal import (
 from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.notebook import NotebookHtml
-from ccd_casadi.support.threads import one_blas_thread
-from ccd_casadi.support.units import use_units
+from ccd_casadi.support.terminal import NotebookHtml
+from ccd_casadi.support.text import use_units
+from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 

@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Kind
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, spoken
+from ccd_casadi.support.text import HZ, spoken
 
 NEAR = 1.1  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
 

@@ -1,10 +1,4 @@
-"""ω_b*(θ) of a fixed structure: one reproducible function of θ with its envelope gradient.
-
-A multi-start search at one θ gives warm starts, the distinct best controllers. ω_b*(θ) is the best
-of the climbs from all warm starts, and from nothing else: it depends neither on the order in which
-θ are asked for nor on the number of workers. Where no warm start climbs to a certified design a
-search of a few seeded starts is run at that θ, which is a function of θ too; not with `starts` = 0.
-"""
+"""ω_b*(θ) of a fixed structure, with its envelope gradient, and the move of a design."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,31 +6,99 @@ from functools import cached_property
 
 import numpy as np
 
+from ccd_casadi.analysis.move import DrivenMechanics, simulate
 from ccd_casadi.analysis.move_time import MoveTime
+from ccd_casadi.analysis.setpoint import MotionAt
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, Structure
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
-from ccd_casadi.fixed_structure.design import bandwidth_envelope
+from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
-from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
-from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
-from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
-from ccd_casadi.inner_problem.move_figures import motion_of
+from ccd_casadi.fixed_structure.local_search import RESIDUAL, Envelope
+from ccd_casadi.fixed_structure.worst_plant import lattice
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.objective import InnerValue
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
     structure_of,
     structured_of,
+    uncertain_plant,
     warm_starts_at,
     with_structured,
 )
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import HZ
+
+CHECKED, FRESH = 100, 500  # plants of the lattice, and drawn afresh
+FRESH_SEED = 3000  # apart from those of other draws
+PER_MOVE = 10.0  # a continuous loop is stepped 50 times in this share of the setpoint
+
+
+def motion_of(problem: CoDesignProblem, theta: Sequence[float]) -> MotionAt:
+    """The move at θ, of a problem that has one."""
+    own = plant_of(problem).evaluate
+    assert isinstance(own, DrivenMechanics)
+    return own.at(tuple(map(float, theta)), problem.sampling)
+
+
+def require_motion(problem: CoDesignProblem) -> None:
+    """Raise UserError where the plant does not make its move."""
+    plant = plant_of(problem)
+    if plant.inputs != plant.outputs:
+        words = f"has {plant.inputs} inputs and {plant.outputs} outputs; [move] needs as many"
+        raise PlantError(f"{words} of one as of the other")
+    motion_of(problem, problem.start)
+
+
+def exact_times(
+    problem: CoDesignProblem, motion: MotionAt, plants: Sequence[ScaledPlant], K: StateSpace
+) -> Array:
+    """From the start of the move until the error stays within the window, s; its end at least."""
+    profile = motion.cycle.profile
+    found = [
+        simulate(
+            Loop(plant.plant_si(), K, problem.sampling), profile, axis=0,
+            forces=motion.forward, window=motion.motion.window,
+            bandwidth_hz=PER_MOVE / profile.duration,
+        ).settled
+        for plant in plants
+    ]  # fmt: skip
+    return np.maximum(found, profile.duration)
+
+
+def latest_plant(
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, seed: int
+) -> tuple[float, int, Array]:
+    """The exact time on the latest plant of a lattice of the box, its option and its point."""
+    uncertain = uncertain_plant(problem, theta)
+    points = lattice(uncertain, CHECKED, seed)
+    times = exact_times(problem, motion_of(problem, theta), uncertain.plants(points), K)
+    return float(times.max()), *points[int(times.argmax())]
+
+
+def stated_time(
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, value: float
+) -> tuple[float, Yield | None]:
+    """The time that a design is told to need (s), whose smooth time on the set is `value`, and how
+    many fresh plants need no longer."""
+    seed = structured_of(problem).seed
+    uncertain, motion = uncertain_plant(problem, theta), motion_of(problem, theta)
+    on_set = exact_times(problem, motion, plants_of(problem, theta), K)
+    told = max(value, float(on_set.max()), latest_plant(problem, theta, K, seed + FRESH_SEED)[0])
+    if not uncertain.names:
+        return told, None
+    fresh = uncertain.drawn(np.random.default_rng((seed, FRESH_SEED)), FRESH)
+    times = exact_times(problem, motion, uncertain.plants(fresh), K)
+    return told, Yield(int((times <= told).sum()), FRESH)
+
 
 FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
 LOST = 1e-6  # relative: of the bandwidth, by rounding

@@ -10,16 +10,15 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.bounds import ChannelBounds
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.decoupling import (
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
     channel_bounds,
     channel_plant,
     find_decoupling,
     given_decoupling,
 )
-from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.race import at_its_bandwidth
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant

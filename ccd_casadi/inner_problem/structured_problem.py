@@ -13,9 +13,15 @@ from typing import Any, Self
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
-from ccd_casadi.fixed_structure.decoupling import given_decoupling
-from ccd_casadi.inner_problem.controller_problem import ControllerProblem, Options
-from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES, RMS_ERROR, FigureOfMerit
+from ccd_casadi.fixed_structure.channel_structure import given_decoupling
+from ccd_casadi.inner_problem.controller_problem import (
+    BANDWIDTH,
+    FIGURES,
+    RMS_ERROR,
+    ControllerProblem,
+    FigureOfMerit,
+    Options,
+)
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.weights import Weights

@@ -14,15 +14,19 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
-from ccd_casadi.fixed_structure.design import bandwidth_envelope
-from ccd_casadi.fixed_structure.loop_on_box import WITHIN, Excess, LoopOnBox
-from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
+from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import LATTICE, lattice, worst_plants
-from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
-from ccd_casadi.inner_problem.move_figures import latest_plant
+from ccd_casadi.fixed_structure.worst_plant import (
+    LATTICE,
+    WITHIN,
+    Excess,
+    LoopOnBox,
+    lattice,
+    worst_plants,
+)
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import LOST, ProblemAt
+from ccd_casadi.inner_problem.structured_bandwidth import LOST, ProblemAt, latest_plant
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
@@ -34,8 +38,8 @@ from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.units import HZ, of_a_bound
+from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import HZ, of_a_bound
 
 AT_ONCE = 8  # plants added in a round
 APART = 1e-4  # of the box: plants that are closer are the same plant

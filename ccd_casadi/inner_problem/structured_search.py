@@ -12,9 +12,9 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
-from ccd_casadi.fixed_structure.loop_on_box import Excess
-from ccd_casadi.fixed_structure.optimality import RESIDUAL
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.fixed_structure.local_search import RESIDUAL
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import ProblemAt, structured_value, too_slow
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Tell, silent
+from ccd_casadi.support.terminal import Tell, silent
 
 MOST_WARM_STARTS = 3
 ENOUGH = 12  # starts before a search may say that it found no controller within the bounds

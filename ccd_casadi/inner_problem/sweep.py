@@ -19,7 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import NotebookHtml
+from ccd_casadi.support.terminal import NotebookHtml
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 from ccd_casadi.synthesis.weights import Weights

@@ -4,10 +4,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.sampling.rows import problem_hash
-from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.store import SampleStore, problem_hash
 from ccd_casadi.support.errors import require
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 if TYPE_CHECKING:
     import pandas

@@ -29,8 +29,7 @@ from numba.core.dispatcher import Dispatcher
 
 from ccd_casadi.kernels import sources
 from ccd_casadi.support.options import usable_cores
-from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import say
+from ccd_casadi.support.terminal import Progress, say
 from surrogates.files import write_whole
 
 PACKAGE = __name__.rpartition(".")[0]
@@ -48,7 +47,7 @@ def compile_part(part: str) -> None:
         return _compile_rows(part == "curvature")
     from ccd_casadi.kernels import design, frequency, gamma, riccati, sensitivity, synthesis
     from ccd_casadi.kernels.generalized_plant import generalized_plant, squared_weights
-    from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
+    from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, stable_subspace
 
     # 1/(s² + 0.1 s + 1) with the paper's weights
     A, B, C = np.array([[0.0, 1.0], [-1.0, -0.1]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
@@ -82,15 +81,8 @@ def compile_part(part: str) -> None:
 
 
 def _compile_rows(curvature: bool) -> None:
-    from ccd_casadi.kernels import (
-        loop_curvature,
-        loop_grid,
-        loop_point,
-        loop_rows,
-        modes,
-        plant_slopes,
-    )
-    from ccd_casadi.kernels.limits import Limit
+    from ccd_casadi.kernels import loop_grid, loop_point, modes
+    from ccd_casadi.kernels.sections import Limit
 
     one, first, square = np.ones(1), np.zeros(1, np.int64), np.eye(1)
     plants = modes.Plants(np.full((1, 1, 4), -1.0 + 1.0j), np.ones((1, 1, 2, 1, 1)), 0.0, 0.0)
@@ -99,21 +91,19 @@ def _compile_rows(curvature: bool) -> None:
     loop = loop_point.LoopArrays(*controller, *plants, *limits)
     if curvature:
         modes.responses(plants, first, one)
-        loop_curvature.second(first, first, first, one, loop)
+        loop_grid.second(first, first, first, one, loop)
         side, four = np.ones((1, 1, 1), complex), np.ones((1, 1, 1, 1), complex)
         terms, apart = plants.terms[..., [0] * 6], four.real[..., None]
         kinds = np.zeros((1, 1), np.int8)
-        slopes = plant_slopes.PlantSlopes(
-            terms, side, side, side, apart, four, four, 0.0, 0.0, kinds
-        )
-        plant_slopes.form_slopes(slopes, first, one, side[0], side[0], False)
+        slopes = modes.PlantSlopes(terms, side, side, side, apart, four, four, 0.0, 0.0, kinds)
+        modes.form_slopes(slopes, first, one, side[0], side[0], False)
     else:
-        loop_rows.levels(first[None], first, square, loop, 0.0, loop_grid.NONE)
+        loop_point.levels(first[None], first, square, loop, 0.0, loop_grid.NONE)
         loop_grid.merged(square, one + 0j, square + 0j, one, (0.5, 2.0), 1e-8, 1e3)
         loop_grid.maxima(square[..., None, None], square, square, 0.0)
         loop_grid.unseen(square[..., None, None], square, 0.0)
-        loop_rows.rows(first, first, first, one, loop)
-        loop_rows.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
+        loop_point.rows(first, first, first, one, loop)
+        loop_point.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
 
 
 def is_compiled() -> bool:
@@ -177,7 +167,7 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    names = ("design", "gradients", "loop_curvature", "loop_grid", "loop_rows", "plant_slopes")
+    names = ("design", "gradients", "loop_grid", "loop_point", "modes")
     for name in names:  # with them all the others
         import_module(f"{PACKAGE}.{name}")
     found = {}

@@ -4,21 +4,20 @@ from math import exp, isnan, log, nan
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import place
-from ccd_casadi.kernels.certificate import level_test, stack_norm
-from ccd_casadi.kernels.closed_loop import (
+from ccd_casadi.kernels.certificate import (
+    level_test,
     loop_matrices,
     pole_rounding,
     reachable_loop,
+    stack_norm,
     weighted_loop,
 )
 from ccd_casadi.kernels.compiled import compiled, inlined
-from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.lapack import eigenvalues
+from ccd_casadi.kernels.generalized_plant import generalized_plant, place
+from ccd_casadi.kernels.linear_algebra import eigenvalues
 from ccd_casadi.kernels.riccati import lqr_hamiltonian
-from ccd_casadi.kernels.sensitivity import bandwidth, peak, sensitivity_gain
+from ccd_casadi.kernels.sensitivity import Code, Column, bandwidth, peak, sensitivity_gain
 from ccd_casadi.kernels.synthesis import central_controller, synthesise
 
 _COUNT, _CODE, _GAMMA_OPT = int(Column.COUNT), int(Column.CODE), int(Column.GAMMA_OPT)

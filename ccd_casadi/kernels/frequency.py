@@ -8,7 +8,7 @@ whole grid runs through it in vector instructions.
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
-from ccd_casadi.kernels.lapack import balanced, schur
+from ccd_casadi.kernels.linear_algebra import balanced, schur
 
 CHUNK = 32  # frequencies at a time: the working rows stay in the first-level cache
 

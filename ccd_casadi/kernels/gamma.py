@@ -7,11 +7,10 @@ place: a step of order four from one Schur form, whose own terms tell when it is
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import frobenius
 from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.frequency import narrow, next_trial, prepare, response, responses
-from ccd_casadi.kernels.generalized_plant import squared_weights
-from ccd_casadi.kernels.lapack import lyapunov_triangular
+from ccd_casadi.kernels.generalized_plant import frobenius, squared_weights
+from ccd_casadi.kernels.linear_algebra import lyapunov_triangular
 from ccd_casadi.kernels.riccati import riccati_level, root_nearby
 
 BACKWARD = 8.0 * 2.0**-52  # |δH|/|H| of a Schur form; 6 eps was measured, N up to 35

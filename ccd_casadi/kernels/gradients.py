@@ -27,15 +27,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccd_casadi.kernels.bound_peak import bound_gradient, bound_peak
-from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, innovations_plant
-from ccd_casadi.kernels.figures import Code, Column
+from ccd_casadi.kernels.adjoint import (
+    FourBlockPullback,
+    MixedPullback,
+    PlantGradients,
+    bound_gradient,
+    bound_peak,
+)
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
-from ccd_casadi.kernels.pullback import FourBlockPullback, MixedPullback, PlantGradients
+from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, stable_subspace
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
+from ccd_casadi.kernels.sensitivity import Code, Column
+from ccd_casadi.kernels.synthesis import disturbance_bound, filter_solution, innovations_plant
 from ccd_casadi.support.arrays import Array
 
 

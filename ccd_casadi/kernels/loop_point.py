@@ -1,29 +1,13 @@
-"""Gains of a loop's matrices over their bounds, on every plant, with exact derivatives.
-
-With S = (I + GK)⁻¹, K = V diag(K_i) Uᵀ and G₀ the plant without hold and delay, each matrix M
-depends on every K_i by rank one, and on the plant by one product. With u, v singular vectors,
-
-    ∂ ln σ = Re(ũᵀ ∂M v),   ũ = ū/σ
-           = Re Σ_i left_i K_i right_i ∂ln K_i + Re(x ∂G y)   [- Re(x ∂G₀ v) of S G₀]
-
-    M            x          right       left            y
-    S          -ũᵀS         UᵀS v       x G V           V diag(K_i) right
-    T = GKS     ũᵀS         UᵀS v       x G V           "
-    KS         -ũᵀKS        UᵀS v       x G V + ũᵀV     "
-    S G₀       -ũᵀS         UᵀS G₀ v    x G V           "
-
-Several singular values are constraints of their own: where the largest two meet both bind, and no
-derivative is lost. One channel is the case of 1 x 1 matrices.
-"""
+"""One loop at one frequency: S, T, KS and GS, and their slopes to the controller's parameters."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.limits import LoopCurve
-from ccd_casadi.kernels.sections import inverse
-from ccd_casadi.kernels.small import invert, singular
+from ccd_casadi.kernels.linear_algebra import invert, largest_gain, singular
+from ccd_casadi.kernels.modes import response
+from ccd_casadi.kernels.sections import LoopCurve, gains, gains_and_slopes, inverse, offset, warped
 
 # What a point, one plant's loop at one frequency, has of matrices (10, w, w) and of vectors (9, w)
 G, DG, FREE, DFREE, GV, GK, S, US, M, V = range(10)  # GV = G V, US = Uᵀ S
@@ -188,3 +172,162 @@ def gain_of(curve, number, into, out, own, at, of, sigma):
             total += into[a, i] * of[K, i] * of[RIGHT, i]
         of[Y, a] = total
     return sigma[place], place
+
+
+@compiled
+def levels(curves, which, v, loop, least, answers):
+    """ln of the gains over their bounds, (N, k, curves, numbers), of the curves (N, C) of each of N
+    plants `which` at v (N, k); -inf where none can be above `least`, and where nothing bounds one.
+
+    What the plants answer is looked up in `answers` (`loop_grid`) where it is known.
+    """
+    count, most = v.shape
+    at, of, _, sigma = room(loop)
+    factors, values, into, outputs = loop.factors, loop.values, loop.into, loop.out
+    terms, residues, T, d = loop.terms, loop.residues, loop.period, loop.delay
+    limits, own, places = loop.limits, loop.rows, answers.place
+    k, matrix_room, vectors = of[K], at[M], at[V]
+    p, numbers, m = outputs.shape[1], limits.shape[1], into.shape[0]
+    out = np.full((count, most, curves.shape[1], numbers), -np.inf)
+    sensitivity = np.empty(p)
+    for i in range(count):
+        for j in range(most):
+            ω, chain = warped(T, v[i, j])
+            gains(factors, values, complex(0.0, v[i, j]), k)
+            place = places[i, j] if places.size else -1
+            if place < 0:
+                response(terms, residues, T, d, which[i], ω, chain, False, at, G)
+            else:
+                for a in range(p):
+                    for b in range(m):
+                        at[G, a, b] = answers.held[which[i], place, a, b]
+                        at[FREE, a, b] = answers.free[which[i], place, a, b]
+            closed(into, outputs, k, at)
+            height, known = np.nan, False  # of S: ln of its largest gain, and of all others
+            for c in range(curves.shape[1]):
+                curve = curves[i, c]
+                of_s = curve != LoopCurve.KS and curve != LoopCurve.T and curve != LoopCurve.GS
+                if curve == LoopCurve.GS and place < 0:
+                    response(terms, residues, 0.0, 0.0, which[i], ω, 1.0, False, at, FREE)
+                rows, columns, top = p, p, height
+                if not of_s or np.isnan(height):
+                    rows, columns = matrix(curve, into, outputs, k, at)
+                    top = abs(at[M, 0, 0])
+                    if rows + columns > 2:
+                        top = largest_gain(matrix_room, rows, columns)
+                    top = np.log(top)
+                    height = top if of_s else height
+                level = offset(curve, 0, ω, chain, limits)[0]
+                if rows + columns == 2:
+                    out[i, j, c, 0] = top + level
+                elif top + level > least:
+                    if not (of_s and known):
+                        matrix(curve, into, outputs, k, at)
+                        singular(matrix_room, rows, columns, vectors, sigma, False)
+                    for number in range(p):
+                        if of_s and not known:
+                            sensitivity[number] = sigma[number]
+                        gain = sensitivity[number] if of_s else sigma[number]
+                        out[i, j, c, number] = np.log(gain) + level
+                    known = known or of_s
+                for number in range(p, numbers):
+                    if limits[curve, number] < np.inf:
+                        matrix(curve, into, outputs, k, at)
+                        row = own[int(curve == LoopCurve.KS), number - p]
+                        size = row_of(row, matrix_room, rows, columns)
+                        level = offset(curve, number, ω, chain, limits)[0]
+                        out[i, j, c, number] = np.log(size) + level
+    return out
+
+
+@compiled
+def rows(curve, number, which, v, loop):
+    """M rows: value, slope to ln v, ∂c/∂κ (M, n); x (M, p), y and v (M, m) for those to the plant.
+
+    Rows at the same frequency of the same plant that follow each other share their loop.
+    """
+    at, of, g, sigma = room(loop)
+    # Unpacked once: to hand all of them to a function costs as much as a row.
+    factors, values, channel, into, out, terms, residues, T, delay, limits, own = loop
+    count, (m, c), p = v.size, into.shape, out.shape[1]
+    value, slope, to_kappa = np.empty(count), np.empty(count), np.empty((count, g.size))
+    x, sides = np.empty((count, p), np.complex128), np.zeros((2, count, m), np.complex128)
+    for j in range(count):
+        before, of_gs, (ω, chain) = j - 1, curve[j] == LoopCurve.GS, warped(T, v[j])
+        known = j > 0 and v[j] == v[before] and which[j] == which[before]
+        if not known:
+            gains_and_slopes(factors, values, complex(0.0, v[j]), of[K], of[RATE], g)
+            response(terms, residues, T, delay, which[j], ω, chain, True, at, G)
+            closed(into, out, of[K], at)
+        if of_gs and not (known and curve[before] == LoopCurve.GS):
+            response(terms, residues, 0.0, 0.0, which[j], ω, 1.0, True, at, FREE)
+        σ, place = gain_of(curve[j], number[j], into, out, own, at, of, sigma)
+        level, rise = offset(curve[j], number[j], ω, chain, limits)
+        for i in range(c):
+            rise += (of[SHARE, i] * of[RATE, i]).real
+        for a in range(p):
+            x[j, a] = of[X, a]
+            for b in range(m):
+                rise += (of[X, a] * at[DG, a, b] * of[Y, b]).real
+                if of_gs:
+                    rise -= chain * (of[X, a] * at[DFREE, a, b] * at[V, b, place]).real
+        value[j], slope[j] = np.log(σ) + level, rise
+        for a in range(g.size):
+            to_kappa[j, a] = (of[SHARE, channel[a]] * g[a]).real
+        for b in range(m):
+            sides[0, j, b] = of[Y, b]
+            if b < p or of_gs:
+                sides[1, j, b] = at[V, b, place]
+    return value, slope, to_kappa, x, sides[0], sides[1]
+
+
+@compiled
+def close(curve, number, which, start, low, high, loop, tolerances):
+    """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
+
+    A bracket that two steps do not halve is cut in the middle: where the slope is tiny at one end
+    and large at the other, as with two maxima about to part, false position alone creeps. Where a
+    bracket's slopes do not change sign (an end) the start stays; second: where they do.
+    """
+    flat, narrowest, most = tolerances
+    top, closed_in = start.copy(), np.zeros(start.size, np.bool_)
+    fa, end = rows(curve, number, which, start, loop)[1], low.copy()
+    for j in range(start.size):
+        if fa[j] > 0.0:
+            end[j] = high[j]
+    fb = rows(curve, number, which, end, loop)[1]
+    a, b, x = np.log(start), np.log(end), np.empty(start.size)
+    narrow, before, wider = np.empty(start.size), np.empty(start.size), np.empty(start.size)
+    going, left = np.empty(start.size, np.int64), 0  # the brackets that are still too wide
+    for j in range(start.size):
+        if fa[j] * fb[j] < 0.0 and np.isfinite(fa[j]) and np.isfinite(fb[j]):
+            closed_in[j], going[left] = True, j
+            narrow[j] = narrowest * abs(b[j] - a[j])
+            before[j], wider[j] = np.inf, np.inf  # widths one and two steps ago
+            left += 1
+    for _ in range(int(most)):
+        going = going[:left]
+        if left == 0:
+            break
+        for j in going:
+            width = abs(b[j] - a[j])
+            x[j] = b[j] - fb[j] * (b[j] - a[j]) / (fb[j] - fa[j])
+            if width > 0.5 * wider[j]:
+                x[j] = 0.5 * (a[j] + b[j])
+            wider[j], before[j] = before[j], width
+        fx = rows(curve[going], number[going], which[going], np.exp(x[going]), loop)[1]
+        left = 0
+        for k in range(fx.size):
+            j = going[k]
+            if fx[k] * fb[j] < 0.0:
+                a[j], fa[j] = b[j], fb[j]
+            else:
+                fa[j] *= 0.5
+            b[j], fb[j] = x[j], fx[k]
+            if abs(fx[k]) >= flat and abs(b[j] - a[j]) > narrow[j]:
+                going[left] = j
+                left += 1
+    for j in range(start.size):
+        if closed_in[j]:
+            top[j] = np.exp(b[j])
+    return top, closed_in

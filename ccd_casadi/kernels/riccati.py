@@ -1,17 +1,9 @@
-"""The level f(t) = λ_min(X⁻¹) of the one-Riccati mixed-sensitivity problem, and its slope.
-
-With D21 = I and a stable plant the filter Riccati equation is solved by Y = 0, so a level γ
-is achievable iff the Hamiltonian, with t = γ² - d1²,
-
-    H(t) = H0 + [B1; -S][Sᵀ B1ᵀ]/t,   S = C1ᵀ D11,
-
-has no eigenvalue on the imaginary axis (γ > γ_jω) and its stabilising X is positive
-semidefinite (γ > γ_X). f is concave and increasing in t.
-"""
+"""The Riccati equation of the synthesis, in balanced coordinates where its own lose digits."""
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import (
+from ccd_casadi.kernels.compiled import compiled, inlined
+from ccd_casadi.kernels.generalized_plant import (
     add,
     frobenius,
     place,
@@ -20,8 +12,7 @@ from ccd_casadi.kernels.blocks import (
     symmetric_part,
     transposed,
 )
-from ccd_casadi.kernels.compiled import compiled, inlined
-from ccd_casadi.kernels.lapack import lyapunov_triangular, solve, stable_subspace
+from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, solve, stable_subspace
 
 NOISE = 1e-7  # |λ(X)| below which its sign may be rounding: see `riccati_level`
 
@@ -169,3 +160,56 @@ def root_nearby(B1, C1, d1, frame, δ):
     first = abs(np.dot(q, Z1 @ q))
     ratio = abs(δ) * max(n3 / n2, n2 / n1)
     return δ, abs(δ) ** 3 * n3 / first * ratio if ratio < 0.5 else np.inf
+
+
+def balancing(H):
+    """τ (N,), powers of two that make the sum of a 2N x 2N Hamiltonian's entries smallest.
+
+    No other power of any one of them makes it smaller; each sweep lowers the sum.
+    """
+    N = H.shape[0] // 2
+    M = np.abs(H)
+    for i in range(2 * N):
+        M[i, i] = 0.0
+    τ = np.ones(N)
+    for _ in range(40):  # it settles in three to six
+        settled = True
+        for i in range(N):
+            k = N + i
+            # τ_i divides row i and column k, once more where they meet, and multiplies the others
+            d2, u2 = M[i, k], M[k, i]
+            d1, u1 = M[i].sum() + M[:, k].sum() - 2.0 * d2, M[:, i].sum() + M[k].sum() - 2.0 * u2
+            if d1 + d2 == 0.0 or u1 + u2 == 0.0:
+                continue
+            f = 1.0
+            while 0.5 * d1 / f + 0.75 * d2 / f**2 > u1 * f + 3.0 * u2 * f**2:  # 2f is better
+                f *= 2.0
+            while d1 / f + 3.0 * d2 / f**2 < 0.5 * u1 * f + 0.75 * u2 * f**2:
+                f *= 0.5
+            if f != 1.0:
+                settled = False
+                τ[i] *= f
+                M[i] /= f
+                M[:, k] /= f
+                M[:, i] *= f
+                M[k] *= f
+        if settled:
+            break
+    return τ
+
+
+def in_coordinates(gp, τ):
+    """The generalized plant with states x̂ = x/τ."""
+    rows = τ.reshape(-1, 1)
+    return gp._replace(
+        A=gp.A * (τ / rows), B1=gp.B1 / rows, B2=gp.B2 / rows, C1=gp.C1 * τ, C2=gp.C2 * τ
+    )
+
+
+def rounding_noise(H0):
+    """What rounding alone makes of a projection that is zero: X(γ = ∞) is positive semidefinite.
+
+    Four times the most negative one there, at least `NOISE`.
+    """
+    _, U1, U2, _, ok = stable_subspace(H0)
+    return max(NOISE, -4.0 * projected(U1, U2)[3].min()) if ok else NOISE

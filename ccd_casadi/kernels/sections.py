@@ -1,11 +1,71 @@
-"""A controller of sections in each of its channels: K = V diag(K_i) Uᵀ, and the slopes of K_i.
+"""Sections of a controller of fixed structure: parameters, their limits, and responses."""
 
-    K_i(s) = k Π factor^±1,   factors 1 + ω/s (an integrator), 1 + s/ω, 1 + 2ζ s/ω + s²/ω²
+from enum import IntEnum
 
-The parameters of all channels stand one after the other in κ = ln(values), g = ∂ln K_i/∂κ.
-"""
+import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
+
+HALF_POWER = 0.5 * np.log(2.0)
+
+
+class LoopCurve(IntEnum):
+    """What is bounded; the row of its limit."""
+
+    S_MAX = 0
+    SHAPE = 1  # of shape/√2, on the line through ω_i
+    S_LOW = 2
+    KS = 3  # of the level over scale and unit of force
+    T = 4  # of the level over scale
+    GS = 5
+    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the level
+    LEVEL = 7  # |S| <= 1/√2 below ω_b, or below the line that ends there
+
+
+class Limit(IntEnum):
+    """The other rows: roots of the weights over ω₀."""
+
+    LEAST = 8  # ω that the shape counts at least
+    KS_ZERO = 9
+    KS_POLE = 10
+    T_ZERO = 11
+    T_POLE = 12
+    BANDWIDTH = 13  # ω_i
+    OPENS = 14  # 1 where the room of the shape opens from ω_b on, else 0
+    COUNT = 15
+
+
+@compiled
+def warped(T, v):
+    """ω of v and ∂ln ω/∂ln v, of a loop with period T (0: continuous)."""
+    if T == 0.0:
+        return v, 1.0
+    ω = 2.0 / T * np.arctan(0.5 * T * v)
+    return ω, v / ω / (1.0 + (0.5 * T * v) ** 2)
+
+
+@compiled
+def offset(curve, number, ω, chain, limits):
+    """What is added to the logarithm of a gain, and its slope to ln v."""
+    level = -limits[curve, number]
+    opens = limits[Limit.OPENS, number] > 0.0
+    if curve == LoopCurve.SHAPE or (opens and curve == LoopCurve.LEVEL):
+        least = limits[Limit.LEAST, number]
+        x = max(ω, least) / limits[Limit.BANDWIDTH, number]
+        slope = 1.0 if ω >= least else 0.0
+        if opens and curve == LoopCurve.SHAPE:
+            shape = np.exp(limits[curve, number] + HALF_POWER)
+            closed = (1.0 - 1.0 / shape) / max(x, 1.0) ** 2  # share of shape x that is not open yet
+            level -= np.log(1.0 - closed)
+            slope += 2.0 * closed / (1.0 - closed) if x >= 1.0 else 0.0
+        return level - np.log(x), -slope * chain
+    if curve == LoopCurve.KS or curve == LoopCurve.T:
+        at = Limit.KS_ZERO if curve == LoopCurve.KS else Limit.T_ZERO
+        a = ω * ω + limits[at, number] ** 2
+        b = ω * ω + limits[at + 1, number] ** 2
+        return level + 0.5 * np.log(a / b), (ω * ω / a - ω * ω / b) * chain
+    return level, 0.0
+
 
 GAIN, INTEGRATOR, REAL, PAIR = 0, 1, 2, 3
 

@@ -1,18 +1,51 @@
-"""Bandwidth, peak and low-frequency value of the sensitivity S = (I + G K)⁻¹, without a grid.
+"""Figures of S: peak, bandwidth, level at ω_low, by level tests confirmed on the response."""
 
-Levels of σ_max(S) are crossed where a Hamiltonian matrix has imaginary eigenvalues; every
-candidate is then confirmed and polished on the frequency response itself, so that rounding
-in the eigenvalues costs no digit of the result. (Boyd, Balakrishnan & Kabamba 1989;
-Bruinsma & Steinbuch 1990.) Frequencies are in the units of A.
-"""
+from enum import IntEnum
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import add, place, place_transposed, transposed
 from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.frequency import response, response_and_slope, responses
-from ccd_casadi.kernels.lapack import eigenvalues
-from ccd_casadi.kernels.small import invert, largest_singular, multiply
+from ccd_casadi.kernels.generalized_plant import add, place, place_transposed, transposed
+from ccd_casadi.kernels.linear_algebra import eigenvalues, invert, largest_singular, multiply
+
+
+class Code(IntEnum):
+    """How a design ended; 0 is the only one that may be used."""
+
+    CERTIFIED = 0
+    GAMMA_NOT_CONVERGED = 1
+    RICCATI_FAILED = 2
+    NOT_FINITE = 3
+    UNSTABLE_LOOP = 4
+    NORM_EXCEEDED = 5
+    LEVEL_TEST_FAILED = 6
+    NO_BANDWIDTH = 7
+    EIGENVALUES_FAILED = 8
+    PEAK_NOT_CONFIRMED = 9
+    FILTER_FAILED = 10
+
+
+class Column(IntEnum):
+    """Columns of a row of figures; frequencies over ω₀, poles over ω₀."""
+
+    CODE = 0
+    GAMMA_OPT = 1
+    GAMMA_LOWER_BOUND = 2
+    GAMMA = 3
+    LIMITED_BY_BOUND = 4
+    SCHUR_FORMS = 5
+    BANDWIDTH = 6
+    PEAK = 7
+    PEAK_FREQUENCY = 8
+    LOW = 9
+    MAX_REAL_POLE = 10
+    NORM = 11
+    NORM_FREQUENCY = 12
+    BALANCED = 13  # 1 where the synthesis needed balanced coordinates
+    GAMMA_ERROR = 14  # relative, what rounding and search may leave in γ_opt; infinite: unknown
+    COUNT = 15
+
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 

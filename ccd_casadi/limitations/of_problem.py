@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
@@ -21,11 +21,11 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.limitations.bound import forbids, forbids_most, lower_bound, pointwise, upper_bound
 from ccd_casadi.limitations.limits import Limits, limits_of
-from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.text import HZ, number
 
 MODEL = "the model"
 

@@ -7,9 +7,8 @@ Balakrishnan & Kabamba 1989; Bruinsma & Steinbuch 1990.)
 import numpy as np
 from scipy.linalg import eigvals, solve
 
-from ccd_casadi.lti.grid import root_flanks
-from ccd_casadi.lti.hold import in_w
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.loop import in_w
+from ccd_casadi.lti.state_space import StateSpace, balanced, root_flanks
 from ccd_casadi.support.arrays import Array
 
 NEAR_AXIS = 1e-3  # |Re λ|/|λ| of a candidate: a spurious one costs an evaluation, no more

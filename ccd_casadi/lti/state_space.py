@@ -1,16 +1,93 @@
-"""A system as a state space, continuous or in discrete time, with its response, poles and zeros.
+"""State-space systems: response, poles, zeros, series connection, the closed loop of two, and
+frequency grids through their poles and zeros."""
 
-The judge `fixed_structure.certificate` and the compiled kernels form loops of their own, and
-`deployment.move` runs them sample by sample: it stays independent of this.
-"""
-
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import scipy
 from scipy.linalg import eig, matrix_balance
 
 from ccd_casadi.support.arrays import Array
+
+FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
+FIRST, HALVINGS = 11, 16  # points between a maximum's neighbours, then of their spacing
+LIGHT = 0.3  # damping ratio below which a pole or zero is a resonance
+
+
+def root_flanks(roots: np.ndarray, flanks: Array = FLANKS) -> Array:
+    """|Im p| + flank |Re p| (..., kf) of roots p (..., k) of any plane in 1/s, rad/s, unsorted."""
+    found = np.abs(roots.imag)[..., None] + np.abs(roots.real)[..., None] * flanks
+    return np.asarray(found.reshape(*roots.shape[:-1], -1))
+
+
+def resonant(roots: np.ndarray) -> np.ndarray:
+    """Those of the upper half plane with a damping ratio below 0.3, ascending by size."""
+    upper = roots[roots.imag > 1e-9 * np.abs(roots)]
+    upper = upper[np.abs(upper.real) < LIGHT * np.abs(upper)]
+    return np.asarray(upper[np.argsort(np.abs(upper))])
+
+
+def frequency_grid(
+    low: float, high: float, points: int, *special: Array, apart: float = 0.0
+) -> Array:
+    """`points` frequencies evenly spread over ln ω from `low` to `high`, and special ones within.
+
+    Ascending, each at least `apart` (relative) above the one before.
+    """
+    grid = np.unique(np.concatenate([np.geomspace(low, high, points), *special]))
+    grid = grid[(grid >= low) & (grid <= high)]  # NaN compares false
+    return np.asarray(grid[np.append(True, np.diff(grid) > apart * grid[1:])])
+
+
+def thinned(values: Array, width: float) -> Array:
+    """Those above 0, ascending: the least of each interval of ln ω that is so wide.
+
+    >>> thinned(np.array([1.0, 1.01, 2.0, 1.02]), 0.1).tolist()
+    [1.0, 2.0]
+    """
+    ascending = np.sort(values[values > 0.0])
+    _, first = np.unique(np.floor(np.log(ascending) / width), return_index=True)
+    return np.asarray(ascending[first])
+
+
+def local_maxima(values: Array) -> np.ndarray:
+    """Places inside the array that are above their left neighbour and not below their right one."""
+    return np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
+
+
+def zoomed(function: Callable[[Array], Array], low: Array, high: Array) -> tuple[Array, Array]:
+    """Where N brackets that close in on a maximum end, and its value; `function` of (N, k)."""
+    if not len(low):
+        return low, low
+    points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, FIRST)
+    value = function(points)
+    for _ in range(HALVINGS):
+        inner = np.argmax(value[:, 1:-1], axis=1)[:, None] + np.arange(3)
+        x, f = (np.take_along_axis(part, inner, axis=1) for part in (points, value))
+        between = 0.5 * (x[:, :-1] + x[:, 1:])
+        order = [0, 3, 1, 4, 2]
+        points = np.concatenate([x, between], axis=1)[:, order]
+        value = np.concatenate([f, function(between)], axis=1)[:, order]
+    best = np.argmax(value, axis=1)[:, None]
+    where, height = (np.take_along_axis(part, best, axis=1)[:, 0] for part in (points, value))
+    return where, height
+
+
+def refine_peak(
+    gain: Callable[[float], float], low: float, high: float, xatol: float = 1e-10
+) -> tuple[float, float]:
+    """(ω, gain) at the local maximum between two frequencies above 0, by Brent's method in ln ω.
+
+    `xatol`: in ln ω.
+    """
+    top = scipy.optimize.minimize_scalar(
+        lambda x: -gain(float(np.exp(x))), bounds=(np.log(low), np.log(high)),
+        method="bounded", options={"xatol": xatol},
+    )  # fmt: skip
+    return float(np.exp(top.x)), -float(top.fun)
+
 
 SOUND = 1e8  # condition of eigenvectors up to which they give a response
 GONE = 1e-6  # a pole z of a delay: it is gone after a sample, and has no frequency
@@ -167,3 +244,80 @@ def weighted(system: StateSpace, filters: Array) -> StateSpace:
         np.hstack([through[:, None] * C, np.diag(through * (zero - pole))]),
         through[:, None] * D,
     )
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """ẋ = A x + B_r r + B_d d (x⁺ with a `period` > 0 in s), y = C_y x, u = C_u x + D_u r.
+
+    x = [x_G; x_K]; sensor noise n enters as -r does.
+    """
+
+    A: Array
+    B_r: Array
+    B_d: Array
+    C_y: Array
+    C_u: Array
+    D_u: Array
+    period: float = 0.0
+
+    @cached_property
+    def S(self) -> StateSpace:
+        """r to e: (1 + GK)⁻¹."""
+        return StateSpace(self.A, self.B_r, -self.C_y, np.eye(len(self.C_y)), period=self.period)
+
+    @cached_property
+    def T(self) -> StateSpace:
+        """r to y: GK(1 + GK)⁻¹."""
+        return strictly_proper(self.A, self.B_r, self.C_y, self.period)
+
+    @cached_property
+    def GS(self) -> StateSpace:
+        """d to y: (1 + GK)⁻¹G."""
+        return strictly_proper(self.A, self.B_d, self.C_y, self.period)
+
+    @cached_property
+    def KS(self) -> StateSpace:
+        """r to u: K(1 + GK)⁻¹."""
+        return StateSpace(self.A, self.B_r, self.C_u, self.D_u, period=self.period)
+
+
+def closed_loop(G: StateSpace, K: StateSpace) -> ClosedLoop:
+    """The loop of a plant without feedthrough (u to y) and a controller (e to u), of one time."""
+    m, p, k = G.B.shape[1], len(G.C), len(K.A)
+    return ClosedLoop(
+        A=np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]]),
+        B_r=np.vstack([G.B @ K.D, K.B]),
+        B_d=np.vstack([G.B, np.zeros((k, m))]),
+        C_y=np.hstack([G.C, np.zeros((p, k))]),
+        C_u=np.hstack([-K.D @ G.C, K.C]),
+        D_u=K.D,
+        period=G.period,
+    )
+
+
+def sensitivity(L: np.ndarray) -> np.ndarray:
+    """(1 + L)⁻¹ (k, p, p) of an open loop L = GK (k, p, p)."""
+    return 1.0 / (1.0 + L) if L.shape[-1] == 1 else np.linalg.inv(np.eye(L.shape[-1]) + L)
+
+
+def equivalent_open_loop(L: np.ndarray, i: int) -> np.ndarray:
+    """1/S_ii - 1 (k,) of S = (1 + L)⁻¹: what channel i sees while the others are closed."""
+    return np.asarray(L[:, 0, 0] if L.shape[1] == 1 else 1.0 / sensitivity(L)[:, i, i] - 1.0)
+
+
+def sigma_max(response: np.ndarray) -> Array:
+    """σ_max (...) of matrices (..., p, m): the root of the largest eigenvalue of MMᴴ.
+
+    Squaring leaves it as exact as singular values are, in two thirds of their time.
+    """
+    if response.shape[-2:] == (1, 1):
+        return np.abs(response[..., 0, 0])
+    squared = response @ response.conj().swapaxes(-1, -2)
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(squared)[..., -1]))
+
+
+def responses_of(G: np.ndarray, K: np.ndarray) -> dict[str, np.ndarray]:
+    """S, KS, T and GS (k, ·, ·) by name, of G (k, p, m) and K (k, m, p)."""
+    S = sensitivity(G @ K)
+    return {"S": S, "KS": K @ S, "T": G @ K @ S, "GS": S @ G}

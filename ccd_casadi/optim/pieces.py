@@ -1,23 +1,49 @@
-"""Descent on a function that is the largest of smooth pieces, of which a point shows one alone.
+"""Steps for the largest of several smooth pieces within a box.
 
-    min t + ½ dᵀH d   s.t.  J_i + g_iᵀ(z + d - z_i) <= t,   λ + ∇λ d <= 0,
-                            |d| <= Δ,   0 <= z + d <= 1
-
-over the pieces that were met near the best point z: a bundle method with a trust region (Schramm
-and Zowe, 1992), whose slack t carries the goal. Where a step does not hold what the pieces promise
-the point that it led to shows one more. Pieces that would lie above J(z), as they do where J is not
-convex, are lowered to it. H learns from their combination Σ μ_i g_i, which is what is smooth of ∇J
-along a kink.
+Each piece is known by its value and gradient where it was met; a step solves the linear or
+quadratic model of the largest of them.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ccd_casadi.optim.quadratic import damped_bfgs
+from ccd_casadi.optim.kkt import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, best_step, minimise
 from ccd_casadi.support.arrays import Array
+
+
+class Box(NamedTuple):
+    """lower <= x <= upper, both (n,)."""
+
+    lower: Array
+    upper: Array
+
+    @property
+    def width(self) -> Array:
+        """Of its sides (n,)."""
+        return self.upper - self.lower
+
+    def shares(self, x: ArrayLike) -> Array:
+        """z of points x (…, n)."""
+        return np.asarray(np.subtract(x, self.lower) / self.width)
+
+    def point(self, z: Array) -> Array:
+        """x of points z (…, n), kept in the box against rounding."""
+        return np.clip(self.lower + self.width * z, self.lower, self.upper)
+
+    def away(self, x: ArrayLike, other: ArrayLike) -> Array:
+        """The largest component of x - other (…, n), in shares."""
+        return np.asarray(np.abs(np.subtract(x, other) / self.width).max(axis=-1))
+
+    def around(self, x: Array | Sequence[float], radius: float) -> "Box":
+        """The part of it within `radius` shares of x."""
+        half = radius * self.width
+        return Box(np.maximum(self.lower, x - half), np.minimum(self.upper, x + half))
+
 
 FIRST, LARGEST, LEAST = 1e-2, 0.2, 1e-10  # of the box: radii
 NEAR = 4.0  # radii from the best point within which a piece counts

@@ -21,7 +21,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from ccd_casadi.optim.quadratic import convex, solve_elastic
+from ccd_casadi.optim.kkt import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
 SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to the answer of a programme

@@ -1,9 +1,4 @@
-"""A plant whose function takes numbers only: its derivatives are differences, and it says so.
-
-At θ_i the derivative is that of the polynomial of degree 4 through five values spaced
-h = `STEP` of the box, which stay inside the box. The parabola through three of them, with twice
-the step, is the cross-check: their difference bounds the error from above.
-"""
+"""A plant with some parameters fixed, and a plant of numbers whose derivatives are differences."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,6 +11,7 @@ import numpy as np
 
 from ccd_casadi.plants.plant import (
     MATRICES,
+    Evaluate,
     Mechanics,
     ModelFunction,
     Plant,
@@ -23,10 +19,101 @@ from ccd_casadi.plants.plant import (
     model_parts,
     named_values,
 )
-from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.support.arrays import Array, VectorCallback
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import raised_words
+
+PLANTS_REMEMBERED = 64  # θ whose matrices are kept
+
+
+def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:
+    """The model as a function of the free parameters alone."""
+    if not fixed:
+        return model
+
+    def of_free(theta: Mapping[str, Any], **options: Any) -> Mapping[str, Any]:
+        return model({**theta, **fixed}, **options)
+
+    return of_free
+
+
+def with_fixed(
+    plant: Plant, fixed: Mapping[str, float], names: Sequence[str] | None = None
+) -> Plant:
+    """The plant as a function of the parameters that `fixed` does not name, in their order or that
+    of `names`.
+
+    >>> from ccd_casadi.plants.plant import build_plant, mechanics
+    >>> from ccd_casadi.plants.registry import two_mass
+    >>> both = build_plant(two_mass, ["m1", "m2"], {})
+    >>> one = with_fixed(both, {"m1": 60.0})
+    >>> one.names, mechanics(one, (50.0,)).M.diagonal().tolist()
+    (('m2',), [60.0, 50.0])
+    """
+    names = [name for name in plant.names if name not in fixed] if names is None else names
+    if tuple(names) == plant.names:
+        return plant
+    place = [plant.names.index(name) for name in names]
+    whole = np.array([fixed.get(name, np.nan) for name in plant.names])
+
+    def own(theta: Sequence[float]) -> tuple[float, ...]:
+        """The whole θ, in the plant's own order."""
+        out = whole.copy()
+        out[place] = theta
+        return tuple(out.tolist())
+
+    def of(evaluate: Evaluate) -> Evaluate:
+        def at(theta: Sequence[float]) -> Mechanics:
+            found = evaluate(own(theta))
+            if not len(found.derivatives[0]):  # values alone
+                return found
+            M, D, K, B, C = (array[place] for array in found.derivatives)
+            return replace(found, derivatives=(M, D, K, B, C))
+
+        return at
+
+    free, domain = ca.MX.sym("theta", len(place)), plant.domain
+    known: dict[str, Any] = {**fixed, **dict(zip(names, ca.vertsplit(free), strict=True))}
+    theta = ca.vertcat(*(known[name] for name in plant.names))
+    return reparametrised(
+        plant, of, own,
+        names=tuple(names),
+        hardware=ca.Function("hardware", [free], plant.hardware.call([theta])),
+        domain=None if domain is None else (domain[0][place], domain[1][place]),
+    )  # fmt: skip
+
+
+def reparametrised(
+    plant: Plant,
+    of: Callable[[Evaluate], Evaluate],
+    own: Callable[[Sequence[float]], tuple[float, ...]],
+    **others: Any,
+) -> Plant:
+    """The plant as a function of another θ: `own` makes its own of that, `of` wraps what evaluates.
+
+    `others`: fields that are given as they are, of the new θ.
+    """
+    shapes, drawing, nearby = plant.shapes, plant.drawing, plant.nearby
+    seen: dict[str, Any] = {
+        "evaluate": of(plant.evaluate),
+        "references": {name: of(closer) for name, closer in plant.references.items()},
+        "values": plant.values and of(plant.values),
+        "nearby": nearby and (lambda known: of(nearby([own(theta) for theta in known]))),
+        "notes": lambda theta: plant.notes(own(theta)),
+        "doubt": lambda theta: plant.doubt(own(theta)),
+        "shapes": shapes and (lambda theta, count: shapes(own(theta), count)),
+        "drawing": drawing and (lambda thetas: drawing({k: own(v) for k, v in thetas.items()})),
+    }
+    return replace(plant, **(seen | others))
+
+
+def remembered(
+    mechanics: Callable[[tuple[float, ...], bool], Mechanics], derivatives: bool = True
+) -> Evaluate:
+    """θ -> `mechanics(θ, derivatives)`, of which the last ones are kept."""
+    kept = lru_cache(maxsize=PLANTS_REMEMBERED)(mechanics)
+    return lambda theta: kept(tuple(map(float, theta)), derivatives)
+
 
 STEP = 1e-3  # share of the box: h⁴ is 1e-12, rounding is magnified a thousandfold
 REMEMBERED = 256  # values of the function kept: matrices and hardware cost ask for the same θ

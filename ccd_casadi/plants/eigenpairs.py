@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.threads import OwnThreads
+from ccd_casadi.support.worker_process import OwnThreads
 
 TOGETHER = 4  # columns solved at once: of two to five each takes half as long, of more twice
 BLOCK = 3  # vectors that modes are searched with

@@ -17,7 +17,7 @@ import numpy as np
 from ccd_casadi.kernels.frequency import prepare, responses
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.plants.response_table import PLACES, least_phase, read_table
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25

@@ -15,16 +15,22 @@ import numpy as np
 import scipy
 
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
-from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
-from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
-from ccd_casadi.plants.axes import at_reference, followed_modes, in_axes
-from ccd_casadi.plants.fixed import reparametrised
-from ccd_casadi.plants.nodes import NodeInterpolation, Position, Positions, names_in
+from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE, ModeShape, ModeShapes
+from ccd_casadi.plants.differenced import reparametrised
+from ccd_casadi.plants.nodes import (
+    NodeInterpolation,
+    Position,
+    Positions,
+    at_reference,
+    followed_modes,
+    in_axes,
+    names_in,
+)
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.rigid_modes import natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 ABSENT = 1e-12  # presence of an actuator that is not there: a root has a slope
 

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.drawing.content import Figure
-from ccd_casadi.drawing.pictures import ModeShapes
+from ccd_casadi.drawing.svg import ModeShapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.user_code import raised_in_user_code
@@ -146,7 +146,7 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
 
     Examples
     --------
-    >>> from ccd_casadi.plants.two_mass import two_mass
+    >>> from ccd_casadi.plants.registry import two_mass
     >>> plant = build_plant(two_mass, ["m1", "m2"], {"zeta": 0.01})
     >>> mechanics(plant, (60.0, 50.0)).M.diagonal().tolist(), hardware_cost(plant, (60.0, 50.0))
     ([60.0, 50.0], 110.0)

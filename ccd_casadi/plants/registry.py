@@ -1,17 +1,40 @@
-"""The plants that a case file may name: the package's, and those of installed packages.
+"""The plants that a case file may name: case study 1, and those of installed packages."""
 
-A package offers a plant of its own as an entry point of the group "ccd_casadi.plants", as
-`case_studies` does the rib stage: a `Model`, or its builder alone.
-"""
-
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from ccd_casadi.plants.plant import Plant
-from ccd_casadi.plants.two_mass import two_mass_plant
+import casadi as ca
+
+from ccd_casadi.plants.plant import Plant, build_plant
+
+
+def two_mass(theta: Mapping[str, Any], zeta: float = 0.01) -> dict[str, Any]:
+    """The paper's two-mass system, k = 2 m1⁴ + 2 m2⁴, force and sensor on m1 (equation (14)).
+
+    θ: m1, m2 in kg; u in N, y in m. The damper b = 2 ζ √(k μ), μ = m1 m2/(m1 + m2), keeps the
+    damping ratio of the flexible mode at `zeta`. Hardware cost: m1 + m2 in kg.
+    """
+    m1, m2 = theta["m1"], theta["m2"]
+    k = 2 * m1**4 + 2 * m2**4
+    b = 2 * zeta * ca.sqrt(k * m1 * m2 / (m1 + m2))
+    spring = ca.DM([[1, -1], [-1, 1]])
+    return {
+        "mass": ca.diag(ca.vertcat(m1, m2)),
+        "damping": b * spring,
+        "stiffness": k * spring,
+        "input": ca.DM([1, 0]),
+        "output": ca.DM([[1, 0]]),
+        "hardware_cost": m1 + m2,
+    }
+
+
+def two_mass_plant(names: Sequence[str], zeta: float = 0.01) -> Plant:
+    """The plant of `two_mass`, θ in the order of `names`."""
+    return build_plant(two_mass, names, {"zeta": zeta})
+
 
 GROUP = "ccd_casadi.plants"
 

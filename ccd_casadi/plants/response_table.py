@@ -15,8 +15,8 @@ import scipy
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
-from ccd_casadi.support.mat_files import mat_variables
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.json_files import mat_variables
+from ccd_casadi.support.text import HZ
 
 NAMES = {
     "f": "f", "freq": "f", "frequency": "f",

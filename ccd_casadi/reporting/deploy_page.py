@@ -6,25 +6,29 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment.files import Root, sections_of
 from ccd_casadi.deployment.on_hardware import OnHardware
-from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
-from ccd_casadi.deployment.sections import Root, sections_of
+from ccd_casadi.deployment.outcome import (
+    ChannelOrders,
+    Deployment,
+    figure_rows,
+    order_words,
+    reason_words,
+    short_status,
+)
 from ccd_casadi.deployment.source_code import COMPILE
-from ccd_casadi.deployment.words import figure_rows, order_words, reason_words, short_status
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
-from ccd_casadi.lti.closed_loop import sensitivity, sigma_max
-from ccd_casadi.lti.grid import frequency_grid
-from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling
+from ccd_casadi.lti.state_space import frequency_grid, sensitivity, sigma_max
 from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number, spoken, with_unit
+from ccd_casadi.support.text import HZ, number, spoken, with_unit
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for

@@ -9,18 +9,18 @@ import numpy as np
 from jinja2 import UndefinedError
 
 from ccd_casadi.drawing.content import Fact, Table
-from ccd_casadi.inner_problem.figure import BANDWIDTH, FIGURES
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, FIGURES
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_slopes
-from ccd_casadi.support.package_text import template
 from ccd_casadi.support.terminal import plain
-from ccd_casadi.support.units import (
+from ccd_casadi.support.text import (
     HZ,
     counted,
     display_unit,
     number,
     small_share,
     spoken,
+    template,
     with_unit,
 )
 

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
+from ccd_casadi.codesign.insight import Front, bandwidth_of, natural_hz
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
@@ -21,12 +20,12 @@ from ccd_casadi.reporting.facts import (
     theta_axes,
     theta_words,
 )
-from ccd_casadi.reporting.glance import machine
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
+from ccd_casadi.reporting.machine import machine
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, display_unit, number, spoken
+from ccd_casadi.support.text import HZ, display_unit, number, spoken
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 MOST = 12  # designs along the front that are drawn

@@ -1,14 +1,37 @@
-"""What limits the bandwidth at a design: S, effort or T, and the resonance and zero next to it.
+"""Chapters of a report: what limits the bandwidth, the error budget, and what the co-design
+changed."""
 
-A mixed-sensitivity design at γ has |W_S S|² + |W_KS KS|² + |W_T T|² of about γ² wherever it is
-pressed; the largest of the three shares at a frequency is what holds it there.
-"""
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.drawing.content import Block, Table, Words
-from ccd_casadi.reporting.facts import paragraphs
+from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
+from ccd_casadi.budget import BudgetFigures
+from ccd_casadi.drawing.content import (
+    Block,
+    Chapter,
+    Curve,
+    Figure,
+    Level,
+    Lines,
+    Panel,
+    Table,
+    Words,
+)
+from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY
+from ccd_casadi.inner_problem.kinds import LoopBudget, loop_budget
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
+from ccd_casadi.lti.state_space import StateSpace, sigma_max
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.reporting.facts import paragraph, paragraphs, theta_axes
+from ccd_casadi.reporting.loops import gain_panels, over_hz, synthesised_loop, view_of
+from ccd_casadi.support.text import HZ, display_unit, spoken
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+
 
 PARTS = ("|S|", "|KS|", "|T|")
 
@@ -57,3 +80,128 @@ def limit_sentences(loop: LoopView) -> list[str]:
 def limit_blocks(loop: LoopView, *more: str) -> tuple[Block, ...]:
     """The sentences, `more` of them, and the table."""
     return (*map(Words, (*limit_sentences(loop), *more)), table_limits(loop))
+
+
+SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
+DECADES = 3.5  # of the error's axis
+
+
+def budget_chapter(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> list[Chapter]:
+    """Nothing for a problem without a budget."""
+    found = loop_budget(problem, theta, controller)
+    if found is None:
+        return []
+    if found.model is None:
+        words = "The loop with the model is not stable: it has no stationary error."
+        return [Chapter("Error budget", (Words(words),))]
+    return [Chapter("Error budget", (*_budget_table(found, found.model), _figure(found.model)))]
+
+
+def _budget_table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
+    windowed = model.window is not None
+    unit, scale = display_unit(spoken("m"), model.error)
+    head = ["source", "enters as", f"RMS error ({unit})", "of the variance (%)"]
+    head += [f"MA ({unit})", f"MSD ({unit})"] if windowed else []
+    head += ["RMS force (N)"]
+    rows = []
+    for item in model.sources:
+        share = 100.0 * (item.error / model.error) ** 2 if model.error > 0.0 else 0.0
+        moving = (scale * item.average, scale * item.deviation) if windowed else ()
+        kind = item.source.kind.value.replace("_", " ")
+        rows.append((item.source.name, kind, scale * item.error, share, *moving, item.force))
+    moving = (scale * model.average, scale * model.deviation) if windowed else ()
+    rows.append(("together", "", scale * model.error, 100.0, *moving, model.force))
+    words = paragraph("report.budget_table", found, model)
+    return Words(words), Table(tuple(head), tuple(rows))
+
+
+def _figure(model: BudgetFigures) -> Figure:
+    shown = [item for item in model.sources if item.cumulative[-1] > 0.0]
+    hz = np.unique(np.concatenate([item.hz for item in shown]))
+    parts = [np.interp(hz, item.hz, item.cumulative, left=0.0) for item in shown]
+    whole = np.sum(parts, axis=0)
+    low = float(hz[np.searchsorted(whole, SHOWN**2 * whole[-1])])
+    high = float(hz[min(np.searchsorted(whole, (1.0 - 1e-6) * whole[-1]), len(hz) - 1)])
+    x = (low, max(2.0 * high, 10.0 * low))
+    unit, scale = display_unit(spoken("m"), model.error)
+    curves = [
+        Curve(hz, scale * np.sqrt(part), item.source.name, CYCLE[i % (len(CYCLE) - 1)],
+              "-" if i < len(CYCLE) - 1 else "--")
+        for i, (item, part) in enumerate(zip(shown, parts, strict=True))
+    ]  # fmt: skip
+    total = Curve(hz, scale * np.sqrt(whole), "together", BLACK, width=1.8)
+    top = scale * float(np.sqrt(whole[-1]))
+    panel = Panel("frequency (Hz)", f"RMS error up to it ({unit})", (*curves, total), log_x=True,
+                  log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top))  # fmt: skip
+    lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
+    return Figure(lines, paragraph("report.budget"))
+
+
+HEADING = "Start against optimum"
+SAME = 1e-6  # of the box: an optimum this close to the start is the start
+HEIGHTS = (3.0, 3.0)  # inches
+
+
+def start_chapter(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[Chapter]:
+    """Both as figures, poles and a table; nothing where the run did not leave its start.
+
+    At the start the true inner problem is solved, so that each hardware has its best controller.
+    """
+    width = np.subtract(problem.upper, problem.lower)
+    if (np.abs(np.subtract(verified.theta, problem.start)) <= SAME * width).all():
+        return []
+    found = true_inner(problem, problem.start)
+    if found.optimum is None:
+        words = f"The hardware that the run began with has no feasible loop: {found.shortfall}."
+        return [Chapter(HEADING, (Words(words),))]
+    f = found.optimum.figures
+    start = synthesised_loop(problem, problem.start, f.omega_S, f.omega_T, "start")
+    loops = (start, replace(view_of(verified), label="optimum"))
+    thetas = (problem.start, verified.theta)
+    costs = [hardware_cost(plant_of(problem), theta) for theta in thetas]
+    poles = [_roots(loop) for loop in loops]
+    lines = Lines(_panels(loops[::-1]), HEADING, HEIGHTS)
+    least = [float(damping.min()) for _, damping in poles]
+    gained = 100.0 * (loops[1].bandwidth_hz / start.bandwidth_hz - 1.0)
+    spared = 100.0 * (costs[1] / costs[0] - 1.0) if costs[0] else None
+    words = paragraph("report.start", gained, spared, least)
+    beside = _start_table(problem, thetas, loops, costs)
+    return [Chapter(HEADING, (Figure(lines, words), beside))]
+
+
+def _roots(loop: LoopView) -> tuple[np.ndarray, np.ndarray]:
+    """|p| in Hz and -Re p/|p| of the loop's poles, a conjugate pair once, in rising order."""
+    return frequency_and_damping(loop.loop.poles / HZ)
+
+
+def _panels(loops: Sequence[LoopView]) -> tuple[tuple[Panel, ...], ...]:
+    """S over the plants and the poles of the loops."""
+    coloured = list(zip(loops, CYCLE, strict=False))
+    G = [Curve(v.hz, sigma_max(v.plant), v.label, colour) for v, colour in coloured]
+    poles = tuple(Curve(*_roots(v), v.label, colour, "", "x") for v, colour in coloured)
+    pole_map = Panel(
+        "|pole| (Hz)", "damping ratio of the loop's poles (–)", poles, log_x=True, legend=None,
+        levels=(Level(0.0, "unstable below", colour=GREY),), y_range=(-0.1, 1.1),
+    )  # fmt: skip
+    S = gain_panels(loops, bounds=False)[0]
+    return (S,), (over_hz(spoken(f"{loops[0].named('G')} (m/N)"), G, loops[0].ends), pole_map)
+
+
+def _start_table(
+    problem: CoDesignProblem, thetas: Sequence[Sequence[float]], loops: Sequence[LoopView],
+    costs: Sequence[float],
+) -> Table:  # fmt: skip
+    hz = [loop.bandwidth_hz for loop in loops]
+    J = [problem.w1 * f + problem.w2 * HZ * v for f, v in zip(costs, hz, strict=True)]
+    first = [min(loop.resonances_hz, default=np.nan) for loop in loops]
+    rows = [
+        (name, unit or "–", *(factor * theta[i] for theta in thetas))
+        for i, (name, unit, factor) in enumerate(theta_axes(problem))
+    ]
+    rows += [
+        ("hardware cost f", problem.cost_unit or "–", *costs), ("first resonance", "Hz", *first),
+        ("bandwidth ω_b", "Hz", *hz), ("objective J", "–", *J),
+    ]  # fmt: skip
+    return Table(("", "unit", "start", "optimum"), tuple(rows))

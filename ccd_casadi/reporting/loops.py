@@ -10,11 +10,11 @@ from ccd_casadi.analysis.loop_view import NAMES, LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, Mark, Panel
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY, ORANGE
-from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, display_unit, number, spoken, with_unit
+from ccd_casadi.support.text import HZ, display_unit, number, spoken, with_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:

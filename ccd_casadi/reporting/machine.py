@@ -1,23 +1,25 @@
-"""The machine as a picture: masses and springs, or its modes; and the shapes of its modes to turn.
+"""The machine as a picture, and what an engineer looks at first."""
 
-Pictures are inline SVG of their own, without a script. Words in them take the page's colour.
-"""
-
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.drawing import svg
-from ccd_casadi.drawing.content import Figure, Modes, Picture, Table
-from ccd_casadi.drawing.pictures import ModeShapes
-from ccd_casadi.drawing.turntable import REACH
+from ccd_casadi.drawing.content import Chapter, Figure, Lines, Modes, Picture, Place, Table
+from ccd_casadi.drawing.paint import tables_of
+from ccd_casadi.drawing.surface import REACH
+from ccd_casadi.drawing.svg import ModeShapes
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import modes_of
-from ccd_casadi.plants.modal import ModalPlant
-from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.modal import ModalPlant, modal_plant
+from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.reporting.facts import paragraph
+from ccd_casadi.reporting.loops import S_panel
+from ccd_casadi.reporting.nyquist import loci_of, nyquist_panel
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.package_text import template
-from ccd_casadi.support.units import HZ, number, spoken
+from ccd_casadi.support.text import HZ, number, spoken, template
 
 # in a page's own theme, where it has one
 BLUE, GREEN, ORANGE = (
@@ -130,3 +132,43 @@ def table_modes(shapes: ModeShapes) -> Table:
         for mode in shapes.modes
     ]  # fmt: skip
     return Table((*head, *shapes.modes[0].more), tuple(rows))
+
+
+HEIGHT = 3.0  # inches of a row
+
+
+def glance(
+    problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: Figure
+) -> Chapter:
+    """Of a design on the plants that it is made for."""
+    assert isinstance(move.drawing, Lines)
+    S_max = problem.inner.S_max
+    names = ("an eigenvalue of L", "the others")
+    if view.scalar:
+        names = ("the model", "plant 2 (and the others)")
+    rows: tuple[tuple[Place, ...], ...] = (
+        (machine(problem, theta), S_panel(view)),
+        (
+            nyquist_panel(view.hz, loci(view), problem.inner.S_max, HEIGHT, names),
+            move.drawing.rows[-2][0],
+        ),
+    )
+    peak = float(view.sizes[0].max())
+    table = isinstance(rows[0][0], Table)
+    words = paragraph("report.glance", view, peak, S_max, move.caption, table)
+    lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
+    return Chapter("At a glance", (Figure(lines, words, (*tables_of(lines), move.tables[0])),))
+
+
+def loci(view: LoopView) -> list[np.ndarray]:
+    """L of one channel on every plant, of several its eigenvalues on the model."""
+    return [line for L in view.open for line in loci_of(L).T]
+
+
+def machine(problem: CoDesignProblem, theta: Sequence[float]) -> Modes | Picture | Table:
+    """Masses and springs with their modes, the first modes of a surface, or a table of modes."""
+    plant = plant_of(problem)
+    if plant.shapes is not None:
+        return Modes(plant.shapes(theta, SHOWN_MODES))
+    system = mechanics(plant, theta)
+    return lumped_machine(system, modal_plant(system, problem.suspension.free))

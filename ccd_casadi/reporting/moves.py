@@ -8,23 +8,22 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.analysis.motor import UNLIMITED, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
-from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.setpoint import UNLIMITED, cycle_of, setpoint
 from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.numbers import tables_of
+from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, free_modal, plant_of
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
 from ccd_casadi.reporting.loops import of_plants
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, display_unit, spoken, with_unit
+from ccd_casadi.support.text import HZ, display_unit, spoken, with_unit
 
 POINTS = 600
 STEPS = 200  # points of a force step

@@ -23,8 +23,7 @@ from ccd_casadi.reporting.facts import conclusion, facts, theta_axes, theta_tabl
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
-from ccd_casadi.support.package_text import template
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.text import HZ, number, template
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 

@@ -27,7 +27,7 @@ from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number, spoken, with_unit
+from ccd_casadi.support.text import HZ, number, spoken, with_unit
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned

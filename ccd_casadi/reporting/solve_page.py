@@ -12,43 +12,41 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_structured import VerifiedStructured
-from ccd_casadi.deployment.channels import scalar_channels
+from ccd_casadi.deployment.realisation import scalar_channels
 from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.reporting.bode import bode
-from ccd_casadi.reporting.budget_chapter import budget_chapter
 from ccd_casadi.reporting.facts import binding, conclusion, facts, run_name, theta_table
-from ccd_casadi.reporting.glance import glance
-from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.landscape import (
     Truths,
     bandwidth_process,
     caption_disagreement,
     caption_landscape,
+    history_blocks,
     landscape_data,
     read_truths,
     slices_figure,
+    table_trust,
+    trust_figure,
 )
-from ccd_casadi.reporting.limits import limit_blocks
+from ccd_casadi.reporting.limits import budget_chapter, limit_blocks, start_chapter
 from ccd_casadi.reporting.loops import gains, run_view, view_of
-from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
+from ccd_casadi.reporting.machine import SHOWN, glance, mode_shape_figure
 from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_figure
-from ccd_casadi.reporting.prediction import history_blocks, table_trust, trust_figure
-from ccd_casadi.reporting.start import start_chapter
+from ccd_casadi.reporting.nyquist import bode
 from ccd_casadi.reporting.structured_page import (
     bandwidths_table,
     binding_words,
     controller_blocks,
     limits_blocks,
 )
-from ccd_casadi.reporting.verdict import run_head
+from ccd_casadi.reporting.verdict import publish, run_head
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import Progress
 
 if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.verified import Solution

@@ -1,11 +1,4 @@
-"""Gain, phase and disk margins: every loop alone, and all of them at once.
-
-With L_i = 1/S_ii - 1, the loop that channel i sees while the others are closed, the symmetric disk
-margin is α = 1/max|S_ii - 1/2|: the loop is stable for every factor inside the disk through
-(2 - α)/(2 + α) and its inverse, that is for any gain in between or any phase up to 2 arctan(α/2).
-All loops at once: 1/α is the structured singular value of S - I/2 (diagonal, complex), bounded
-from above (`mu_bound`), so that α is a lower bound. (Seiler, Packard and Gahinet 2020.)
-"""
+"""Margins of a loop, and its signals under noise."""
 
 import math
 from collections.abc import Callable
@@ -15,11 +8,81 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.lti.closed_loop import equivalent_open_loop, sensitivity
-from ccd_casadi.robust.mu_bound import mu_bound
+from ccd_casadi.budget.evaluation import Lyapunov
+from ccd_casadi.budget.loops import process
+from ccd_casadi.budget.sources import Kind, ShapedSpectrum, Source
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import (
+    ClosedLoop,
+    equivalent_open_loop,
+    refine_peak,
+    responses_of,
+    sensitivity,
+    sigma_max,
+)
+from ccd_casadi.robust.structured_singular_value import mu_bound
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import PlantAndController, classical_margins
+from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis.closed_loop import PlantAndController, classical_margins
+
+REST = 1e-3  # of the lowest frequency of a grid: what counts as constant
+
+
+@dataclass(frozen=True)
+class Noise:
+    """RMS of every output and every input under given densities; inf where they are not finite."""
+
+    position_by_noise: Array
+    force_by_noise: Array
+    position_by_disturbance: Array
+    force_by_disturbance: Array
+
+
+def gains(G: NDArray, K: NDArray) -> Array:
+    """σ_max of S, T, GS (disturbance force to position) and KS (noise to force), rows (4, k)."""
+    found = responses_of(G, K)
+    return np.array([sigma_max(found[name]) for name in ("S", "T", "GS", "KS")])
+
+
+def norms(loop: ClosedLoop) -> tuple[tuple[float, float], ...]:
+    """‖·‖∞ of S, T, GS and KS, each with its frequency in rad/s (0: at rest), without a grid."""
+    return tuple(hinf_norm(part) for part in (loop.S, loop.T, loop.GS, loop.KS))
+
+
+def highest(gain: Callable[[Array], Array], omega: Array) -> tuple[tuple[float, float], ...]:
+    """The largest value of each row of gains (r, k), climbed from a grid in rad/s, and its ω.
+
+    Of a loop in discrete time, from far below the grid (a constant signal) to its end.
+    """
+    omega = np.concatenate([REST * omega[:1], omega])
+    values, found = gain(omega), []
+    for row, i in enumerate(values.argmax(axis=1)):
+        ends = omega[max(i - 1, 0)], omega[min(i + 1, len(omega) - 1)]
+        top = refine_peak(partial(_of_row, gain, row), *ends)
+        tops = (float(values[row, i]), 0.0 if i == 0 else float(omega[i]))
+        found.append(max(tops, top[::-1]) if i else tops)
+    return tuple(found)
+
+
+def _of_row(gain: Callable[[Array], Array], row: int, omega: float) -> float:
+    return float(gain(np.array([omega]))[row, 0])
+
+
+def noise(loop: Loop, sensor: float, disturbance: float) -> Noise:
+    """RMS values for white sensor noise (m/√Hz) and white force at every input (N/√Hz).
+
+    They are those of an error budget of both sources: of a sampled loop at its instants.
+    """
+    found = []
+    for kind, density in ((Kind.SENSOR_NOISE, sensor), (Kind.FORCE, disturbance)):
+        of = process(loop, Source(kind.value, kind, ShapedSpectrum(density**2))).balanced()
+        P = Lyapunov(of.A, sampled=of.sampled).covariance(of.noise)
+        position, force = (np.einsum("ij,jk,ik->i", C, P, C) for C in (of.C, of.F))
+        force = np.full_like(force, np.inf) if of.infinite_force else force + (of.V**2).sum(1)
+        found += [np.sqrt(np.maximum(position, 0.0)), np.sqrt(np.maximum(force, 0.0))]
+    return Noise(*found)
+
 
 FINE = 61  # points between the neighbours of the least disk margin found
 

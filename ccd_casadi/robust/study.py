@@ -15,24 +15,33 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.robust.demands import Demands
-from ccd_casadi.robust.hardware import Tolerances, tolerances
-from ccd_casadi.robust.margins import DiskMargin, Margins, margins
+from ccd_casadi.robust.margins import (
+    DiskMargin,
+    Margins,
+    Noise,
+    gains,
+    highest,
+    margins,
+    noise,
+    norms,
+)
 from ccd_casadi.robust.perturbed import (
     Line,
     PerturbedLoop,
+    Tolerances,
     damping_line,
     shift_line,
     single_modes,
+    tolerances,
     worst_in_box,
 )
-from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
-from ccd_casadi.robust.structured import StructuredBound, structured_bound
+from ccd_casadi.robust.structured_singular_value import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import kept_quiet
-from ccd_casadi.support.threads import one_blas_thread
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.statics import Statics, statics
+from ccd_casadi.support.text import HZ
+from ccd_casadi.support.worker_process import one_blas_thread
+from ccd_casadi.synthesis.synthesis import Statics, statics
 
 NYQUIST = 0.999  # of half the sampling rate: where a grid ends
 

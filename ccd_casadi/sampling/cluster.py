@@ -20,8 +20,7 @@ from typing import Any, Self
 from ccd_casadi.inner_problem.problem import NUMERICS
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool, Workers
-from ccd_casadi.support.threads import one_blas_thread
-from ccd_casadi.support.worker_process import R, T, WorkerLost, answer_message
+from ccd_casadi.support.worker_process import R, T, WorkerLost, answer_message, one_blas_thread
 
 CONNECT_SECONDS = 10.0  # for the scheduler to answer at first, and for a worker to be there
 CLOSE_SECONDS = 1.0  # for a farewell that nobody needs: Ctrl-C ends within 2 s

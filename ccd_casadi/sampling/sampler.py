@@ -12,26 +12,35 @@ from typing import TypeVar
 
 import numpy as np
 
-from ccd_casadi.inner_problem.objective import objective, violated
+from ccd_casadi.inner_problem.objective import TrueQuantities, objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.sampling.neighbours import from_controller, from_neighbour, promising_starts
-from ccd_casadi.sampling.rows import Sample, best_key, hashes_of, problem_hash, sample_key
 from ccd_casadi.sampling.samples import (
     InnerSample,
     QuantitySample,
+    SynthesisCounts,
     inner_sample,
     quantity_sample,
     sample_of,
 )
-from ccd_casadi.sampling.spent import SynthesisCounts
-from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.sampling.units import design_unit, inner_unit
+from ccd_casadi.sampling.store import (
+    Sample,
+    SampleStore,
+    best_key,
+    hashes_of,
+    problem_hash,
+    sample_key,
+)
+from ccd_casadi.sampling.units import (
+    design_unit,
+    from_controller,
+    from_neighbour,
+    inner_unit,
+    promising_starts,
+)
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import remark
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.terminal import Progress, remark
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
 T = TypeVar("T")

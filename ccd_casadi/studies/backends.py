@@ -25,8 +25,8 @@ import numpy as np
 import slycot
 
 from ccd_casadi.kernels.design import FREED
-from ccd_casadi.kernels.disturbance import four_block_plant
 from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.kernels.synthesis import four_block_plant
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -7,21 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, axis_label
-from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.landscape import bandwidth_process, landscape_data, read_truths
 from ccd_casadi.reporting.loops import figure_gains
 from ccd_casadi.reporting.solve_page import stage_chapters
 from ccd_casadi.reporting.verdict import lines_of, worst_state
-from ccd_casadi.studies.baselines import baseline_of
-from ccd_casadi.studies.comparison import Comparison, Method
-from ccd_casadi.studies.conclusions import LABELS, stable_words
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.studies.comparison import LABELS, Comparison, Method, stable_words
+from ccd_casadi.studies.steepest_descent import baseline_of
+from ccd_casadi.support.text import HZ, number
 
 
 def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> c.Page:

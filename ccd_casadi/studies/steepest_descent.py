@@ -1,34 +1,213 @@
-"""The paper's own method: nested steepest descent on a swept inner problem, the baseline.
+"""The paper's own method: nested steepest descent on a swept inner problem, for each kind of
+controller."""
 
-The sweep is that of `baselines`. The gradient of J is the paper's equation (10),
-
-    ∂J/∂θ = w1 ∂f/∂θ + w2 ∂ω_b/∂θ,
-    ∂ω_b/∂θ = -(∂‖S‖₂/∂θ)/(∂‖S‖₂/∂ω_b)             (11, implicit functions)
-    ∂‖S‖₂/∂p = Re(u1* ∂S/∂p v1)                     (12, 13: singular vectors)
-    ∂S/∂θ = -(I+GK)⁻¹ (∂G/∂θ) K (I+GK)⁻¹            (14: K held fixed)
-    ∂S/∂ω_b = -(I+GK)⁻¹ (G'K + GK') (I+GK)⁻¹        (15)
-
-as `derivatives.Sensitivities.fixed_controller` gives it. The variant "total" has K move with θ.
-
-What the paper leaves open, and what is done here: θ is scaled to the unit box; a step goes along
--∇J/‖∇J‖∞ with length α, projected on the bounds; α is halved when the step does not improve J,
-and the descent ends when α falls under `smallest_step` of the box, when the projected gradient
-vanishes, or after `max_iterations`. The synthesis, its certificate, S_max and the case are ours.
-
-With a controller of fixed structure nothing is swept: ω_b*(θ) is that of the problem's warm starts,
-and its envelope gradient the only one there is.
-"""
-
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from ccd_casadi.inner_problem.objective import hardware_at, objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.studies.baselines import AnyDesign, Gradient, baseline_of
+from ccd_casadi.cases.case import Case, load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.result_entries import active_of, box_words, design_dict, figures_dict
+from ccd_casadi.codesign.robust_check import survived
+from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.verdict import VerdictLine, survives
+from ccd_casadi.codesign.verified_mixed import robust_words
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.objective import final_design, hardware_at, objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design
+from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
+from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
+from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
+
+LOCAL_POINTS = (7, 7)
+LOCAL_FACTOR = 1.25  # the small range reaches from ω/1.25 to 1.25 ω
+STATUS = {True: "verified", False: "not_verified"}
+AnyDesign = Any  # Sensitivities or SectionsDesign: what a baseline gives and takes back
+
+
+class Gradient(StrEnum):
+    """Which dω_b/dθ the descent follows."""
+
+    FIXED = "fixed"
+    TOTAL = "total"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The best design at a θ: ω_b (rad/s), what J counts, that one's slope, (ω_S, ω_T) or NaN."""
+
+    design: AnyDesign
+    bandwidth: float
+    value: float
+    slope: Array
+    frequencies: tuple[float, float] = (np.nan, np.nan)
+
+
+class Baseline(ABC):
+    """One kind of controller, for a problem; `swept` over weights' frequencies."""
+
+    gradients: tuple[Gradient, ...]
+    swept: bool
+
+    def __init__(self, problem: CoDesignProblem) -> None:
+        self.problem = problem
+
+    @abstractmethod
+    def answer(
+        self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
+    ) -> tuple[Answer | None, int]:
+        """The best design at θ, near (ω_S, ω_T) where these are given, and the syntheses spent."""
+
+    @abstractmethod
+    def design_of(self, sample: InnerSample) -> AnyDesign:
+        """The design of a sample of ω_b*(θ)."""
+
+    @abstractmethod
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> dict[str, Any]:
+        """A design under the contract's keys, with its status and what is active."""
+
+    @abstractmethod
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
+    ) -> tuple[StateSpace, VerdictLine]:
+        """Its controller (SI), and what that survives: the line of the verdict of a run."""
+
+
+class MixedBaseline(Baseline):
+    """The paper's own: a sweep of (ω_S, ω_T)."""
+
+    gradients = tuple(Gradient)
+    swept = True
+
+    def answer(
+        self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
+    ) -> tuple[Answer | None, int]:
+        design, spent = _sweep(self.problem, theta, around)
+        if design is None:
+            return None, spent
+        figures = design.figures
+        slope = design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
+        omega, at = figures.bandwidth, (figures.omega_S, figures.omega_T)
+        return Answer(design, omega, omega, np.asarray(slope, float), at), spent
+
+    def design_of(self, sample: InnerSample) -> Sensitivities:
+        return true_design(self.problem, sample.theta, sample.omega_S, sample.omega_T)
+
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> dict[str, Any]:
+        found, inner = design.figures, self.problem.inner
+        active = list(active_constraints(inner, found))
+        return figures_dict(found) | {"status": STATUS[inner.feasible(found)], "active": active}
+
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
+    ) -> tuple[StateSpace, VerdictLine]:
+        at = (design.figures.omega_S, design.figures.omega_T)
+        K = final_design(self.problem, theta, at).controller
+        found, robust = survived(self.problem, loops_of(self.problem, theta, K), design.figures)
+        own = {} if robust is None else robust_words(robust)
+        return K, survives(found, S_max=self.problem.inner.S_max, **own)
+
+
+class StructuredBaseline(Baseline):
+    """Climbs from the warm starts; climbs and multi-start searches are what it spends."""
+
+    gradients = (Gradient.TOTAL,)
+    swept = False
+
+    def answer(
+        self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
+    ) -> tuple[Answer | None, int]:
+        value = structured_value(self.problem, theta.tolist())
+        if not value.feasible:
+            return None, value.syntheses
+        slope = np.array(value.gradient)
+        return Answer(value.design, value.bandwidth, value.value, slope), value.syntheses
+
+    def design_of(self, sample: InnerSample) -> SectionsDesign:
+        return structured_value(self.problem, sample.theta).design
+
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> dict[str, Any]:
+        entries = design_dict(self.problem, theta, design)
+        return entries | {"status": STATUS[design.certified], "active": active_of(design)}
+
+    def judged(
+        self, theta: tuple[float, ...], design: AnyDesign, workers: Pool
+    ) -> tuple[StateSpace, VerdictLine]:
+        K, on_box = design.controller, DesignOnBox(self.problem, theta, design)
+        worst = on_box.worst()[0]
+        wide, checked, proof = on_box.judged(worst, workers)
+        found = survived(self.problem, loops_of(self.problem, theta, K), design)[0]
+        drawn = None if proof.conclusive else on_box.fresh_yield(workers)
+        along = found is not None and found.within(*kind_of(self.problem).common_shifts())
+        own = box_words(wide, checked, proof, worst, drawn, along=along)
+        return K, survives(found, S_max=self.problem.inner.S_max, **own)
+
+
+def case_to_compare(path: Path, command: str) -> tuple[Case, CoDesignProblem]:
+    """A case whose methods can be compared: it counts the bandwidth, and lists no values.
+
+    Raises UserError of one line that names the `command` where it is another.
+    """
+    case = load_case(path)
+    problem = problem_of(case)
+    require_bandwidth(problem, command)
+    for name, _ in problem.listed:
+        words = f"{command} needs a range; give fixed, as the case.toml of a finished solve does"
+        raise UserError(f"{path}: theta.{name}.values: {words}")
+    plant_of(problem)
+    return case, problem
+
+
+def baseline_of(problem: CoDesignProblem) -> Baseline:
+    """The baseline's inner problem."""
+    return BASELINES[type(problem.controller)](problem)
+
+
+BASELINES: dict[type[ControllerProblem], type[Baseline]] = {
+    MixedSensitivityProblem: MixedBaseline,
+    StructuredProblem: StructuredBaseline,
+}
+
+
+def _sweep(
+    problem: CoDesignProblem, theta: Array, around: tuple[float, float] | None
+) -> tuple[Sensitivities | None, int]:
+    """The best feasible design of a sweep, wide or small; and the syntheses that it took."""
+    inner = problem.inner
+    local = inner
+    if around is not None:
+        ranges = [
+            (max(low, centre / LOCAL_FACTOR), min(high, centre * LOCAL_FACTOR))
+            for (low, high), centre in zip((inner.omega_S, inner.omega_T), around, strict=True)
+        ]
+        local = replace(inner, omega_S=ranges[0], omega_T=ranges[1], sweep_points=LOCAL_POINTS)
+    plant = scaled_plant(problem, tuple(theta))
+    rows = sweep(plant, problem.weights, *local.axes(), **inner.synthesis_options)
+    feasible: list[DesignFigures] = [row for row in rows if inner.feasible(row)]
+    if not feasible:
+        if around is None:
+            return None, len(rows)
+        wide, used = _sweep(problem, theta, None)
+        return wide, used + len(rows)
+    best = max(feasible, key=lambda row: row.bandwidth)
+    # The derivative at the swept optimum is no new synthesis: the paper has K at hand too.
+    return evaluate(plant, problem.weights, inner, (best.omega_S, best.omega_T)), len(rows)
 
 
 class Stop(StrEnum):

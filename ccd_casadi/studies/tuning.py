@@ -20,19 +20,27 @@ from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.fixed_structure.measured_design import NEGATIVE, MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import bandwidth_within
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.kernels.limits import HALF_POWER
-from ccd_casadi.lti.closed_loop import closed_loop, sigma_max
-from ccd_casadi.lti.grid import FLANKS, frequency_grid, local_maxima, root_flanks, zoomed
-from ccd_casadi.lti.hold import Sampling, delay_parts, delayed, sampled, tustin
+from ccd_casadi.kernels.sections import HALF_POWER
+from ccd_casadi.lti.loop import Sampling, delay_parts, delayed, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.lti.state_space import (
+    FLANKS,
+    StateSpace,
+    balanced,
+    closed_loop,
+    frequency_grid,
+    local_maxima,
+    root_flanks,
+    sigma_max,
+    zoomed,
+)
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.plants.response_table import holds_lines
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
-from ccd_casadi.support.progress import Tell, silent
-from ccd_casadi.support.threads import one_blas_thread
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.terminal import Tell, silent
+from ccd_casadi.support.text import HZ
+from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis import interchange
 
 NOTCHES = 3  # at most, where none are asked for

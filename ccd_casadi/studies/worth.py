@@ -1,53 +1,146 @@
-"""What co-design gains over the sequential way, from a few true designs and their derivatives.
-
-Both designs are true and certified, so the gain is a lower bound without error. What a full solve
-may add is estimated by the surrogate v ~ N(m, s²) of what J counts: one more true design at θ is
-expected to gain (Jones, Schonlau and Welch 1998)
-
-    EI(θ) = E[max(J_best - J(θ), 0)] = |w2| s (z Φ(z) + φ(z)),
-    z = (J_best - w1 f(θ) - w2 m(θ)) / (|w2| s(θ)),
-
-and rounds of which each gains at most half of the last gain 2 max EI in all. Expected of a full
-solve are the cost f and bandwidth m ± δ/|w2| of designs with w1 f + w2 m <= J_best + δ,
-
-    δ = 2 max EI + |w2| |v(θ_n) - m(θ_n)|,   θ_n the surrogate's last optimum, where v is known.
-
-A structured controller is the best of climbs from what is known near by; at both ends a multi-start
-search asks whether there is a better one, which the samples around learn from then. A full solve
-may end in the next local optimum, and counts worse plants of the box: δ has both besides
-(`search_error`).
-
-No bound: a region without samples may be better.
-"""
+"""The sequential baseline, and what co-design gains over it, from a few true designs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from time import perf_counter, process_time
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from scipy.special import ndtr
 
 from ccd_casadi.cases.case import Case
+from ccd_casadi.codesign.joint_model import with_scenarios
 from ccd_casadi.codesign.nested import fit_bandwidth
-from ccd_casadi.codesign.outer_problem import OuterFailure, outer_program, solve_program
+from ccd_casadi.codesign.outer_problem import (
+    NonlinearProgram,
+    OuterFailure,
+    outer_program,
+    solve_program,
+)
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.codesign.working_set import with_scenarios
-from ccd_casadi.inner_problem.objective import MET, constraint_sizes, objective, objective_of
+from ccd_casadi.inner_problem.objective import (
+    MET,
+    constraint_sizes,
+    objective,
+    objective_of,
+    violated,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
-from ccd_casadi.studies.baselines import baseline_of
-from ccd_casadi.studies.sequential import design_hardware, first_resonance
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.studies.steepest_descent import baseline_of
+from ccd_casadi.support.arrays import Array, VectorCallback
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.process_pool import Pool, results
+from ccd_casadi.support.text import HZ, number
 from surrogates import design, to_casadi
+
+MOST_ROUNDS, AGREED, KNOWN = (
+    8,
+    1e-6,
+    3,
+)  # of a solve on what is known; relative in ω_1; θ that are known
+
+
+@dataclass(frozen=True)
+class HardwareDesign:
+    """The hardware that the rule of thumb gives; resonance in rad/s; `met` False: none meets it."""
+
+    theta: tuple[float, ...]
+    hardware_cost: float
+    first_resonance: float
+    met: bool
+
+
+def first_resonance(
+    problem: CoDesignProblem, theta: Array, evaluate: Evaluate | None = None
+) -> tuple[float, Array]:
+    """ω_1 of the first flexible mode, rad/s, and its gradient to θ; NaN where all is rigid."""
+    system = (evaluate or partial(mechanics, plant_of(problem)))(tuple(theta))
+    modal = modal_plant(system, problem.suspension.free)
+    flexible = np.flatnonzero(~modal.rigid)
+    if flexible.size == 0:
+        return np.nan, np.full(len(theta), np.nan)
+    i = int(flexible[0])
+    omega = float(modal.natural[i])
+    slope = modal.dK[:, i, i] - omega**2 * modal.dM[:, i, i]
+    return omega, slope / (2.0 * omega)
+
+
+def design_hardware(
+    problem: CoDesignProblem,
+    resonance: float,
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    workers: Pool | None = None,
+) -> HardwareDesign:
+    """The least hardware cost with ω_1 >= `resonance` (rad/s), by IPOPT.
+
+    From the case's start and `starts` more: with none, the local solution next to the start,
+    which need not be the least one (for the two masses it is the paper's equal-mass design).
+    """
+    points = [problem.start]
+    if starts > 0:
+        points += map(tuple, design("sobol", *box(problem), starts, seed).tolist())
+    tasks = {start: (problem, resonance, start) for start in points}
+    found = [design for _, design in sorted(results(workers, _from_start, tasks))]
+    nearest = max(found, key=lambda item: item.first_resonance)
+    meeting = (item for item in found if item.met)
+    return min(meeting, key=lambda item: item.hardware_cost, default=nearest)
+
+
+def _from_start(
+    problem: CoDesignProblem, resonance: float, start: tuple[float, ...]
+) -> HardwareDesign:
+    plant = plant_of(problem)
+    known: tuple[tuple[float, ...], ...] = (start,)
+    for _ in range(MOST_ROUNDS):
+        evaluate = None if plant.nearby is None else plant.nearby(known)
+        point, predicted = _least_cost(problem, resonance, known[-1], evaluate)
+        omega = predicted if evaluate is None else first_resonance(problem, point)[0]
+        theta = tuple(float(v) for v in point)
+        if abs(predicted / omega - 1.0) <= AGREED or np.isnan(omega):
+            break
+        known = (*known[1 - KNOWN :], theta)
+    met = bool(omega >= resonance * (1.0 - AGREED)) and not violated(problem, point)
+    return HardwareDesign(theta, hardware_cost(plant, point), omega, met)
+
+
+def _least_cost(
+    problem: CoDesignProblem, resonance: float, start: tuple[float, ...], evaluate: Evaluate | None
+) -> tuple[Array, float]:
+    """θ of the least cost near a start, and ω_1 there, by one way to evaluate the plant."""
+    plant = plant_of(problem)
+    theta = ca.MX.sym("theta", len(start))
+    cost, lam = plant.hardware(theta)
+    at = lru_cache(maxsize=None)(lambda point: first_resonance(problem, np.array(point), evaluate))
+    callback = VectorCallback(
+        "first_resonance", len(start), 1,
+        lambda x: np.array([np.log(at(tuple(x))[0] / resonance)]),
+        lambda x: at(tuple(x))[1][None] / at(tuple(x))[0],
+    )  # fmt: skip
+    program = NonlinearProgram(
+        x=theta,
+        f=cost / (abs(hardware_cost(plant, start)) or 1.0),
+        g=ca.vertcat(-callback(theta), lam / ca.DM(constraint_sizes(problem))),
+        box=box(problem),
+        exact_hessian=False,
+    )
+    try:
+        point = solve_program(program, np.array([start])).best.x
+    except OuterFailure:
+        point = np.array(start)
+    return point, at(tuple(point))[0]
+
 
 SLOW = 0.3  # seconds of processor time of a plant at a θ: finite elements
 LOOKS, LOOKS_SLOW = 8, 1  # true inner problems over the box for each parameter

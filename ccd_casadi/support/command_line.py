@@ -18,9 +18,13 @@ from ccd_casadi.support.options import DEFAULT_CASE, Option, Parser, integer, on
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import option as option
 from ccd_casadi.support.terminal import kept_quiet, say
-from ccd_casadi.support.threads import one_blas_thread, threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
-from ccd_casadi.support.worker_process import WorkerLost, import_ahead
+from ccd_casadi.support.worker_process import (
+    WorkerLost,
+    import_ahead,
+    one_blas_thread,
+    threads_permitted,
+)
 
 _DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"

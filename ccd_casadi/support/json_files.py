@@ -1,5 +1,4 @@
-"""Plain values as JSON: files that any reader takes, and dataclasses back from it, exact in every
-bit of a number."""
+"""Plain values as JSON files, dataclasses back from them, and .mat files read without trust."""
 
 import json
 import math
@@ -13,8 +12,27 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
+import scipy
 
+from ccd_casadi.support.errors import UserError
 from surrogates.files import write_whole
+
+
+def mat_variables(path: Path) -> dict[str, Any]:
+    """What a .mat file holds by name. Raises UserError where it cannot be read."""
+    try:
+        with path.open("rb") as stream:
+            return dict(scipy.io.loadmat(stream))
+    except FileNotFoundError:
+        raise UserError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except NotImplementedError:  # how SciPy refuses the HDF5 files of MATLAB 7.3
+        raise UserError(f"{path}: is a MATLAB 7.3 file; write it with save(…, '-v7')") from None
+    except Exception as error:  # a damaged file fails anywhere inside the reader
+        words = " ".join(str(error).split())[:120]
+        raise UserError(f"{path}: is not a readable .mat file: {words}") from None
+
 
 DIGITS = 7  # of the numbers of an array that is listed
 

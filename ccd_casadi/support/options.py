@@ -8,7 +8,7 @@ from enum import IntEnum
 from typing import Any, NoReturn
 
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 Option = Callable[[argparse.ArgumentParser], object]  # adds one

@@ -24,7 +24,7 @@ from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.threads import one_blas_thread
+from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.weights import Weights
 

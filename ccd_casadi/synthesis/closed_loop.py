@@ -1,13 +1,17 @@
-"""Measure and certify any controller on any plant: the judge that all back ends share."""
+"""Measure and certify any controller on any plant, and the classical margins of its loop."""
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ccd_casadi.kernels.design import judge
-from ccd_casadi.kernels.figures import Column
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.kernels.sensitivity import Column
+from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import (
     UNBOUNDED,
     Design,
@@ -16,6 +20,120 @@ from ccd_casadi.synthesis.synthesis import (
     figures_from_row,
 )
 from ccd_casadi.synthesis.weights import Weights
+
+PlantAndController = Callable[[Array], tuple[NDArray, NDArray]]  # G (k, p, m) and K (k, m, p) at ω
+
+SECTIONS = 15  # of a bracket between two points of the grid, in ten: to rounding
+
+
+@dataclass(frozen=True)
+class ClassicalMargins:
+    """Factors `gain_down` < 1 < `gain_up` at which stability is lost (0 and inf where none is).
+
+    `phase_deg`: least change of phase, either way, at |L| = 1; `delay`: least lag there in s;
+    `crossover`: where |L| falls through 1 in the end, rad/s (`_crossover`). All are inf where |L|
+    does not cross 1.
+    `places`: where gain_down, gain_up and phase_deg are, rad/s; inf where there is no such margin.
+    """
+
+    gain_down: float
+    gain_up: float
+    phase_deg: float
+    delay: float
+    crossover: float
+    places: tuple[float, float, float] = (np.inf, np.inf, np.inf)
+
+
+def classical_margins(
+    response: Callable[[Array], NDArray[np.complex128]], omega: Array
+) -> ClassicalMargins:
+    """Margins of the loop 1 + L = 0 from `response`, L(jω) (k,) at any ω (k,) in rad/s.
+
+    Crossings of the negative real axis and of |L| = 1 are bracketed by neighbours in the ascending
+    `omega` and closed in on. Assumes a grid fine enough to separate them.
+
+    >>> found = classical_margins(lambda w: 4.0 / (1j * w + 1.0) ** 3, np.geomspace(0.1, 10.0, 50))
+    >>> round(found.gain_up, 9), round(found.crossover, 6), round(found.phase_deg, 4)
+    (2.0, 1.232819, 27.1416)
+    """
+    L = response(omega)
+    turned = _crossings(lambda w: response(w).imag, L.imag, omega)
+    real = response(turned).real
+    gains, turned = -1.0 / real[real < 0.0], turned[real < 0.0]
+    low, high = gains < 1.0, gains > 1.0
+    crossover = _crossings(lambda w: np.abs(response(w)) - 1.0, np.abs(L) - 1.0, omega)
+    # the lag that takes L to -1; a margin of lead is what is left of a whole turn
+    lags = np.mod(np.angle(-response(crossover)), 2.0 * np.pi)
+    phases = np.degrees(np.minimum(lags, 2.0 * np.pi - lags))
+    return ClassicalMargins(
+        gain_down=float(gains[low].max(initial=0.0)),
+        gain_up=float(gains[high].min(initial=np.inf)),
+        phase_deg=float(phases.min(initial=np.inf)),
+        delay=float((lags / crossover).min(initial=np.inf)),
+        crossover=_crossover(np.log(crossover), np.log(omega[0]), abs(L[0]) > 1.0),
+        places=(
+            _at_least(-gains[low], turned[low]),
+            _at_least(gains[high], turned[high]),
+            _at_least(phases, crossover),
+        ),
+    )
+
+
+def _crossover(falls: Array, lowest: float, above: bool) -> float:
+    """Of all ln ω where |L| passes 1 the one below which it is above 1, and above it below, over
+    most of ln ω: neither a graze at low frequencies nor a resonance further up is the crossover.
+
+    `above`: whether it is at the `lowest` ln ω. inf where it never falls through 1.
+    """
+    signs = (1.0 if above else -1.0) * (-1.0) ** np.arange(len(falls))
+    gained = np.cumsum(signs * np.diff(falls, prepend=lowest))
+    gained[signs < 0.0] = -np.inf  # there it rises through 1
+    best = int(gained.argmax()) if len(gained) else 0
+    return float(np.exp(falls[best])) if (signs > 0.0).any() else np.inf
+
+
+def _at_least(values: Array, places: Array) -> float:
+    return float(places[values.argmin()]) if values.size else np.inf
+
+
+def least_margins(respond: PlantAndController, omega: Array) -> ClassicalMargins:
+    """The least of all loops broken one at a time at the plant's inputs."""
+
+    def broken(at: Array, i: int) -> NDArray[np.complex128]:
+        G, K = respond(at)
+        return equivalent_open_loop(K @ G, i)
+
+    inputs = respond(omega[:1])[0].shape[2]
+    return least_of([classical_margins(partial(broken, i=i), omega) for i in range(inputs)])
+
+
+def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
+    """Of several loops the margins nearest to instability, and the lowest crossover."""
+    down = max(each, key=lambda m: m.gain_down)
+    up = min(each, key=lambda m: m.gain_up)
+    phase = min(each, key=lambda m: m.phase_deg)
+    return ClassicalMargins(
+        gain_down=down.gain_down,
+        gain_up=up.gain_up,
+        phase_deg=phase.phase_deg,
+        delay=min(m.delay for m in each),
+        crossover=min(m.crossover for m in each),
+        places=(down.places[0], up.places[1], phase.places[2]),
+    )
+
+
+def _crossings(function: Callable[[Array], Array], values: Array, omega: Array) -> Array:
+    """Where a function changes sign, one place for every two neighbours that it does between."""
+    at = np.flatnonzero(np.diff(np.signbit(values)))
+    low, high, below = omega[at], omega[at + 1], np.signbit(values[at])
+    rows = np.arange(at.size)
+    for _ in range(SECTIONS if at.size else 0):
+        points = np.linspace(low, high, 11, axis=1)
+        inside = np.signbit(function(points[:, 1:-1].ravel())).reshape(-1, 9)
+        first = np.argmax(np.column_stack([inside, ~below]) != below[:, None], axis=1)
+        low, high = points[rows, first], points[rows, first + 1]
+    return 0.5 * (low + high)
+
 
 EPS = 2.0**-52
 ROUNDING = 1e-6  # relative: what the conversion to SI may change of a norm and of a bandwidth

@@ -21,10 +21,9 @@ import scipy
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.mat_files import mat_variables
-from ccd_casadi.support.threads import one_blas_thread
-from ccd_casadi.synthesis.matlab_systems import PARTS, strings, system_of, systems_in
-from ccd_casadi.synthesis.realisation import realised
+from ccd_casadi.support.json_files import mat_variables
+from ccd_casadi.support.worker_process import one_blas_thread
+from ccd_casadi.synthesis.matlab_systems import PARTS, realised, strings, system_of, systems_in
 
 if TYPE_CHECKING:
     import control  # a second to import: where it is called, and not before

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 import slycot
 
-from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
-from ccd_casadi.lti.hold import Sampling, in_w, sampled, tustin
-from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
+from ccd_casadi.lti.loop import Sampling, in_w, sampled, tustin
+from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, balanced, closed_loop, weighted
 from ccd_casadi.support.errors import described
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.text import counted
 from ccd_casadi.synthesis.weights import Weights
 
 AGREEMENT = 1e-5  # relative: by how much two engines may differ in a norm

@@ -26,13 +26,12 @@ from ccd_casadi.fixed_structure import (
     synthesise,
 )
 from ccd_casadi.fixed_structure.certificate import SetCertificate, certify
-from ccd_casadi.fixed_structure.decoupling import given_decoupling
-from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.channel_structure import given_decoupling
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, descend
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.progress import Tell
+from ccd_casadi.support.terminal import Tell
 
 HZ = 2.0 * np.pi
 SAMPLING = Sampling(drive.RATE_HZ)

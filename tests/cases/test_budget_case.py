@@ -12,15 +12,15 @@ from ccd_casadi.budget import Kind, ShapedSpectrum, TabulatedSpectrum
 from ccd_casadi.budget.frequency import integrate
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.design_entries import budget_entry
+from ccd_casadi.codesign.result_entries import budget_entry
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.reporting.budget_chapter import budget_chapter
 from ccd_casadi.reporting.facts import loop_lines
+from ccd_casadi.reporting.limits import budget_chapter
 from ccd_casadi.support.json_files import json_values
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import synthesise
 
 BUDGET = """

@@ -15,13 +15,12 @@ from ccd_casadi.cases import plant_tables
 from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.first_look import DRAWING, SAMPLING, is_searched
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Parameter
-from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants import registry
 from ccd_casadi.plants.plant import Plant, mechanics
-from ccd_casadi.plants.registry import model_named, model_names
-from ccd_casadi.plants.two_mass import two_mass_plant
+from ccd_casadi.plants.registry import model_named, model_names, two_mass_plant
 from ccd_casadi.support.errors import UserError
 
 

@@ -11,8 +11,8 @@ from oracles.case_documents import DOCUMENT, PLANT, TWO_MASS, again, edited, mes
 from oracles.helpers import few
 
 from ccd_casadi.cases.case import load_case, parse_case
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
 
 
 def test_the_contracts_case_comes_back_as_it_was(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ import pytest
 
 from ccd_casadi.cases.case import CaseError, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.text import package_text
 
 TABLES = tomllib.loads(package_text("templates/case.toml"))
 PATH = Path(parse_case.__code__.co_filename).parents[1] / "templates" / "case.toml"

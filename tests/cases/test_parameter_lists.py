@@ -8,7 +8,7 @@ import pytest
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.compare import main as compare
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"

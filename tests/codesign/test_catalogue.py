@@ -33,7 +33,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.spent import SynthesisCounts
+from ccd_casadi.sampling.samples import SynthesisCounts
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.json_files import plain
 from ccd_casadi.support.process_pool import Workers

@@ -25,7 +25,7 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import certificate
 from ccd_casadi.fixed_structure.bounds import LoopPeaks
 from ccd_casadi.fixed_structure.box_proof import Proof, ProofOutcome
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore

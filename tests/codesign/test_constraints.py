@@ -12,13 +12,19 @@ from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.kkt import TrueDesign
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.inner_problem.objective import ACTIVE, MET, binding, constraint_shares, violated
+from ccd_casadi.inner_problem.objective import (
+    ACTIVE,
+    MET,
+    TrueQuantities,
+    binding,
+    constraint_shares,
+    violated,
+)
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.true_function import TrueQuantities
 
 MODEL = """
-from ccd_casadi.plants.two_mass import two_mass
+from ccd_casadi.plants.registry import two_mass
 
 def model(theta, least, unit, zeta=0.01):
     m1, m2 = theta["m1"], theta["m2"]

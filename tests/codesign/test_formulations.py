@@ -26,8 +26,7 @@ from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
-from ccd_casadi.sampling.samples import InnerSample
-from ccd_casadi.sampling.spent import SynthesisCounts
+from ccd_casadi.sampling.samples import InnerSample, SynthesisCounts
 
 ROOT = Path(__file__).parents[2]
 CASE = load_case(ROOT / "runs" / "two_mass.toml")

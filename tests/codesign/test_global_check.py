@@ -10,8 +10,8 @@ import pytest
 from oracles.helpers import problem
 
 from ccd_casadi.codesign.formulation import GlobalCheck
-from ccd_casadi.codesign.global_check import _starts, global_check
 from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.search import _starts, global_check
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.samples import InnerSample

@@ -12,9 +12,9 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.insight import Front, pareto_front
 from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Place
-from ccd_casadi.codesign.pareto import Front, pareto_front
 from ccd_casadi.codesign.post_optimal import post_optimal
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.drawing.content import Lines
@@ -32,7 +32,7 @@ from ccd_casadi.support.process_pool import Workers
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.plants.two_mass import two_mass
+from ccd_casadi.plants.registry import two_mass
 
 def model(theta):
     bowl = (theta["m1"] - 58.0) ** 2 + (theta["m2"] - 59.0) ** 2

@@ -10,9 +10,9 @@ from oracles.helpers import HZ, few, problem
 
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer_problem import OuterSolution, outer_program, solve_program
+from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import KktCertificate
 
 
@@ -49,7 +49,7 @@ def test_optimum_of_the_true_problem_is_certified() -> None:
 
 
 MODEL = """
-from ccd_casadi.plants.two_mass import two_mass
+from ccd_casadi.plants.registry import two_mass
 
 def model(theta, least, zeta=0.01):
     m1, m2 = theta["m1"], theta["m2"]

@@ -13,7 +13,7 @@ from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import predicted_value
 from ccd_casadi.optim.kkt import KktCertificate
-from ccd_casadi.sampling.spent import SynthesisCounts
+from ccd_casadi.sampling.samples import SynthesisCounts
 from surrogates import fit
 
 

@@ -11,9 +11,9 @@ from test_kkt import MODEL, point
 from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.kkt import NEAR, TrueDesign, active_at, newton_step
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array

@@ -10,10 +10,10 @@ from test_kinks import pieces
 
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
-from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.inner_problem.objective import TrueQuantities
+from ccd_casadi.optim import kkt
 from ccd_casadi.optim import pieces as of_pieces
-from ccd_casadi.optim import quadratic
-from ccd_casadi.optim.quadratic import AT_FIRST, INSIDE, KEPT, solve_elastic, solve_quadratic
+from ccd_casadi.optim.kkt import AT_FIRST, INSIDE, KEPT, solve_elastic, solve_quadratic
 from ccd_casadi.support.arrays import Array
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -91,7 +91,7 @@ def failing(monkeypatch: pytest.MonkeyPatch):
 
     def let(count: int) -> None:
         left = [count]
-        dual, interior = quadratic.daqp.solve, quadratic._interior
+        dual, interior = kkt.daqp.solve, kkt._interior
 
         def solve(*programme: object, **options: object) -> tuple:
             x, value, flag, info = dual(*programme, **options)
@@ -102,8 +102,8 @@ def failing(monkeypatch: pytest.MonkeyPatch):
             left[0] -= refused
             return Refused() if refused else interior(*shape)
 
-        monkeypatch.setattr(quadratic.daqp, "solve", solve)
-        monkeypatch.setattr(quadratic, "_interior", other)
+        monkeypatch.setattr(kkt.daqp, "solve", solve)
+        monkeypatch.setattr(kkt, "_interior", other)
 
     return let
 

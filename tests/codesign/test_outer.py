@@ -21,13 +21,13 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.optim.box import Box
-from ccd_casadi.studies.sequential import design_hardware, first_resonance
+from ccd_casadi.optim.pieces import Box
+from ccd_casadi.studies.worth import design_hardware, first_resonance
 
 W1, W2 = 0.0995, -0.9950
 LOWER, UPPER = np.array([55.0, 55.0]), np.array([70.0, 70.0])
 CONSTRAINED = """
-from ccd_casadi.plants.two_mass import two_mass
+from ccd_casadi.plants.registry import two_mass
 
 def model(theta, least):
     light = {"total": least - theta["m1"] - theta["m2"], "never": theta["m1"] - 1000.0}

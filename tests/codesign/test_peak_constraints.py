@@ -10,22 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import HZ, few, problem
 
-from ccd_casadi.codesign import peak_constraints
-from ccd_casadi.codesign.global_check import global_check
+from ccd_casadi.codesign import kkt
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import TrueDesign
+from ccd_casadi.codesign.kkt import OTHER_PEAK, TrueDesign, other_peaks
 from ccd_casadi.codesign.outer_mixed import MixedOuter
-from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
-from ccd_casadi.inner_problem import true_function
+from ccd_casadi.codesign.search import global_check
+from ccd_casadi.inner_problem import objective
 from ccd_casadi.inner_problem.controller_problem import RobustSet
+from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.synthesis import derivatives, peaks
-from ccd_casadi.synthesis.peaks import LocalPeak, local_peaks_with_gradients
+from ccd_casadi.synthesis import derivatives
+from ccd_casadi.synthesis.derivatives import LocalPeak, local_peaks_with_gradients
 
 ROBUST = RobustSet(0.001, 3, (), 0.001)
 POINTS = st.tuples(
@@ -63,7 +62,7 @@ def test_every_peak_stands_among_the_rows_once(
     def places(items: tuple[LocalPeak, ...]) -> list[tuple[int, float]]:
         given = replace(case, inner=replace(case.inner, S_max=float(np.exp(level))))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(peak_constraints, "local_peaks_with_gradients", lambda *_, **__: items)
+            patch.setattr(kkt, "local_peaks_with_gradients", lambda *_, **__: items)
             rows = other_peaks(given, x, design, 0.5)
         return sorted((row.member, row.omega) for row in rows if row.name.startswith(OTHER_PEAK))
 
@@ -87,7 +86,7 @@ def test_a_descent_synthesises_every_design_once(
         calls.append(1)
         return real(*arguments)
 
-    for module in (derivatives, peaks):
+    for module in (derivatives, derivatives):
         monkeypatch.setattr(module, "design", counted, raising=False)
     case = problem(robust=robust)
     quantities = TrueQuantities(case)
@@ -103,13 +102,13 @@ def test_a_verification_synthesises_every_design_once(
 ) -> None:
     """Polish, verification and the global check over the box ask the same truth."""
     asked: list[tuple] = []
-    real = true_function.true_design
+    real = objective.true_design
 
     def counted(problem: CoDesignProblem, *where: Any) -> object:
         asked.append(where)
         return real(problem, *where)
 
-    monkeypatch.setattr(true_function, "true_design", counted)
+    monkeypatch.setattr(objective, "true_design", counted)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(), store, Workers(1))
         outer = MixedOuter(sampler)

@@ -14,8 +14,7 @@ from oracles.busy import HANGS
 
 import ccd_casadi as ccd
 from ccd_casadi.codesign.outer_mixed import MixedOuter
-from ccd_casadi.codesign.retraining import Job, Outcome
-from ccd_casadi.codesign.stored import FOLDER, LOCK, only_job, version_names
+from ccd_casadi.codesign.retraining import FOLDER, LOCK, Job, Outcome, only_job, version_names
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
@@ -170,7 +169,7 @@ def test_a_surrogate_is_kept_with_its_error(retrained: tuple[Path, Outcome, Solu
 HOLDS = """
 import sys
 from pathlib import Path
-from ccd_casadi.codesign.stored import only_job
+from ccd_casadi.codesign.retraining import only_job
 with only_job(Path(sys.argv[1]), 7):
     print("held", flush=True)
     sys.stdin.read()

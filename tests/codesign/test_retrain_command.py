@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from ccd_casadi.codesign import retraining
-from ccd_casadi.codesign.retraining import Outcome
-from ccd_casadi.codesign.stored import LOCK, only_job
+from ccd_casadi.codesign.retraining import LOCK, Outcome, only_job
 from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.support.worker_process import WorkerLost
 from surrogates.retrain import main

@@ -11,7 +11,7 @@ from oracles.helpers import problem
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.studies import baselines as module
+from ccd_casadi.studies import steepest_descent as module
 from ccd_casadi.studies.steepest_descent import steepest_descent
 
 

@@ -10,20 +10,27 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from oracles.helpers import problem
 
-from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
-from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, reach, survival
+from ccd_casadi.codesign.survival import (
+    FACTORS,
+    PEAK,
+    REACH,
+    LoopsOffModel,
+    Survival,
+    loops_off_model,
+    reach,
+    survival,
+)
 from ccd_casadi.codesign.verdict import OwnSet, State, survives
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import RobustSet
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.robust import perturbed
-from ccd_casadi.robust.sampled import sampled_figures
+from ccd_casadi.robust.perturbed import sampled_figures
 
 SUSPENSION = FREE
 CROSSOVER = 100.0  # rad/s

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import few
 
-from ccd_casadi.optim.quadratic import AT_FIRST, damped_bfgs, symmetric_rank_one
+from ccd_casadi.optim.kkt import AT_FIRST, damped_bfgs, symmetric_rank_one
 from ccd_casadi.optim.trust_region import (
     End,
     Iterate,

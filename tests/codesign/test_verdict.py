@@ -22,28 +22,26 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.result_entries import kept_words, robust_dict
 from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.structured_entries import kept_words, robust_dict
 from ccd_casadi.codesign.survival import REACH, Survival, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.fixed_structure import SetCertificate
-from ccd_casadi.fixed_structure.loop_on_box import Excess
-from ccd_casadi.inner_problem.controller_problem import RobustSet
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RobustSet
+from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design, true_inner
-from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting import verdict as shown
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
-from ccd_casadi.synthesis.statics import Statics
-from ccd_casadi.synthesis.synthesis import synthesise
+from ccd_casadi.synthesis.derivatives import local_peaks_with_gradients
+from ccd_casadi.synthesis.synthesis import Statics, synthesise
 
 ROOT = Path(__file__).parents[2]
 KKT_LEVEL = VerifiedDesign.kkt_level

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi import HZ, Lifted, load_case, problem_of, solve
-from ccd_casadi.fixed_structure.race import LocalOptimum
+from ccd_casadi.fixed_structure.multi_start import LocalOptimum
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box, plant_of, true_inner
 from ccd_casadi.plants.plant import hardware_cost

@@ -10,10 +10,10 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import ccd_casadi as ccd
-from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.threads import one_blas_thread
 from ccd_casadi.support.user_code import GivenFunction
+from ccd_casadi.support.worker_process import one_blas_thread
 
 WEIGHTS = {"M_S": 2.0, "A_S": 1e-4, "c_K": 1e4, "omega_K_hz": 100.0, "M_K": 2e7, "A_l": 1.0,
            "A_u": 1e-2}  # fmt: skip

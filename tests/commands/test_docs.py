@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from ccd_casadi.__main__ import COMMANDS
-from ccd_casadi.reporting.index import FILES
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.reporting.verdict import FILES
+from ccd_casadi.support.text import package_text
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

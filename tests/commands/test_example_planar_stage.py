@@ -9,9 +9,9 @@ import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.plants.channels import find_channels
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import find_channels
 from ccd_casadi.solve import main
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "planar_stage"

@@ -14,7 +14,7 @@ from oracles import consistency
 from oracles.page_figures import disagreements, page_of, same
 
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.stored import write_page
+from ccd_casadi.drawing.paint import write_page
 
 SLOW = pytest.mark.slow
 SEEDS = [2, 4, *(pytest.param(seed, marks=SLOW) for seed in (1, 5, 9, 13))]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccd_casadi.support.recurrence import states
+from ccd_casadi.support.arrays import states
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2, 3, 16, 17, 1000])

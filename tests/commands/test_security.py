@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 TRAP = """
 import pathlib
 (pathlib.Path(__file__).parent / "executed").touch()
-from ccd_casadi.plants.two_mass import two_mass
+from ccd_casadi.plants.registry import two_mass
 
 def f(theta, **options):
     return two_mass(theta, 0.01)

@@ -15,9 +15,9 @@ LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/sampling/cluster.py"
 # They import by names that sources spell out: optional packages, what a command or a worker needs.
 # Processes of this Python with a module of the package; the person's C compiler on our own C code.
 PROCESSES = {
-    ("ccd_casadi/deployment/fmu.py", "subprocess.run"),
+    ("ccd_casadi/deployment/source_code.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
-    ("ccd_casadi/explorer/background.py", "subprocess.Popen"),
+    ("ccd_casadi/explorer/known_plant.py", "subprocess.Popen"),
     ("ccd_casadi/support/guard.py", "ctypes.CDLL"),  # of the process itself, for prctl
 }
 BY_NAME = {

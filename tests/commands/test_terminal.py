@@ -10,8 +10,7 @@ import termios
 import pytest
 
 import ccd_casadi
-from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import coloured, wrapped
+from ccd_casadi.support.terminal import Progress, coloured, wrapped
 
 
 def on_screen(columns: int, *words: str) -> list[str]:

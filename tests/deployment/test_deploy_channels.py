@@ -26,12 +26,12 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, uncertain_plant
 from ccd_casadi.inner_problem.structured_search import with_range
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.reporting.deploy_page import deploy_page
-from ccd_casadi.robust.sampled import sampled_figures
+from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.solve import main as solve_main
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 
 GANTRY = """

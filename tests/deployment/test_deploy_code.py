@@ -11,10 +11,14 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from oracles.helpers import few
 
-from ccd_casadi.deployment.anti_windup import with_anti_windup
-from ccd_casadi.deployment.channels import LoopChannel
-from ccd_casadi.deployment.realisation import Realisation, difference_equation, realise
-from ccd_casadi.deployment.sections import Section, sections_of
+from ccd_casadi.deployment.files import Section, sections_of
+from ccd_casadi.deployment.realisation import (
+    LoopChannel,
+    Realisation,
+    difference_equation,
+    realise,
+    with_anti_windup,
+)
 from ccd_casadi.deployment.source_code import COMPILE, c_files, write_c
 from ccd_casadi.lti.state_space import StateSpace
 

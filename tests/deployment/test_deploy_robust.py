@@ -14,16 +14,16 @@ from ccd_casadi.deployment.outcome import SAMPLED_EXCESS, Deployment
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
+from ccd_casadi.robust.perturbed import sampled_compliance, sampled_figures
 from ccd_casadi.robustness import main as robustness
 from ccd_casadi.solve import main as solve
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.statics import compliance_of
+from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis.synthesis import compliance_of
 
 RUNS = Path(__file__).parents[2] / "runs"
 ONE_WAY = Timing(lead=True)

@@ -13,15 +13,19 @@ from oracles.sampled_simulation import simulate
 from oracles.structured_text import run as run_text
 from test_deploy_code import of_one_channel, random_controller
 
-from ccd_casadi.analysis.feedforward import feedforward
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
-from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.deployment.anti_windup import back_calculation, takeover, with_anti_windup
-from ccd_casadi.deployment.move import PARTS, Electronics, move
-from ccd_casadi.deployment.realisation import Realisation, difference_equation
+from ccd_casadi.analysis.setpoint import feedforward, setpoint
+from ccd_casadi.deployment.on_hardware import PARTS, Electronics, move
+from ccd_casadi.deployment.realisation import (
+    Realisation,
+    back_calculation,
+    difference_equation,
+    takeover,
+    with_anti_windup,
+)
 from ccd_casadi.deployment.source_code import structured_text, vectors
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, modal_plant
 from ccd_casadi.plants.plant import Mechanics

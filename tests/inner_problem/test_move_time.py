@@ -9,21 +9,18 @@ from oracles import random_moves as moves
 from oracles.case_documents import TWO_MASS
 from oracles.differences import slopes
 
-from ccd_casadi.analysis.driven_plant import with_motion
-from ccd_casadi.analysis.motor import STEP, UNLIMITED, Motion, Motor, cycle_of
-from ccd_casadi.analysis.move import simulate
+from ccd_casadi.analysis.move import simulate, with_motion
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import _Crossing
+from ccd_casadi.analysis.setpoint import STEP, UNLIMITED, Motion, Motor, cycle_of
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.inner_problem.figure import MOVE_TIME
-from ccd_casadi.inner_problem.move_figures import motion_of
+from ccd_casadi.inner_problem.controller_problem import MOVE_TIME
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import structured_value
+from ccd_casadi.inner_problem.structured_bandwidth import motion_of, structured_value
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.inner_problem.structured_search import least_from, prepared
-from ccd_casadi.lti.hold import Sampling, sampled, tustin
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import (
     build_plant,

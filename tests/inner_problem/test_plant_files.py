@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.inner_problem.plant_files import digest_of, files_of
-from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
+from ccd_casadi.inner_problem.plant_source import PlantSource, digest_of, files_of, plant_from
 from ccd_casadi.support.errors import UserError
 
 PLANT = """

@@ -18,13 +18,13 @@ from oracles.helpers import (
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.sampling.rows import problem_hash
+from ccd_casadi.sampling.store import problem_hash
 from ccd_casadi.solve import main
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities

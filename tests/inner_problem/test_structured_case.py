@@ -11,8 +11,8 @@ from oracles.helpers import random_plant
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import plant_of
@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.sampling.rows import problem_hash
+from ccd_casadi.sampling.store import problem_hash
 
 RUNS = Path(__file__).parents[2] / "runs"
 SECTIONS = '\n[controller]\nstructure = "sections"\n'

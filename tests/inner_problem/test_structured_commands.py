@@ -31,14 +31,14 @@ from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.insight import main as insight_main
-from ccd_casadi.limitations.basis import Basis
-from ccd_casadi.limitations.discs import discs
+from ccd_casadi.limitations.limits import discs
+from ccd_casadi.limitations.multiplier import Basis
 from ccd_casadi.limitations.of_problem import limits_of_problem, opposite_corners
-from ccd_casadi.lti.hold import sampled, tustin
+from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.solve import main as solve_main
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.text import HZ, number
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import synthesise
 from surrogates.retrain import main as retrain_main

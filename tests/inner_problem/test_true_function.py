@@ -8,9 +8,9 @@ import pytest
 from oracles.helpers import HZ, INNER, problem
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design
 from ccd_casadi.inner_problem.search import search_inner
-from ccd_casadi.inner_problem.true_function import TrueQuantities
 
 
 def point(m1: float, m2: float, S_hz: float, T_hz: float) -> np.ndarray:

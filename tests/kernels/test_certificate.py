@@ -19,8 +19,7 @@ from oracles.helpers import (
     two_mass,
 )
 
-from ccd_casadi.kernels.certificate import level_test, stack_norm
-from ccd_casadi.kernels.closed_loop import weighted_loop
+from ccd_casadi.kernels.certificate import level_test, stack_norm, weighted_loop
 from ccd_casadi.kernels.design import certificate_grid
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.lti.state_space import StateSpace

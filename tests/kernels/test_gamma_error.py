@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from oracles.bound_error import bound_error, gamma_error
 from oracles.helpers import PAPER, few, flexible_case, two_mass
 
-from ccd_casadi.kernels.figures import Code, Column
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
+from ccd_casadi.kernels.sensitivity import Code, Column
 from ccd_casadi.kernels.synthesis import synthesise
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

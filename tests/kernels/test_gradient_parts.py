@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from oracles.differences import difference
 from oracles.helpers import HZ, PAPER, few, flexible_case, random_plant, scaled
 
-from ccd_casadi.kernels import bound_peak, pullback
+from ccd_casadi.kernels import adjoint
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, lower_bound_squared, plant_gain
 from ccd_casadi.kernels.generalized_plant import generalized_plant, squared_weights
@@ -47,8 +47,8 @@ def test_the_pull_back_is_the_adjoint_of_building_the_plant(seed: int, m: int, p
     cotangents = [rng.normal(size=change.shape) for change in changes]
     A_g, B2, C1, C2 = (part[None] for part in cotangents)
     B1 = np.zeros_like(before[1])[None]
-    of = pullback.PlantGradients(A_g, 0.0 * A_g, B1, B2, C1, 0.0 * C1, C2)
-    A_, B_, C_, _ = pullback.MixedPullback(A, B, C, w).to_plant_and_weights(of)
+    of = adjoint.PlantGradients(A_g, 0.0 * A_g, B1, B2, C1, 0.0 * C1, C2)
+    A_, B_, C_, _ = adjoint.MixedPullback(A, B, C, w).to_plant_and_weights(of)
     there = sum(np.sum(x * y) for x, y in zip(cotangents, changes, strict=True))
     back = np.sum(A_ * dA) + np.sum(B_ * dB) + np.sum(C_ * dC)
     size = sum(np.abs(x * y).sum() for x, y in zip(cotangents, changes, strict=True))
@@ -62,7 +62,7 @@ def test_the_slopes_of_the_squared_weights(seed: int, at: float) -> None:
     rng, omega = np.random.default_rng(seed), 10.0**at
     # M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T
     w = np.array([2.0, 1e-4, 1.0, 1e4, 1.0, 0.9, 1e-2, 1.0]) * np.exp(rng.uniform(-1.0, 1.0, 8))
-    found, h = pullback.squared_weight_slopes(w, omega), Fraction(1, 10**40)
+    found, h = adjoint.squared_weight_slopes(w, omega), Fraction(1, 10**40)
     exact = [Fraction(value) for value in w]
     for k in range(8):
         moved = exact.copy()
@@ -87,7 +87,7 @@ def test_the_gradient_of_the_bound_at_one_frequency(seed: int, p: int, at: float
         gain = plant_gain(A + x * dA, B + x * dB, C + x * dC, np.array([omega]))[0]
         return float(np.sqrt(lower_bound_squared(moved, gain, omega)))
 
-    A_, B_, C_, w_, _ = bound_peak.bound_gradient(A, B, C, w, 0.0, omega)
+    A_, B_, C_, w_, _ = adjoint.bound_gradient(A, B, C, w, 0.0, omega)
     found = np.sum(A_ * dA) + np.sum(B_ * dB) + np.sum(C_ * dC)
     size = bound(0.0)
     assert found == pytest.approx(difference(bound, 1e-5), rel=1e-5, abs=1e-7 * size)
@@ -107,7 +107,7 @@ def test_the_slope_of_the_bound_over_frequency(seed: int, p: int, at: float) -> 
         gain = plant_gain(plant.A, plant.B, plant.C, np.array([x]))[0]
         return float(lower_bound_squared(w, gain, x))
 
-    slope = bound_peak.bound_slope(plant.A, plant.B, plant.C, w, 0.0, omega) * omega
+    slope = adjoint.bound_slope(plant.A, plant.B, plant.C, w, 0.0, omega) * omega
     assert slope == pytest.approx(difference(squared, 1e-5), rel=1e-6, abs=1e-7 * squared(0.0))
 
 
@@ -119,15 +119,15 @@ def test_the_place_of_the_bound_is_found_from_either_side(off: float) -> None:
     start = gamma_lower_bound(
         prepare(*arguments[:3]), arguments[3], case.plant.grid, case.plant.gain
     )[1]
-    top = bound_peak.bound_peak(*arguments, 0.0, start)
+    top = adjoint.bound_peak(*arguments, 0.0, start)
     above, here, below = (
-        bound_peak.bound_slope(*arguments, 0.0, top * (1.0 + h)) for h in (1e-7, 0.0, -1e-7)
+        adjoint.bound_slope(*arguments, 0.0, top * (1.0 + h)) for h in (1e-7, 0.0, -1e-7)
     )
     curve = (above - below) / 2e-7
     assert curve < 0.0  # dslope/dln ω
     assert abs(here) < 1e-10 * abs(curve)
     near = 1e-2 * off  # the peak is some 1e-3 of its frequency wide
-    assert bound_peak.bound_peak(*arguments, 0.0, top * (1.0 + near)) == pytest.approx(
+    assert adjoint.bound_peak(*arguments, 0.0, top * (1.0 + near)) == pytest.approx(
         top, rel=1e-10
     )
-    assert bound_peak.bound_peak(*arguments, 0.0, 0.2 * top) == 0.2 * top
+    assert adjoint.bound_peak(*arguments, 0.0, 0.2 * top) == 0.2 * top

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from oracles.helpers import few, state_response
 from oracles.kernel_draws import complex_matrix, random_system, seeds
 
-from ccd_casadi.kernels import frequency, small
+from ccd_casadi.kernels import frequency
+from ccd_casadi.kernels import linear_algebra as algebra
 from ccd_casadi.kernels.frequency import _vertex, narrow, next_trial, promised
 
 
@@ -16,22 +17,22 @@ from ccd_casadi.kernels.frequency import _vertex, narrow, next_trial, promised
 def test_small_matrices_are_those_of_numpy(seed: int, n: int, m: int) -> None:
     rng = np.random.default_rng(seed)
     A, B = complex_matrix(rng, n, n), complex_matrix(rng, n, m)
-    np.testing.assert_allclose(small.multiply(A, B), A @ B, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(small.invert(A) @ A, np.eye(n), atol=1e-10 * np.linalg.cond(A))
-    assert small.largest_singular(B.copy()) == pytest.approx(np.linalg.norm(B, 2), rel=1e-12)
+    np.testing.assert_allclose(algebra.multiply(A, B), A @ B, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(algebra.invert(A) @ A, np.eye(n), atol=1e-10 * np.linalg.cond(A))
+    assert algebra.largest_singular(B.copy()) == pytest.approx(np.linalg.norm(B, 2), rel=1e-12)
 
 
 def test_a_matrix_with_a_zero_pivot_is_inverted_and_a_singular_one_is_infinite() -> None:
     swap = np.array([[0.0, 1.0], [1.0, 0.0]]) + 0.0j
-    np.testing.assert_array_equal(small.invert(swap), swap)
+    np.testing.assert_array_equal(algebra.invert(swap), swap)
     tiny = np.array([[1e-20, 1.0], [1.0, 1.0]]) + 0.0j  # without row exchanges: all digits lost
-    np.testing.assert_allclose(small.invert(tiny), [[-1.0, 1.0], [1.0, 0.0]], atol=1e-15)
-    assert np.isinf(small.invert(np.ones((3, 3)) + 0.0j)).all()
+    np.testing.assert_allclose(algebra.invert(tiny), [[-1.0, 1.0], [1.0, 0.0]], atol=1e-15)
+    assert np.isinf(algebra.invert(np.ones((3, 3)) + 0.0j)).all()
 
 
 def test_the_largest_singular_value_of_a_diagonal_matrix_wherever_it_stands() -> None:
     for order in ((3.0, 1.0, 2.0), (1.0, 3.0, 2.0), (1.0, 2.0, 3.0)):
-        assert small.largest_singular(np.diag(order) + 0.0j) == 3.0
+        assert algebra.largest_singular(np.diag(order) + 0.0j) == 3.0
 
 
 @few(max_examples=25)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.kernels.loop_grid import maxima, merged, unseen
-from ccd_casadi.lti.grid import FLANKS, root_flanks
+from ccd_casadi.lti.state_space import FLANKS, root_flanks
 
 APART = 1e-8
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccd_casadi.fixed_structure.decoupling import Decoupling
+from ccd_casadi.fixed_structure.channel_structure import Decoupling
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.kernels.plant_slopes import form_slopes
-from ccd_casadi.lti.hold import Sampling, sampled
+from ccd_casadi.kernels.modes import form_slopes
+from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import strictly_proper
 from ccd_casadi.plants.scaling import ScaledPlant
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ccd_casadi.kernels.bound_peak import direction
-from ccd_casadi.kernels.figures import Column
+from ccd_casadi.kernels.adjoint import direction
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import BACKWARD, gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import squared_weights
+from ccd_casadi.kernels.sensitivity import Column
 from ccd_casadi.support.arrays import Array
 
 EPS = 2.0**-52

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"
 DOCUMENT = tomllib.loads(TWO_MASS.read_text("utf-8"))

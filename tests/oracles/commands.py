@@ -9,7 +9,7 @@ from ccd_casadi.solve import main
 
 TWO_MASS = Path(__file__).parents[2] / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.plants.two_mass import two_mass
+from ccd_casadi.plants.registry import two_mass
 
 def model(theta, least):
     total = theta["m1"] + theta["m2"]

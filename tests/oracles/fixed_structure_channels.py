@@ -9,13 +9,24 @@ import numpy as np
 import pytest
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
+    channel_bounds,
+    find_decoupling,
+)
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decoupling
-from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
+from ccd_casadi.fixed_structure.figures import (
+    CLOSINGS,
+    FLAT,
+    NARROW,
+    Brackets,
+    assess,
+    constraints,
+    hessians,
+    to_theta,
+)
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopCurve, LoopProblem
-from ccd_casadi.fixed_structure.peak_search import CLOSINGS, FLAT, NARROW, Brackets
-from ccd_casadi.kernels import loop_grid, loop_rows
+from ccd_casadi.kernels import loop_grid, loop_point
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -100,7 +111,7 @@ def gaps(model: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Arr
     which = model.plants_of(rows)
     loop = model.loop(kappa, tau)
     places = (rows.curve[:, None], which, rows.v[:, None])
-    level = loop_rows.levels(*places, loop, -np.inf, loop_grid.NONE)[:, 0, 0]
+    level = loop_point.levels(*places, loop, -np.inf, loop_grid.NONE)[:, 0, 0]
     every, number = np.arange(len(which)), rows.plant // len(model.plants.plants)
     whole = number < model.first
     size = np.exp(level[:, : model.first])
@@ -157,7 +168,7 @@ def closed(
     patch: pytest.MonkeyPatch, slope: Callable[[float], float], brackets: Brackets
 ) -> tuple[Array, np.ndarray]:
     """The kernel's false position, interpreted, on curves of this slope to ln v."""
-    patch.setattr(loop_rows, "rows", lambda *places: (None, np.vectorize(slope)(places[3])))
-    run = getattr(loop_rows.close, "py_func", loop_rows.close)
+    patch.setattr(loop_point, "rows", lambda *places: (None, np.vectorize(slope)(places[3])))
+    run = getattr(loop_point.close, "py_func", loop_point.close)
     ends = (brackets.start, brackets.low, brackets.high)
     return run(brackets.curve, brackets.row, brackets.row, *ends, None, (FLAT, NARROW, CLOSINGS))

@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, Problem
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.kernels.loop_grid import NONE
-from ccd_casadi.kernels.loop_rows import levels
+from ccd_casadi.kernels.loop_point import levels
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics

@@ -20,7 +20,7 @@ import ccd_casadi.reporting.solve_page
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.stored import keep_version, only_job, stored_designs
+from ccd_casadi.codesign.retraining import keep_version, only_job, stored_designs
 from ccd_casadi.inner import main as inner
 from ccd_casadi.insight import main as insight
 from ccd_casadi.retrain import formulation_in

@@ -18,12 +18,12 @@ from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sweep import InnerBounds
 from ccd_casadi.kernels.design import judge
-from ccd_casadi.kernels.figures import Column
+from ccd_casadi.kernels.sensitivity import Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
+from ccd_casadi.plants.registry import two_mass_plant
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
-from ccd_casadi.plants.two_mass import two_mass_plant
 from ccd_casadi.synthesis.synthesis import DesignFigures, figures_from_row
 from ccd_casadi.synthesis.weights import Weights
 from oracles.draws import few as few

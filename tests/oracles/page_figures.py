@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.drawing import content as c
-from ccd_casadi.drawing.stored import read_pages
+from ccd_casadi.drawing.paint import read_pages
 from ccd_casadi.support.json_files import restored
 from ccd_casadi.support.terminal import plain as in_ascii
 

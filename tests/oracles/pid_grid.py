@@ -28,8 +28,8 @@ import numpy as np
 from ccd_casadi.fixed_structure import Bounds, Structure, synthesise_sections
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
+from ccd_casadi.plants.registry import two_mass
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.plants.two_mass import two_mass
 from ccd_casadi.synthesis.weights import Weights
 from oracles.pid_judge import Loop, Table, controller, judged, loop_of, near, poles
 

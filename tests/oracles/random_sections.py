@@ -40,18 +40,17 @@ import numpy as np
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
-from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.design import MARGIN, DesignSearch, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import ascend
 from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopCurve
-from ccd_casadi.fixed_structure.race import at_its_bandwidth
-from ccd_casadi.fixed_structure.sections_design import MARGIN, DesignSearch
+from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.limitations.bound import forbids
 from ccd_casadi.limitations.limits import limits_of
 from ccd_casadi.plants.plant import build_plant, mechanics
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.weights import Weights
 from oracles.robust_design import synthesise_robustly

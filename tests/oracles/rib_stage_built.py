@@ -26,11 +26,10 @@ from scipy.signal import cont2discrete
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES
 from ccd_casadi.case_studies.rib_stage.plant import rib_stage
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.robust.sampled import sampled_figures
+from ccd_casadi.robust.perturbed import sampled_figures
 from oracles.sampled_simulation import measure_set
 
 RESULTS = Path(__file__).parents[2] / "benchmarks/rib_stage_built.json"

@@ -15,9 +15,15 @@ from ccd_casadi.fixed_structure import (
 )
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import certify
-from ccd_casadi.fixed_structure.loop_on_box import WITHIN, Excess, LoopOnBox
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import LATTICE, lattice, worst_plants
+from ccd_casadi.fixed_structure.worst_plant import (
+    LATTICE,
+    WITHIN,
+    Excess,
+    LoopOnBox,
+    lattice,
+    worst_plants,
+)
 from ccd_casadi.support.arrays import Array
 
 AT_ONCE = 3  # plants added in one round

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any
 
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.store import Sample
 
 REALS = [field.name for field in dataclasses.fields(Sample) if field.type is float]
 

@@ -26,10 +26,9 @@ from ccd_casadi.analysis.loop_figures import light_roots
 from ccd_casadi.cases.case import load_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
-from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.loop import Loop, constant_drive
+from ccd_casadi.lti.loop import Loop, Sampling, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "tests/data/shipped_designs.json"

@@ -7,7 +7,7 @@ import pytest
 from ccd_casadi.drawing.maps import GROUND, RING
 from ccd_casadi.drawing.paint import theme
 from ccd_casadi.drawing.svg import COLOUR_MAP, THEME
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.text import package_text
 
 LEAST, LEAST_OF_CURVES = 4.5, 3.0  # of WCAG 2.2: 1.4.3 for words, 1.4.11 for what is drawn
 SHEETS = ("drawing/assets/page.css", "drawing/assets/steps.css", "drawing/assets/turntable.css")

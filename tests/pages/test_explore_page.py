@@ -15,7 +15,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support import errors
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.text import package_text
 
 PATIENCE = 240e3  # ms: the machine may be busy
 # Pixels of one unit of Re L and of Im L.

@@ -11,22 +11,38 @@ from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.drawing.svg import BLUE
-from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_sampled
-from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
-from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
+from ccd_casadi.explorer.curves import (
+    FIGURES,
+    as_sampled,
+    curves_of,
+    drawn,
+    machine_html,
+    move_words,
+    sampled_of,
+    standing_html,
+    with_sampled,
+)
+from ccd_casadi.explorer.designs import (
+    How,
+    Problems,
+    Standing,
+    case_at,
+    elements_at,
+    judged,
+    knobs_of,
+    present,
+)
 from ccd_casadi.explorer.known_plant import KnownPlant, frequency_error
-from ccd_casadi.explorer.landscape import landscape_of, steepest_axes
-from ccd_casadi.explorer.panels import FIGURES, drawn
+from ccd_casadi.explorer.map_figure import landscape_of, steepest_axes
 from ccd_casadi.explorer.session import Session
-from ccd_casadi.explorer.words import machine_html, move_words, standing_html
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.places import Places
 from ccd_casadi.plants.plant import Mechanics, mechanics
-from ccd_casadi.reporting.bode import loop_panels
 from ccd_casadi.reporting.landscape import read_truths
 from ccd_casadi.reporting.machine import lumped, lumped_svg
-from ccd_casadi.support.units import HZ
+from ccd_casadi.reporting.nyquist import loop_panels
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import Outcome
 
 CASE = Path("runs/two_mass.toml")
@@ -283,7 +299,7 @@ def test_a_saved_case_is_the_one_on_the_sliders(session):
 def test_a_place_that_is_dragged_moves_what_it_names():
     """A mirrored coordinate the other way, a diagonal by the mean, what is held not at all."""
     pytest.importorskip("bokeh")
-    from ccd_casadi.explorer.places_figure import PlacesFigure, moves
+    from ccd_casadi.explorer.controls import PlacesFigure, moves
 
     nodes = tuple((x, y) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.0, 0.1))
     places = Places(nodes, (("-a", "b"), ("r", "r"), (0.0, 0.05)))

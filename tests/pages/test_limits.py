@@ -5,10 +5,10 @@ import pytest
 from oracles.helpers import HZ, problem
 
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.limits import limit_sentences, shares, table_limits
-from ccd_casadi.support.units import display_unit
+from ccd_casadi.support.text import display_unit
 from ccd_casadi.synthesis.synthesis import synthesise
 
 

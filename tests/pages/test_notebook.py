@@ -16,10 +16,9 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.codesign.formulation import FormulationResult, Terms
 from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
+from ccd_casadi.fixed_structure.design import SectionsOutcome
 from ccd_casadi.support.errors import MissingPackage
-from ccd_casadi.support.notebook import NotebookHtml
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import NotebookHtml, Progress
 
 ROOT = Path(__file__).resolve().parents[2]
 VOID = {"br", "hr", "img", "meta", "input"}

@@ -16,23 +16,23 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulation import Iterate
 from ccd_casadi.codesign.verdict import OwnSet
+from ccd_casadi.deployment.outcome import against, deployed_line
 from ccd_casadi.deployment.robust_set import MemberLoop
-from ccd_casadi.deployment.words import against, deployed_line
 from ccd_casadi.fixed_structure import ShapeEnd
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.reporting.facts import conclusion, facts, theta_table, theta_words
 from ccd_casadi.reporting.insight import front_answer
+from ccd_casadi.reporting.landscape import history_blocks
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, way_words, ways_figure
 from ccd_casadi.reporting.nyquist import near, nyquist_panel
-from ccd_casadi.reporting.prediction import history_blocks
 from ccd_casadi.reporting.robustness_page import shown_peak
 from ccd_casadi.reporting.verdict import LINES, advice, head_of, run_head
-from ccd_casadi.studies.conclusions import conclusions
-from ccd_casadi.support.units import HZ
+from ccd_casadi.studies.comparison import conclusions
+from ccd_casadi.support.text import HZ
 
 
 def test_the_bounds_drawn_of_sections_are_those_that_they_are_judged_by() -> None:

@@ -21,20 +21,19 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.deployment.channels import scalar_channels
-from ccd_casadi.drawing.paint import block_html, page_html
-from ccd_casadi.drawing.stored import draw, read_pages
-from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.deployment.realisation import scalar_channels
+from ccd_casadi.drawing.paint import block_html, draw, page_html, read_pages
+from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.report import main as report_command
-from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.landscape import read_truths
+from ccd_casadi.reporting.nyquist import bode
 from ccd_casadi.reporting.solve_page import solve_page, write_report
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.units import number
+from ccd_casadi.support.text import number
 
 HZ = 2.0 * np.pi
 HOSTILE_UNIT = r'kg</td><script>alert(1)</script>"&$\\frac$'

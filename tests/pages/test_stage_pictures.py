@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from ccd_casadi.case_studies.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shapes
-from ccd_casadi.case_studies.rib_stage.drawing import drawing
 from ccd_casadi.case_studies.rib_stage.geometry import UPPER, bays, mass
+from ccd_casadi.case_studies.rib_stage.pictures import drawing
 from ccd_casadi.drawing.content import Block, Chapter, Head, Page, Panel, Words
 from ccd_casadi.drawing.paint import block_html, page_html
-from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
-from ccd_casadi.drawing.turntable import (
+from ccd_casadi.drawing.surface import (
     HEIGHT,
     MARGIN,
     REACH,
@@ -28,6 +27,7 @@ from ccd_casadi.drawing.turntable import (
     data,
     still,
 )
+from ccd_casadi.drawing.svg import ModeShape, ModeShapes
 from ccd_casadi.reporting.machine import mode_shape_figure, table_modes
 
 Array = np.ndarray

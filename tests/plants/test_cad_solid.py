@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 
 from ccd_casadi.plants.cad import draw_morph
-from ccd_casadi.plants.cad.boundary import Boundary, Piece, matched
-from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved_points, volumes
+from ccd_casadi.plants.cad.solid import (
+    Boundary,
+    Piece,
+    face_at,
+    kernel,
+    load,
+    matched,
+    meshed,
+    moved_points,
+    volumes,
+)
 from ccd_casadi.support.errors import MissingPackage, PlantError, require
 
 

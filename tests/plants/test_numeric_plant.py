@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, solve_program
-from ccd_casadi.optim.box import Box
+from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.differenced import user_plant
 from ccd_casadi.plants.plant import build_plant, constraint_values, hardware_cost
 from ccd_casadi.solve import main

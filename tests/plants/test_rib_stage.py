@@ -22,12 +22,15 @@ from ccd_casadi.case_studies.rib_stage import (
     StageError,
     mode_shapes,
 )
-from ccd_casadi.case_studies.rib_stage.geometry import has_square_symmetry, mass_properties
-from ccd_casadi.case_studies.rib_stage.mesh import Mesh, build_mesh, plain
+from ccd_casadi.case_studies.rib_stage.geometry import (
+    has_square_symmetry,
+    mass_properties,
+    rigid_fields,
+    rigid_values,
+)
+from ccd_casadi.case_studies.rib_stage.mesh import Mesh, build_mesh, line_nodes, plain
 from ccd_casadi.case_studies.rib_stage.model import discretisation, orthonormal_directions
 from ccd_casadi.case_studies.rib_stage.modes import functionals, groups_of, spectrum
-from ccd_casadi.case_studies.rib_stage.reference import line_nodes
-from ccd_casadi.case_studies.rib_stage.rigid import rigid_fields, rigid_values
 from ccd_casadi.plants.plant import Mechanics
 
 Array = np.ndarray

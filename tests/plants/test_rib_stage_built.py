@@ -16,10 +16,10 @@ from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.structured_plant_set import structure_of
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.robust.sampled import sampled_figures
+from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.support.errors import UserError
 
 RUNS = Path(__file__).parents[2] / "runs"

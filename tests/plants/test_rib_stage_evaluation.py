@@ -5,7 +5,7 @@ import pytest
 
 from ccd_casadi.case_studies.rib_stage import COARSE, RibStage, StageError
 from ccd_casadi.case_studies.rib_stage.model import modes_at, orthonormal_directions
-from ccd_casadi.support.threads import threads_permitted
+from ccd_casadi.support.worker_process import threads_permitted
 
 A = tuple(1e-3 * np.array([1.0, 3.0, 8.0, 8.0, 16.806, 67.5]))
 B = tuple(1e-3 * np.array([1.0, 3.0, 4.2446, 4.0588, 11.917, 74.974]))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.loop import sampled
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Mechanics

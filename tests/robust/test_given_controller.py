@@ -11,8 +11,8 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deployment.given_controller import read_controller, with_controller
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.statics import Statics, statics
+from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis.synthesis import Statics, statics
 
 TABLE = """
 gain = 3.0e5

@@ -14,18 +14,21 @@ from oracles.helpers import HZ, SUSPENSION, random_plant, responses, scaled
 from scipy.integrate import trapezoid
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting.robustness_page import _bandwidth_lost
-from ccd_casadi.robust.hardware import tolerances
-from ccd_casadi.robust.margins import margins
-from ccd_casadi.robust.perturbed import damping_line, shift_line, single_modes, worst_in_box
-from ccd_casadi.robust.signals import gains, noise
-from ccd_casadi.robust.structured import structured_bound
+from ccd_casadi.robust.margins import gains, margins, noise
+from ccd_casadi.robust.perturbed import (
+    damping_line,
+    shift_line,
+    single_modes,
+    tolerances,
+    worst_in_box,
+)
+from ccd_casadi.robust.structured_singular_value import structured_bound
 from ccd_casadi.robustness import main
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
 from ccd_casadi.synthesis.synthesis import synthesise

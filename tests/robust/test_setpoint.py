@@ -14,8 +14,7 @@ from ccd_casadi.analysis.move import mass_feedforward, simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics

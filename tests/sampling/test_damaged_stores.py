@@ -15,7 +15,7 @@ from oracles.rows import sample
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.stored import stored_designs
+from ccd_casadi.codesign.retraining import stored_designs
 from ccd_casadi.sampling import store as module
 from ccd_casadi.sampling.store import SampleStore, SampleStoreError
 from ccd_casadi.support.errors import UserError

@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 from oracles.rows import REALS, identical, sample
 
-from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
-from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash, sample_key
 
 # -0.0 is left out: SQLite stores it as 0, and no key or figure tells the two apart.
 numbers = st.floats().filter(lambda v: math.copysign(1.0, v) > 0.0 or v != 0.0)
@@ -202,7 +201,7 @@ def test_the_file_explains_itself_without_our_code(tmp_path: Path) -> None:
 WRITER = """
 import dataclasses, random, sys, time
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.store import Sample
 path, name, pause = sys.argv[1], sys.argv[2], float(sys.argv[3])
 NAMES = [field.name for field in dataclasses.fields(Sample) if field.type is float]
 def row(unit, i):

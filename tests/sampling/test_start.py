@@ -53,7 +53,7 @@ def test_type_checkers_see_the_names_of_surrogates() -> None:
 
 def test_a_module_does_not_take_the_place_of_the_function_of_its_name() -> None:
     words = (
-        "import surrogates.extrapolation; from surrogates import extrapolation; "
+        "import surrogates.quality; from surrogates import extrapolation; "
         "assert callable(extrapolation)"
     )
     subprocess.run([sys.executable, "-c", words], check=True)

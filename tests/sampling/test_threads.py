@@ -10,7 +10,7 @@ import pytest
 from scipy import sparse
 
 from ccd_casadi.plants.eigenpairs import Pencil, build_pencil
-from ccd_casadi.support.threads import OwnThreads, alongside, side_by_side, threads_permitted
+from ccd_casadi.support.worker_process import OwnThreads, alongside, side_by_side, threads_permitted
 
 PAGE = 4096  # bytes, at least
 

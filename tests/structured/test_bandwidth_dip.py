@@ -11,7 +11,7 @@ from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 from ccd_casadi.analysis.loop_figures import AROUND, _dip, bandwidth_dip, loop_entry
 from ccd_casadi.fixed_structure import ShapeEnd, Structure, certify, synthesise_sections
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 HALF_POWER = 2.0**-0.5
 EASY = replace(BOUNDS, S_max=2.0, compliance_max=None)

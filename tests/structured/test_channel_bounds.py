@@ -28,9 +28,12 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise,
 )
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
+    channel_bounds,
+    given_decoupling,
+)
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.decoupling import channel_bounds, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem

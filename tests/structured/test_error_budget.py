@@ -19,13 +19,18 @@ from ccd_casadi.budget import (
     TabulatedSpectrum,
     evaluate_budget,
 )
-from ccd_casadi.budget.derivatives import STEP, ErrorVariance, of_source, variances
+from ccd_casadi.budget.evaluation import STEP, ErrorVariance, of_source, variances
 from ccd_casadi.budget.frequency import integrated
-from ccd_casadi.budget.loops import Process, noise_of_a_period, process, run_matrix
-from ccd_casadi.budget.moving_average import average_gain, average_matrix
+from ccd_casadi.budget.loops import (
+    Process,
+    average_gain,
+    average_matrix,
+    noise_of_a_period,
+    process,
+    run_matrix,
+)
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.lti.hold import delay_parts
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, delay_parts
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 

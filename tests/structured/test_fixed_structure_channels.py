@@ -24,19 +24,18 @@ from oracles.fixed_structure_channels import (
 from oracles.helpers import sensitivity_gain
 
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.decoupling import (
+from ccd_casadi.fixed_structure.channel_structure import (
+    ChannelStructure,
     Decoupling,
     find_decoupling,
     given_decoupling,
     in_channels,
     is_decoupled,
 )
-from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
+from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.figures import Brackets, assess, constraints, hessians, split
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
-from ccd_casadi.fixed_structure.peak_search import Brackets, split
 from ccd_casadi.support.errors import PlantError
 
 ROOT = Path(__file__).resolve().parents[2]

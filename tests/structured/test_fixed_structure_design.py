@@ -19,17 +19,13 @@ from ccd_casadi.fixed_structure import (
     synthesise_sections,
 )
 from ccd_casadi.fixed_structure.certificate import judged
-from ccd_casadi.fixed_structure.design import bandwidth_envelope, problem_for
+from ccd_casadi.fixed_structure.design import bandwidth_envelope, in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.loop_on_box import LoopOnBox
+from ccd_casadi.fixed_structure.local_search import Point, optimality
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve
-from ccd_casadi.fixed_structure.optimality import optimality
-from ccd_casadi.fixed_structure.peak_climbs import climbed
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import lattice, worst_plants
+from ccd_casadi.fixed_structure.worst_plant import LoopOnBox, climbed, lattice, worst_plants
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics

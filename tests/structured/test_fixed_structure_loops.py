@@ -21,8 +21,9 @@ from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.certificate_curves import grid_through
-from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import (
+    Brackets,
     assess,
     constraints,
     evaluate_rows,
@@ -31,15 +32,12 @@ from ccd_casadi.fixed_structure.figures import (
 )
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, Places
-from ccd_casadi.fixed_structure.peak_search import Brackets
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.kernels import sections
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import in_w, sampled
+from ccd_casadi.lti.loop import in_w, sampled
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.robust.sampled import sampled_figures
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
+from ccd_casadi.robust.perturbed import sampled_figures
 from ccd_casadi.support.errors import PlantError
 
 STRUCTURES = [

@@ -13,12 +13,12 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, syn
 from ccd_casadi.fixed_structure.affine import Affine
 from ccd_casadi.fixed_structure.box_proof import prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
-from ccd_casadi.fixed_structure.decoupling import Decoupling
+from ccd_casadi.fixed_structure.channel_structure import Decoupling
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
-from ccd_casadi.kernels.plant_slopes import form_slopes
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.kernels.modes import form_slopes
+from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, modal_plant, without_hidden_rigid_modes

@@ -15,7 +15,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Structure, certify, local_search, synthesise_sections
 from ccd_casadi.fixed_structure import least_value as module
 from ccd_casadi.fixed_structure.least_value import RmsError, least_value
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 BUDGET = ErrorBudget((
     Source("cable", Kind.FORCE, ShapedSpectrum(1e-4)),

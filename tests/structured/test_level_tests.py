@@ -12,9 +12,8 @@ from ccd_casadi.codesign.verdict import OwnSet, State, survives
 from ccd_casadi.fixed_structure import Sampling, Structure, certificate, certify
 from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE, Proof, ProofOutcome
-from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.synthesis.second_engine import AGREEMENT, compared, second_opinion
 
 WIDE = replace(BOUNDS, S_max=50.0, weighted_level=1e6, compliance_max=1.0)

@@ -18,21 +18,19 @@ from ccd_casadi.fixed_structure import Bounds, Sampling
 from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.gap import main
 from ccd_casadi.inner_problem.problem import best_choice, scaled_plant
-from ccd_casadi.limitations.basis import Basis
-from ccd_casadi.limitations.bound import lower_bound, upper_bound
-from ccd_casadi.limitations.certificate import rules_out, support, support_of
-from ccd_casadi.limitations.discs import circle, discs, ratio
-from ccd_casadi.limitations.limits import limits_of, response_of
+from ccd_casadi.limitations.bound import lower_bound, rules_out, support, support_of, upper_bound
+from ccd_casadi.limitations.limits import circle, discs, limits_of, ratio, response_of
+from ccd_casadi.limitations.multiplier import Basis
 from ccd_casadi.limitations.of_problem import (
     gap_of,
     limits_of_problem,
     none_reaches,
     opposite_corners,
 )
-from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights

@@ -19,10 +19,9 @@ from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.lti.hold import tustin
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.loop import Loop, tustin
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.synthesis.classical_margins import classical_margins
+from ccd_casadi.synthesis.closed_loop import classical_margins
 
 HZ = 2.0 * np.pi
 

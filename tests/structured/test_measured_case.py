@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.measured_loop import controller_response, judge
 from ccd_casadi.inner import main as inner
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.solve import main as solve
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 
 
 @pytest.mark.parametrize("sampled", [False, True])

@@ -12,12 +12,11 @@ from ccd_casadi.fixed_structure.affine import Affine
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable
-from ccd_casadi.fixed_structure.decoupling import given_decoupling
+from ccd_casadi.fixed_structure.channel_structure import given_decoupling
+from ccd_casadi.fixed_structure.discs import Terms, quotient
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
-from ccd_casadi.fixed_structure.largest_norm import Terms
-from ccd_casadi.fixed_structure.mode_discs import quotient
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
-from ccd_casadi.lti.hold import sampled, tustin
+from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.plants.plant import Mechanics
 
 # two carts of two masses, a weak spring and unlike places of drive and reading between them

@@ -12,9 +12,8 @@ from test_tune import judged
 import ccd_casadi as ccd
 from ccd_casadi.fixed_structure.measured_design import design_on_data
 from ccd_casadi.fixed_structure.measured_loop import controller_response, judge
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import sampled, tustin
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import from_control

@@ -12,15 +12,15 @@ from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
-from ccd_casadi.fixed_structure.race import (
+from ccd_casadi.fixed_structure.multi_start import (
     SAME,
     WITHIN,
     at_its_bandwidth,
     distinct,
+    reinserted,
     run_race,
     started,
 )
-from ccd_casadi.fixed_structure.reinsertion import reinserted
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
 from ccd_casadi.plants.plant import Mechanics
 

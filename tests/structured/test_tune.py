@@ -24,7 +24,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.studies import tuning
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.tune import main
 from surrogates.lazy_names import from_stub
 

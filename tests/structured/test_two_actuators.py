@@ -12,8 +12,8 @@ from scipy.signal import cont2discrete
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, synthesise
 from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.channel_structure import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem

@@ -12,8 +12,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 
 from surrogates import GaussianProcess, Hyperparameters, Kernel, condition, design, fit, to_casadi
-from surrogates.casadi_export import NEAR, radial_expression
 from surrogates.covariance import radial
+from surrogates.export import NEAR, radial_expression
 
 KERNELS = pytest.mark.parametrize("kernel", list(Kernel))
 LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])

@@ -11,8 +11,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
 from surrogates import Hyperparameters, Kernel
-from surrogates.covariance import covariance, observed_covariance, radial
-from surrogates.likelihood import log_likelihood
+from surrogates.covariance import covariance, log_likelihood, observed_covariance, radial
 
 
 @KERNELS

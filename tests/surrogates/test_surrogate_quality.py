@@ -20,10 +20,10 @@ from ccd_casadi.codesign.gaussian_processes import (
     surrogate_quality,
 )
 from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
-from ccd_casadi.codesign.stored import stored_designs
+from ccd_casadi.codesign.retraining import stored_designs
 from ccd_casadi.drawing.paint import block_html
-from ccd_casadi.inner_problem.figure import BANDWIDTH
-from ccd_casadi.reporting.prediction import table_trust, trust_figure
+from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
+from ccd_casadi.reporting.landscape import table_trust, trust_figure
 from ccd_casadi.sampling.samples import quantity_sample
 from ccd_casadi.sampling.store import SampleStore
 from surrogates import GaussianProcess, design, errors, fit

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surrogates import design, extrapolation, fit
-from surrogates.extrapolation import hull_distance
+from surrogates.quality import hull_distance
 
 BOX = {"lower": [-2.0, 0.0], "upper": [2.0, 3.0]}
 

@@ -12,9 +12,8 @@ from scipy.stats import ortho_group
 
 from ccd_casadi.case_studies.rib_stage import COARSE, RibStage
 from ccd_casadi.kernels import design
-from ccd_casadi.plants.channels import find_channels
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
-from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.plants.scaling import find_channels, scale_plant
 from ccd_casadi.synthesis import derivatives
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise

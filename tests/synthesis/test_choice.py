@@ -13,7 +13,7 @@ from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.choice import _squared, choose_inputs
 from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights

@@ -18,7 +18,7 @@ from oracles.helpers import (
 )
 
 from ccd_casadi.analysis.loop_view import peaks_of
-from ccd_casadi.kernels.figures import Code, Column
+from ccd_casadi.kernels.sensitivity import Code, Column
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -17,18 +17,17 @@ from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import true_inner
 from ccd_casadi.kernels.design import design, judge
-from ccd_casadi.kernels.disturbance import filter_solution, innovations_plant
-from ccd_casadi.kernels.figures import Code, Column
-from ccd_casadi.kernels.lapack import stable_subspace
+from ccd_casadi.kernels.linear_algebra import stable_subspace
 from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian
+from ccd_casadi.kernels.sensitivity import Code, Column
+from ccd_casadi.kernels.synthesis import filter_solution, innovations_plant
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.studies.backends import balance, mixed_sensitivity
 from ccd_casadi.synthesis.derivatives import sensitivities
-from ccd_casadi.synthesis.statics import statics
-from ccd_casadi.synthesis.synthesis import Design, synthesise
+from ccd_casadi.synthesis.synthesis import Design, statics, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 seeds = st.integers(0, 10**6)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from oracles.helpers import HZ, problem
 
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import Sampling, sampled, tustin
+from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import closed_loop
 from ccd_casadi.synthesis import second_engine
 from ccd_casadi.synthesis.second_engine import AGREEMENT, second_opinion, weighted_loop
 from ccd_casadi.synthesis.synthesis import Design, synthesise

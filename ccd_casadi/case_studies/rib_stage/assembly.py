@@ -1,20 +1,114 @@
-"""K(θ) and M(θ) of one symmetry in a fixed sparsity pattern, and bilinear forms of their slopes.
-
-K(θ) = Σ c_q(θ) K_q with c = l_x l_y l_z/(l_p l_q) of each box, and M likewise with l_x l_y l_z:
-exact, since the edges are affine in θ. Boxes off the diagonal have a mirror image with the same
-matrix, so only half of them are formed. Matrices are those of the whole stage (four quarters).
-"""
+"""K(θ) and M(θ) of one symmetry of the square in a fixed sparsity pattern."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
-from ccd_casadi.case_studies.rib_stage.geometry import Material
-from ccd_casadi.case_studies.rib_stage.mesh import Block, Mesh
-from ccd_casadi.case_studies.rib_stage.reference import PAIRS, cube_mass, cube_stiffness
-from ccd_casadi.case_studies.rib_stage.symmetry import Fold, Symmetry, fold, swap_displacements
+from ccd_casadi.case_studies.rib_stage.geometry import Material, Point
+from ccd_casadi.case_studies.rib_stage.mesh import PAIRS, Block, Mesh, cube_mass, cube_stiffness
 from ccd_casadi.support.arrays import Array
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """Parities of u_z about x = 0 and y = 0, and about the diagonal (0: not used)."""
+
+    name: str
+    sector: str
+    x: int
+    y: int
+    diagonal: int
+
+
+A1 = Symmetry("A1", "SS", 1, 1, 1)
+B1 = Symmetry("B1", "SS", 1, 1, -1)
+B2 = Symmetry("B2", "AA", -1, -1, 1)
+A2 = Symmetry("A2", "AA", -1, -1, -1)
+SA = Symmetry("SA", "SA", 1, -1, 0)
+AS = Symmetry("AS", "AS", -1, 1, 0)
+SOLVED = (A1, B1, B2, A2, SA)
+ALL = (A1, B1, B2, A2, SA, AS)
+
+
+@dataclass(frozen=True)
+class Fold:
+    """u = T q: displacement d of the quarter is weight[d] q[index[d]], zero where index < 0."""
+
+    index: np.ndarray
+    weight: Array
+    size: int
+
+    @cached_property
+    def matrix(self) -> sparse.csr_matrix:
+        """T (3 nodes, size): T q are the quarter's displacements, Tᵀ f the reduced forces."""
+        live = np.flatnonzero(self.index >= 0)
+        entries = (self.weight[live], (live, self.index[live]))
+        return sparse.csr_matrix(entries, shape=(len(self.index), self.size))
+
+    @cached_property
+    def shared(self) -> np.ndarray:
+        """(size,) int8: 1 where two displacements have √½ of it each."""
+        found = np.zeros(self.size, np.int8)
+        found[self.index[(self.index >= 0) & (np.abs(self.weight) < 1.0)]] = 1
+        return found
+
+
+def swap_displacements(mesh: Mesh) -> np.ndarray:
+    """(3 nodes,) the displacement that the diagonal mirror makes of each one."""
+    partner = mesh.number[mesh.grid[:, 1], mesh.grid[:, 0], mesh.grid[:, 2]]
+    return (3 * partner[:, None] + np.array([1, 0, 2])).ravel()
+
+
+def fold(mesh: Mesh, symmetry: Symmetry) -> Fold:
+    """The reduction of this symmetry; T has orthonormal columns."""
+    count = 3 * mesh.nodes
+    component = np.tile(np.arange(3), mesh.nodes)
+    on_x, on_y = np.repeat(mesh.grid[:, 0] == 0, 3), np.repeat(mesh.grid[:, 1] == 0, 3)
+    # even u_z about x = 0 leaves no u_x there, odd u_z leaves nothing but u_x
+    dead = on_x & ((component == 0) == (symmetry.x > 0))
+    dead |= on_y & ((component == 1) == (symmetry.y > 0))
+    here = np.arange(count)
+    weight = np.ones(count)
+    first = here
+    if symmetry.diagonal:
+        partner = swap_displacements(mesh)
+        first = np.minimum(here, partner)
+        weight = np.where(here == partner, 1.0, np.sqrt(0.5))
+        weight[here > partner] *= symmetry.diagonal
+        dead |= (here == partner) & (symmetry.diagonal < 0)
+    kept = (first == here) & ~dead
+    rank = np.where(kept, np.cumsum(kept) - 1, -1)
+    index = np.where(dead, -1, rank[first])
+    return Fold(index, np.where(dead, 0.0, weight), int(kept.sum()))
+
+
+def point_functional(
+    mesh: Mesh, symmetry: Symmetry, theta: Array, point: Point
+) -> tuple[Array, Array]:
+    """(3 nodes, 3) and (θ, 3 nodes, 3): u_x, u_y, u_z at (x, y, 0) from the quarter's vector.
+
+    For AS the quarter's vector is that of SA: the field is its diagonal mirror image.
+    """
+    x, y = point
+    values, slopes = mesh.interpolate(theta, abs(x), abs(y))
+    out = np.zeros((3 * mesh.nodes, 3))
+    d_out = np.zeros((len(theta), 3 * mesh.nodes, 3))
+    for component, sign in enumerate(mirror_signs(symmetry, x < 0.0, y < 0.0)):
+        out[component::3, component] = sign * values
+        d_out[:, component::3, component] = sign * slopes
+    if symmetry is AS:
+        swap = swap_displacements(mesh)
+        return out[swap], d_out[:, swap]
+    return out, d_out
+
+
+def mirror_signs(symmetry: Symmetry, left: bool, below: bool) -> tuple[int, int, int]:
+    """Signs of u_x, u_y, u_z in a quadrant against the first quadrant."""
+    sign = (symmetry.x if left else 1) * (symmetry.y if below else 1)
+    return (-sign if left else sign, -sign if below else sign, sign)
+
 
 # exponents of (l_x, l_y, l_z) in the coefficients: the six of K, then that of M
 EXPONENTS = np.array([[1 - (d == p) - (d == q) for d in range(3)] for p, q in PAIRS] + [[1, 1, 1]])

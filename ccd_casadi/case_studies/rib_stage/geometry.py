@@ -1,24 +1,13 @@
-"""The rib-reinforced stage: parameters, lengths, mass and the room its bays must keep.
-
-The stage is ours. The paper gives neither side length nor ribs nor bounds; this family was
-fitted to its two published points, (1.02 kg, 250.0 Hz) and (0.59 kg, 110.5 Hz).
-
-A square 6061-T6 plate, side L, carries square ribs on its upper face: a frame along the edges
-(t_o thick), ribs at ±x_i (t_i) and one through the centre (t_c), alike along x and y, all of
-height H above the plate of thickness h. From the centre outwards the intervals of an axis are
-
-    t_c/2 | b_2 = x_i - t_i/2 - t_c/2 | t_i | b_1 = L/2 - x_i - t_o - t_i/2 | t_o,
-
-affine in θ. Origin at the centre of the lower face, z upwards. SI units throughout.
-"""
+"""The rib-reinforced stage: parameters, lengths, mass, and its rigid-body modes in closed form."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.cad.elements import Material as Material
+from ccd_casadi.plants.cad.modes import Material as Material
 from ccd_casadi.support.arrays import Array
 
 NAMES = ("h", "t_o", "t_i", "t_c", "H", "x_i")
@@ -146,3 +135,43 @@ def has_square_symmetry(geometry: Geometry) -> bool:
     mirrored = [(-x, y, m) for x, y, m in here]
     swapped = [(y, x, m) for x, y, m in here]
     return table(here) == table(mirrored) == table(swapped)
+
+
+RIGID_NAMES = ("z", "tip", "tilt")
+
+
+def rigid_fields(geometry: Geometry, points: Sequence[Point]) -> ca.Function:
+    """θ -> u_z of the three modes at points of the lower face, (3, points) in 1/√kg, and ∂/∂θ."""
+    theta = ca.SX.sym("theta", len(NAMES))
+    modes = _coefficients(geometry, theta)
+    x = ca.DM([[p[0] for p in points]])
+    y = ca.DM([[p[1] for p in points]])
+    one = ca.DM.ones(1, len(points))
+    field = ca.densify(modes @ ca.vertcat(one, y, x))
+    slope = ca.densify(ca.jacobian(ca.vec(field), theta))
+    return ca.Function("rigid_fields", [theta], [field, slope])
+
+
+def rigid_values(function: ca.Function, theta: Array) -> tuple[Array, Array]:
+    """(3, points) and (θ, 3, points) from `rigid_fields`."""
+    field, slope = (np.array(value) for value in function(theta))
+    return field, slope.reshape(field.shape[1], field.shape[0], len(theta)).transpose(2, 1, 0)
+
+
+def _coefficients(geometry: Geometry, theta: ca.SX) -> ca.SX:
+    """(3, 3): u_z = c_0 + c_1 y + c_2 x of each mode."""
+    body = mass_properties(geometry, [theta[i] for i in range(len(NAMES))])
+    J, (x_c, y_c, _) = body.inertia, body.centre
+    S_aa = J[0][0] - J[0][2] ** 2 / J[2][2]
+    S_bb = J[1][1] - J[1][2] ** 2 / J[2][2]
+    S_ab = -(J[0][1] - J[0][2] * J[1][2] / J[2][2])  # b turns about -y
+    L_aa = ca.sqrt(S_aa)
+    L_ba = S_ab / L_aa
+    L_bb = ca.sqrt(S_bb - L_ba**2)
+    tip_a = 1.0 / L_aa
+    tilt_a, tilt_b = -L_ba / (L_aa * L_bb), 1.0 / L_bb
+    return ca.vertcat(
+        ca.horzcat(1.0 / ca.sqrt(body.mass), 0.0, 0.0),
+        ca.horzcat(-tip_a * y_c, tip_a, 0.0),
+        ca.horzcat(-tilt_a * y_c - tilt_b * x_c, tilt_a, tilt_b),
+    )

@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.case_studies.rib_stage import geometry as shape
-from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point, has_square_symmetry
+from ccd_casadi.case_studies.rib_stage.geometry import (
+    RIGID_NAMES,
+    Geometry,
+    Point,
+    has_square_symmetry,
+    rigid_fields,
+    rigid_values,
+)
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
 from ccd_casadi.case_studies.rib_stage.modes import Discretisation, discretise, heights
-from ccd_casadi.case_studies.rib_stage.rigid import RIGID_NAMES, rigid_fields, rigid_values
 from ccd_casadi.case_studies.rib_stage.truncation import (
     Mode,
     ModeCount,

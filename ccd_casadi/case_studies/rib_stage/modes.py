@@ -12,10 +12,17 @@ import numpy as np
 from scipy.linalg import qr
 
 from ccd_casadi.case_studies.rib_stage.assembly import (
+    ALL,
+    AS,
+    SA,
+    SOLVED,
     Assembler,
     Sector,
+    Symmetry,
     build_assembler,
     build_sector,
+    point_functional,
+    swap_displacements,
 )
 from ccd_casadi.case_studies.rib_stage.geometry import (
     Geometry,
@@ -25,15 +32,6 @@ from ccd_casadi.case_studies.rib_stage.geometry import (
     has_square_symmetry,
 )
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder, build_mesh
-from ccd_casadi.case_studies.rib_stage.symmetry import (
-    ALL,
-    AS,
-    SA,
-    SOLVED,
-    Symmetry,
-    point_functional,
-    swap_displacements,
-)
 from ccd_casadi.plants.eigenpairs import (
     Pencil,
     build_pencil,

@@ -14,8 +14,8 @@ from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
 from ccd_casadi.case_studies.rib_stage.truncation import FORTY_FOUR, TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
+from ccd_casadi.plants.differenced import remembered, with_fixed
 from ccd_casadi.plants.eigenpairs import StageError
-from ccd_casadi.plants.fixed import remembered, with_fixed
 from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 
@@ -84,9 +84,9 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         return remembered(lambda theta, _: reduced.mechanics(stage, made, theta))
 
     def drawing(thetas: Mapping[str, Sequence[float]]) -> Figure:
-        from ccd_casadi.case_studies.rib_stage import drawing  # matplotlib is slow to import
+        from ccd_casadi.case_studies.rib_stage import pictures  # matplotlib is slow to import
 
-        return drawing.drawing(stage.geometry, thetas)
+        return pictures.drawing(stage.geometry, thetas)
 
     theta = ca.SX.sym("theta", len(NAMES))
     mass, constraints = stage.hardware(ca.vertsplit(theta))

@@ -21,6 +21,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import block_diag, eigh
 
+from ccd_casadi.case_studies.rib_stage.assembly import AS, mirror_signs, swap_displacements
 from ccd_casadi.case_studies.rib_stage.geometry import (
     LOWER,
     UPPER,
@@ -50,11 +51,10 @@ from ccd_casadi.case_studies.rib_stage.modes import (
     sector_of,
     spectrum,
 )
-from ccd_casadi.case_studies.rib_stage.symmetry import AS, mirror_signs, swap_displacements
 from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, faded
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.threads import side_by_side
+from ccd_casadi.support.worker_process import side_by_side
 
 KNOWN = 1e-4  # of its length: what of a mode's move is beside the basis and not worth a vector
 ROUNDING = 1e-8  # the same of a mode

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.case_studies.rib_stage.assembly import AS, SA
 from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point, has_square_symmetry
 from ccd_casadi.case_studies.rib_stage.modes import (
     EXTRA,
@@ -16,9 +17,8 @@ from ccd_casadi.case_studies.rib_stage.modes import (
     groups_of,
     spectrum,
 )
-from ccd_casadi.case_studies.rib_stage.symmetry import AS, SA
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.threads import side_by_side
+from ccd_casadi.support.worker_process import side_by_side
 
 
 @dataclass(frozen=True)

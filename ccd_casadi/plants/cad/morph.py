@@ -18,7 +18,7 @@ from ccd_casadi.plants.cad import solid
 from ccd_casadi.plants.plant import named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import Progress
 
 FORMAT = "ccd_casadi morph 1"
 UNSEEN = 5  # θ that measure the fit

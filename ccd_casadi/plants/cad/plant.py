@@ -8,16 +8,14 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.drawing.content import Figure
-from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.surface import surface_figure
-from ccd_casadi.plants.cad.elements import Body, Material
-from ccd_casadi.plants.cad.modes import mode_shapes, reduced, surface
+from ccd_casadi.drawing.svg import ModeShapes
+from ccd_casadi.plants.cad.modes import Body, Material, mode_shapes, reduced, surface
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
-from ccd_casadi.plants.fixed import remembered, with_fixed
+from ccd_casadi.plants.differenced import remembered, with_fixed
 from ccd_casadi.plants.plant import Mechanics, Plant
-from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.support.arrays import Array, VectorCallback
 from ccd_casadi.support.errors import PlantError, require
 
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")  # of the rigid body, about its centre of gravity

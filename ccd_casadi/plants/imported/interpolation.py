@@ -14,8 +14,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from ccd_casadi.plants.imported.entries import fit_entries
-from ccd_casadi.plants.imported.frames import Frame, frames
+from ccd_casadi.plants.imported.frames import Frame, fit_entries, frames
 from ccd_casadi.plants.imported.modal_table import ModalTable
 from ccd_casadi.plants.plant import Mechanics, named_values
 from ccd_casadi.support.arrays import Array

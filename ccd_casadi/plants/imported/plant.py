@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.imported.entries import fit_entries
+from ccd_casadi.plants.imported.frames import fit_entries
 from ccd_casadi.plants.imported.interpolation import SAME, Errors, InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table

@@ -1,0 +1,342 @@
+"""Designs as entries of result.json and controller.json."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.analysis.yield_bound import Yield
+from ccd_casadi.budget import BudgetFigures, SourceFigures
+from ccd_casadi.codesign.verdict import OwnSet
+from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
+from ccd_casadi.fixed_structure.bounds import BINDS, key_words, kind_and_channel
+from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.certificate import TOLERANCE
+from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.inner_problem.structured_bandwidth import exact_times, motion_of
+from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
+from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.text import HZ, counted
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures, compliance_words, statics
+
+
+def figures_dict(figures: DesignFigures) -> dict[str, Any]:
+    """One design's figures under the contract's keys."""
+    return {
+        "omega_S_hz": figures.omega_S / HZ,
+        "omega_T_hz": figures.omega_T / HZ,
+        "outcome": figures.outcome.name.lower(),
+        "reason": figures.outcome.value,
+        "bandwidth_hz": figures.bandwidth / HZ,
+        "gamma_opt": figures.gamma_opt,
+        "gamma": figures.gamma,
+        "gamma_lower_bound": figures.gamma_lower_bound,
+        "sensitivity_peak": figures.sensitivity_peak,
+        "sensitivity_peak_hz": figures.sensitivity_peak_frequency / HZ,
+        "sensitivity_low": figures.sensitivity_low,
+        "compliance_max": figures.compliance,
+        "certificate": asdict(figures.certificate),
+    }
+
+
+def compliance_dict(most: float, at_rest: float, low: float, low_hz: float) -> dict[str, Any]:
+    """What a force moves, m/N: ‖GS‖∞, at rest (0: an integrator) and at ω_low; and in words."""
+    return {
+        "compliance_max": most,
+        "static_compliance": at_rest,
+        "low_compliance": low,
+        "compliance_words": compliance_words(most, at_rest, low, low_hz),
+    }
+
+
+def mixed_dict(problem: CoDesignProblem, theta: Sequence[float], design: Design) -> dict[str, Any]:
+    """A mixed-sensitivity design's figures, with compliance, margins and steps of a stable loop:
+    these on the plant and those of its robust set."""
+    figures, plant = design.figures, scaled_plant(problem, theta)
+    found = figures_dict(figures)
+    if not figures.certified:
+        return found
+    plants = [one.plant_si() for one in plant.members]
+    rest = statics(plants[0], design.controller, bandwidth=figures.bandwidth,
+                   omega_low=problem.inner.omega_low)  # fmt: skip
+    return (
+        found
+        | loop_entry(plants, design.controller, None, figures.bandwidth, figures.sensitivity_peak)
+        | compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
+    )
+
+
+def controller_dict(controller: StateSpace) -> dict[str, Any]:
+    """controller.json: row-major lists, SI, input e = r - y, output u."""
+    return {
+        **{name: getattr(controller, name).tolist() for name in "ABCD"},
+        "input": "e = r - y",
+        "output": "u",
+        "units": "SI, time in s",
+    }
+
+
+def budget_entry(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> dict[str, Any]:
+    """`budget` as the one key of a mapping; nothing where the problem has none."""
+    found = loop_budget(problem, theta, controller)
+    return {} if found is None else {"budget": budget_dict(found)}
+
+
+def move_entry(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> dict[str, Any]:
+    """`move` as the one key of a mapping, SI; nothing where the problem has none."""
+    if problem.source.motion is None:
+        return {}
+    motion = motion_of(problem, theta)
+    times = exact_times(problem, motion, kind_of(problem).plants(theta), controller)
+    cycle, own = motion.cycle, problem.source.motion
+    of_motor = () if own.motor is None else ("power", "peak_share", "heat_share")
+    return {"move": {
+        "duration": cycle.profile.duration,
+        "settled": float(times[0]),
+        "settled_latest": float(times.max()),
+        "plants": len(times),
+        "window": own.window,
+        "dwell": own.dwell,
+        "reached": {key: float(getattr(cycle.profile, key))
+                    for key in ("velocity", "acceleration", "jerk")},
+        "limits": list(cycle.limits),
+        **{key: float(getattr(cycle, key)) for key in ("peak_force", "rms_force", *of_motor)},
+        **({} if own.motor is None else {
+            "peak_current": cycle.peak_force / own.motor.at(motion.mass)[0]}),
+        "feedforward": motion.forward.tolist(),
+    }}  # fmt: skip
+
+
+def budget_dict(budget: LoopBudget) -> dict[str, Any]:
+    """The figures on the model, and the largest of all plants; m, N, s; null where infinite."""
+    model = budget.model
+    head: dict[str, Any] = {
+        "sampled": budget.sampled,
+        "plants": budget.plants,
+        "error_rms_largest": budget.largest_error,
+        "force_rms_largest": budget.largest_force,
+    }
+    if model is None:
+        return head | {"reason": "the loop with the model is not stable", "sources": []}
+    return head | {
+        "error_rms": model.error,
+        "error_ma": None if model.window is None else model.average,
+        "error_msd": None if model.window is None else model.deviation,
+        "force_rms": model.force,
+        "window_s": model.window,
+        "disagreement": model.disagreement,
+        "sources": [_source(item, model) for item in model.sources],
+    }
+
+
+def _source(item: SourceFigures, whole: BudgetFigures) -> dict[str, Any]:
+    windowed = whole.window is not None
+    return {
+        "name": item.source.name,
+        "kind": item.source.kind.value,
+        "spectrum": "filter" if item.source.shaped else "table",
+        "error_rms": item.error,
+        "share": (item.error / whole.error) ** 2 if whole.error > 0.0 else 0.0,
+        "error_ma": item.average if windowed else None,
+        "error_msd": item.deviation if windowed else None,
+        "force_rms": item.force,
+        "disagreement": item.disagreement,
+    }
+
+
+WORST = 1.0 + TOLERANCE  # figure over bound up to which the judge counts a bound as met
+
+
+def design_dict(
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
+) -> dict[str, Any]:
+    """A certified design's figures under the contract's keys, the worst of its plants."""
+    judged = design.certificate
+    assert judged is not None
+    highest = max(judged.plants, key=lambda plant: plant.S_peak)
+    sampling, loop = problem.sampling, dict[str, Any]()
+    if all(plant.stable for plant in judged.plants):  # else there are no margins and steps
+        assert design.controller is not None
+        plants = [plant.plant_si() for plant in plants_of(problem, theta)]
+        loop = loop_entry(plants, design.controller, sampling, design.bandwidth, highest.S_peak)
+    grown = max(plant.stability for plant in judged.plants)
+    if sampling is not None:  # of the spectral radius: the real part that it comes from
+        grown = float(np.log1p(grown)) / sampling.period
+    ratios = judged.worst
+    return {
+        **dict.fromkeys(("omega_S_hz", "omega_T_hz")),
+        "outcome": design.outcome.name.lower(),
+        "reason": "" if design.certified else design.words,
+        "bandwidth_hz": design.bandwidth / HZ,
+        **dict.fromkeys(("gamma_opt", "gamma", "gamma_lower_bound")),
+        "sensitivity_peak": highest.S_peak,
+        "sensitivity_peak_hz": highest.S_peak_frequency / HZ,
+        "sensitivity_low": max(plant.S_low for plant in judged.plants),
+        **compliance_dict(
+            max(plant.GS for plant in judged.plants),
+            max(plant.static_compliance for plant in judged.plants),
+            max(plant.low_compliance for plant in judged.plants),
+            problem.inner.omega_low / HZ,
+        ),
+        "KS_max": max(plant.KS for plant in judged.plants),
+        **loop,
+        **_channel_entry(bounds_of(problem), judged),
+        "certificate": {
+            "stable": all(plant.stable for plant in judged.plants),
+            "max_real_pole": grown,
+            "norm": max(ratios.values()),
+            "norm_bound": WORST,
+            "passed": judged.passed,
+            "plants": len(judged.plants),
+            "figures_over_bounds": ratios,
+        },
+        "controller": sections_dict(design.structure, design.kappa)
+        | {
+            "kappa": design.kappa.tolist(),
+            "local_optima": [
+                {"bandwidth_hz": item.bandwidth / HZ, "searches": item.count}
+                for item in design.local_optima
+            ],
+            "starts": design.starts,
+            "best_found": design.found,
+            "multipliers": design.multipliers,
+            "at_range": [f"{name} {end}" for name, end, _ in design.at_box],
+            "kkt_residual": design.kkt_residual,
+        },
+    }
+
+
+def active_of(design: SectionsDesign) -> list[str]:
+    """What binds the controller."""
+    return bound_words(name for name, mu in design.multipliers.items() if mu > 1e-6)
+
+
+def bound_words(names: Iterable[str]) -> list[str]:
+    """Bounds on the loop as a reader knows them, of rows by kind and channel.
+
+    >>> bound_words(["KS", "CROSSING", "S_MAX of z"])
+    ['S_max of channel z', 'weighted_level of KS']
+    """
+    order = list(BINDS)
+    found = [(kind_and_channel(name), name) for name in names]
+    bounds = [(order.index(kind), of, name) for (kind, of), name in found if kind in BINDS]
+    return [key_words(name) for *_, name in sorted(bounds)]
+
+
+def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
+    """`channel_bounds`: what channels keep for themselves, the worst of the judge's plants."""
+    found = []
+    for i, own in enumerate(bounds.channels):
+        rows = [plant.channels[i] for plant in judged.plants if plant.channels]
+        if not own.given or not rows:
+            continue
+        top = max(rows, key=lambda row: row.S_peak)
+        entry = {
+            "name": own.name,
+            "sensitivity_peak": top.S_peak,
+            "sensitivity_peak_hz": top.S_peak_frequency / HZ,
+            "S_max": own.S_max,
+            "bandwidth_hz": min(row.bandwidth for row in rows) / HZ,
+            "bandwidth_ratio": own.bandwidth_ratio,
+        }
+        if own.M_K is not None:
+            entry |= {"M_K": own.M_K, "weighted_KS": max(row.weighted_KS for row in rows)}
+        found.append(entry)
+    return {"channel_bounds": found} if found else {}
+
+
+def kept_words(worst: Excess) -> str:
+    """Which bounds hold on a box whose judge allows `LOOSE`, by its worst plant to six digits."""
+    if float(f"{100.0 + 100.0 * np.expm1(worst.value):.6g}") <= 100.0:
+        return "within every bound"
+    return f"no bound exceeded by more than {100.0 * LOOSE:g} %"
+
+
+def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, Any]:
+    """`robust`: the judge on so many plants of the box, and the worst that was searched."""
+    words = f"stable, {kept_words(worst)} on {counted(plants, 'plant')}"
+    return {
+        "plants": plants,
+        "passed": wide.passed,
+        "words": words if wide.passed else wide.words,
+        "bandwidth_hz": wide.bandwidth / HZ,
+        "worst_excess": float(np.expm1(worst.value)),
+    }
+
+
+def proof_dict(proof: Proof) -> dict[str, Any]:
+    """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
+    found: dict[str, Any] = {
+        "outcome": proof.outcome.name.lower(),
+        "words": proof.words,
+        "slack": proof.slack,
+        "parameters": list(proof.parameters),
+        "levels": {BINDS[name]: level for name, level in proof.levels.items()},
+        "boxes": proof.boxes,
+    }
+    if proof.refuted:
+        found |= {
+            "option": proof.option,
+            "point": list(proof.point),
+            "passed": [BINDS[proof.passed[0]], proof.passed[1]],
+        }
+    return found
+
+
+def sections_controller(
+    design: SectionsDesign | MeasuredDesign, sampling: Sampling | None
+) -> dict[str, Any]:
+    """controller.json: the state space in SI, the sections, and how they run."""
+    assert design.controller is not None
+    words = sections_dict(design.structure, design.kappa) | {"kappa": design.kappa.tolist()}
+    if isinstance(design, MeasuredDesign):
+        words["sign"] = design.sign
+    if sampling is not None:
+        words["loop"] = vars(sampling) | {"method": "tustin"}
+    return controller_dict(design.controller) | {"sections": words}
+
+
+def box_words(
+    wide: SetCertificate, checked: int, proof: Proof, worst: Excess, drawn: Yield | None,
+    *, along: bool,
+) -> dict[str, Any]:  # fmt: skip
+    """What `survives` takes of a loop on its box: the judge on so many plants, the proof, the worst
+    plant that was searched, random ones; `along`: whether its common shift is kept."""
+    excess, fresh = math.expm1(worst.value), "" if drawn is None else drawn.words
+    figures = {
+        "plants": checked,
+        "worst_excess": excess,
+        "proof": proof.outcome.name.lower(),
+        "proven": proof.levels,
+        "unproven": proof.unasked,
+    }
+    where = f"{counted(checked, 'plant')} of the box that [robust] names"
+    share, within = f"{100.0 + 100.0 * excess:.6g} % of a bound", kept_words(worst)
+    own, words = OwnSet.BROKEN, f"{within} on {where}, the worst that a search found at {share}"
+    if not wide.passed:
+        words = f"on {where}: {wide.words}"
+    elif proof.denies:
+        words = f"{within} on {where}, but {proof.words}"
+    elif checked <= 1:
+        own, words = OwnSet.NONE, "[robust] names no plant but the model"
+    elif drawn is not None and drawn.survived < drawn.draws:
+        words = f"{within} on {where}, but of the whole box {fresh}"
+    elif along:
+        own = OwnSet.SEARCHED if proof.unasked else OwnSet.KEPT
+        own = OwnSet.UNPROVEN if proof.unclosed else own
+        words = "; ".join(part for part in (words, fresh, proof.words) if part)
+    else:
+        words = f"{within} on {where}, but not all along its common resonance shift"
+    return {"own": own, "own_words": words, "figures": figures}

@@ -1,0 +1,265 @@
+"""Discs around what modes are over frequencies and boxes, and the largest norm of matrices over
+such discs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.affine import Affine, inverse
+from ccd_casadi.fixed_structure.boxes import Axis, Pair
+from ccd_casadi.fixed_structure.uncertainty import ModalSum
+from ccd_casadi.lti.state_space import sigma_max
+from ccd_casadi.support.arrays import Array
+
+FIRST = 1e30  # share of what is divided before anything else: where modes are not enclosed
+CANCELLED = 1e3  # times what is of first order: there the second says what to divide
+TURNS = np.exp(1j * np.pi * np.arange(-2, 3) / 4)  # half planes that 1/D is looked for in
+
+
+@dataclass(frozen=True)
+class Discs:
+    """Of n modes over N boxes: `middle`, `radius` (n, N), and what each coordinate adds to the
+    latter (n, 1 + n_p, N)."""
+
+    middle: np.ndarray
+    radius: Array
+    shares: Array
+
+
+def discs_of(
+    plant: ModalSum, names: tuple[str, ...], low: Array, high: Array, axis: Axis, free: bool
+) -> tuple[Discs, Discs, np.ndarray]:
+    """Of all modes as the loop has them, and where `free` without hold and delay; where all
+    flexible modes stay damped (N,)."""
+    free &= axis.period is not None
+    count = (len(plant.omega), 1 + len(names), low.shape[1])
+    held, bare = (
+        Discs(np.zeros(count[::2], complex), np.zeros(count[::2]), np.zeros(count))
+        for _ in range(2)
+    )
+    moved: Sequence[Sequence[Affine | None]] = [(None, None)] * count[0]
+    q, known = sum(name.startswith("theta.") for name in names), np.ones(count[2], bool)
+    if plant.moving is not None:
+        moved, known = plant.moving(low[-q:], high[-q:])
+    damped = known
+    for i in range(count[0]):
+        own = [k for k, name in enumerate(names)
+               if name == plant.shift_of(i) or not name.startswith("mode_shift")]  # fmt: skip
+        rows = [0, *(1 + k for k in own)]
+        w, strength = (f and f.of(len(rows), len(rows) - q) for f in moved[i])
+        if plant.rigid[i]:
+            gain = plant.strength(tuple(names[k] for k in own), low[own], high[own])
+            gain = gain if strength is None else gain * strength
+            _fill_free(held, i, rows, axis.free_body.of(len(rows)) * gain)
+            if free:
+                _fill_free(bare, i, rows, axis.free_body_unheld.of(len(rows)) * gain)
+            continue
+        poles, decay = plant.poles(i, tuple(names[k] for k in own), low[own], high[own], w)
+        damped = damped & (decay >= 0.0)
+        T = axis.period  # of Re D, what it is not below
+        least = decay * axis.x.lowest if T is None else -np.expm1(-decay * T)
+        _fill(held, i, rows, [axis.factor(*pole) for pole in poles], least, strength)
+        if free:
+            s = axis.s.of(len(rows))
+            _fill(bare, i, rows, [(s - p, residue) for p, residue in poles], decay, strength)
+    if q:
+        held.shares[:, -q:] = np.where(known, held.shares[:, -q:], FIRST * (high - low)[-q:])
+    return held, bare if free else held, damped
+
+
+def _fill_free(discs: Discs, i: int, rows: list[int], form: Affine) -> None:
+    """A free body's disc."""
+    discs.middle[i], discs.radius[i] = form.centre, (form.reach + form.rest) * (1.0 + 1e-12)
+    discs.shares[i, rows] = form.reaches
+
+
+def _fill(
+    discs: Discs, i: int, rows: list[int], poles: list[Pair], least: Array, strength: Affine | None
+) -> None:
+    """Mode i's disc: of both poles as one form, since far above a resonance they nearly cancel, or
+    a disc of each; times its strength, which may pass through 0."""
+    (D, N), (E, M) = poles
+    first, second = inverse(D), inverse(E)
+    whole = N * first + M * second
+    one, two = quotient(N, D, least, first), quotient(M, E, least, second)
+    middle, apart = one[0] + two[0], one[1] + two[1]
+    moves = one[2] + two[2]
+    if strength is not None:
+        whole, size, most = whole * strength, strength.middle, np.abs(middle) + apart
+        apart = size * apart + (strength.reach + strength.rest) * most
+        middle, moves = strength.centre * middle, size * moves + strength.reaches * most
+    radius = whole.reach + whole.rest
+    near = ~(radius <= apart) | np.isinf(radius)
+    discs.middle[i] = np.where(near, middle, whole.centre)
+    discs.radius[i] = np.where(near, apart, radius) * (1.0 + 1e-12)
+    # where the first order cancels, as at rest, what is left is due to what moves the poles
+    beyond = whole.rest * moves / np.maximum(moves.sum(axis=0), 1e-300)
+    beyond = np.where(whole.rest > CANCELLED * whole.reach, beyond, 0.0)
+    discs.shares[i, rows] = np.where(near, moves, whole.reaches + beyond)
+
+
+def quotient(
+    N: Affine, D: Affine, least: Array | float = 0.0, form: Affine | None = None
+) -> tuple[np.ndarray, Array, Array]:
+    """Centre and radius of a disc around N/D, and how each variable moves it (n, N); Re D >= least.
+
+    1/D lies in that of 1/D as a `form`, or where Re e^{-jθ}D >= d in the disc of diameter 1/d that
+    touches 0; N then turns and scales the latter, which keeps 0 on its edge. Around 0, |N|/d holds.
+    """
+    form = inverse(D) if form is None else form
+    x, y = TURNS.real[:, None], TURNS.imag[:, None]
+    along = x[..., None] * D.slope.real + y[..., None] * D.slope.imag
+    d = x * D.centre.real + y * D.centre.imag - np.abs(along).sum(1) - D.rest
+    d[len(TURNS) // 2] = np.maximum(d[len(TURNS) // 2], least)
+    best = np.argmax(d, axis=0)
+    d = d[best, np.arange(len(best))]
+    half = np.where(d > 0.0, 0.5 / np.where(d > 0.0, d, 1.0), np.inf) * (1.0 + 1e-15)
+    centre, radius = form.centre, form.reach + form.rest
+    size = N.middle
+    spread = N.reach + N.rest
+    outer = size * radius + spread * (np.abs(centre) + radius)
+    along = N.slope / np.where(size == 0.0, 1.0, N.centre)
+    longer, aside = (np.abs(part).sum(0) + N.rest / size for part in (along.real, along.imag))
+    grown = np.hypot(1.0 + longer, aside)
+    bent = np.where(longer < 1.0, aside / np.where(longer < 1.0, 1.0 - longer, 1.0), np.inf)
+    touching = size * half * grown * (1.0 + bent)
+    chosen = ~(outer <= touching)
+    edge = N.centre * TURNS[best].conj() * half * grown
+    moves = D.reaches / np.where(chosen, d, D.middle) + np.abs(along)
+    middle, radius = np.where(chosen, edge, N.centre * centre), np.where(chosen, touching, outer)
+    plain = 2.0 * N.size * half
+    middle, radius = np.where(plain < radius, 0.0, middle), np.fmin(plain, radius)
+    # where nothing is bounded the relative ones say what to divide
+    return middle, radius, moves * np.where(np.isinf(radius), 1.0, np.abs(middle) + radius)
+
+
+GUARD = 64.0 * 2.2e-16  # several times what products, inverses and norms of a few rows lose
+LEAST = 1e-3  # of the largest term: by how much a term counts at least where τ is chosen
+NEAREST = 0.05  # to where P⁻¹ - N is singular: the first guess stays so far away
+
+
+@dataclass(frozen=True)
+class Terms:
+    """n terms of N boxes: `radius` (N, n), `columns` c (n, p), `rows` q (N, n, p) and `inputs` b
+    (n, m), one of which is 0; by default b is."""
+
+    columns: Array
+    rows: np.ndarray
+    radius: Array
+    inputs: Array | None = None
+
+    def pushes(self, B: np.ndarray, Z: np.ndarray) -> Array:
+        """How far each moves e per radius, to first order (N, n): |B c_i|(|q_iᵀZ| + |b_i|)."""
+        return _lengths(B @ self.columns.T, 1) * self._seen(self.rows @ Z)
+
+    def largest(self, A: np.ndarray, B: np.ndarray, Z: np.ndarray) -> Array:
+        """γ (N,) of A (N, k, m), B (N, k, p), Z (N, p, m); infinite where none is found."""
+        if B.shape[2] == 1:
+            R = (_lengths(self.rows, 2) * np.abs(self.columns[:, 0]) * self.radius).sum(axis=1)
+            good, BZ = R < 1.0, B @ Z
+            R = np.where(good, R, 0.0)
+            left, beside = 1.0 - R * R, self.pushes(B, 0.0 * Z) * self.radius
+            value = norm(A + (R * R / left)[:, None, None] * BZ) + norm(BZ) * R / left
+            value += beside.sum(axis=1) / (1.0 - R)
+            return np.asarray(np.where(good, value * (1.0 + GUARD / (1.0 - R)), np.inf))
+        sizes = [norm(part, loosely=True)[:, None] for part in (A, B, Z)]
+        gain, seen = _lengths(B @ self.columns.T, 1), self._seen(self.rows @ Z)
+        first, tau = self._level(A, B, Z, self._guess(gain, seen, sizes[0]))
+        # where these lengths lead to no τ, those of c and q do if any do
+        gain = sizes[1] * _lengths(self.columns, 1)
+        plain = self._guess(gain, self._seen(sizes[2][..., None] * self.rows), sizes[0])
+        tau = np.where(np.isinf(first)[:, None], plain, tau)
+        return np.fmin(first, self._level(A, B, Z, tau)[0])
+
+    def _seen(self, rows: np.ndarray) -> Array:
+        """The lengths of what each sees of f (N, n)."""
+        return _lengths(rows, 2) + (0.0 if self.inputs is None else _lengths(self.inputs, 1))
+
+    def _guess(self, gain: Array, seen: Array, size: Array) -> Array:
+        """τ (N, n) where each term moves e, of `size`, by its radius times `gain` and `seen`."""
+        total = size + (gain * seen * self.radius).sum(axis=1, keepdims=True)
+        tau = _share(total * gain, self.radius * seen)
+        P, Q, _ = self._sums(tau)
+        near = np.sqrt(np.abs(np.einsum("Nab,Nba->N", P, Q)))[:, None]
+        return tau * np.where(near < np.inf, 1.0 / np.maximum(1.0 - near, NEAREST), 1.0)
+
+    def _sums(self, tau: Array) -> tuple[Array, np.ndarray, Array | float]:
+        """P, Q and Q_b (N, ·, ·)."""
+        weight = tau * self.radius**2
+        Q_b = 0.0 if self.inputs is None else _products(weight, self.inputs)
+        return (
+            _products(1.0 / tau, self.columns),
+            _adjoint(self.rows) @ (weight[..., None] * self.rows),
+            Q_b,
+        )
+
+    def _level(
+        self, A: np.ndarray, B: np.ndarray, Z: np.ndarray, tau: Array
+    ) -> tuple[Array, Array]:
+        """γ (N,) with these τ, infinite where P⁻¹ is not above N; and better τ, those with which
+        the worst f and w lie on the edges of all discs."""
+        P, Q, Q_b = self._sums(tau)
+        one, back = np.eye(P.shape[1]), _adjoint(B)
+        P += (1e-13 * _trace(P) + 1e-250)[:, None, None] * one
+        good = np.asarray(np.isfinite(P).all(axis=(1, 2)))
+        L = np.linalg.cholesky(np.where(good[:, None, None], P, one))
+        back_L = L.transpose(0, 2, 1)
+        X, N = back_L @ (back @ A + Q @ Z), back @ B + Q
+        left = one - back_L @ N @ L
+        good &= np.isfinite(left).all(axis=(1, 2))
+        values, V = np.linalg.eigh(np.where(good[:, None, None], left, one))
+        lost = GUARD * (1.0 + _trace(P) * _trace(N))
+        good &= values[:, 0] > 2.0 * lost
+        values = np.where(good[:, None], values - lost[:, None], 1.0)
+        Y = _adjoint(V) @ X
+        square = _adjoint(A) @ A + _adjoint(Z) @ Q @ Z + Q_b + _adjoint(Y) @ (Y / values[..., None])
+        good &= np.isfinite(square).all(axis=(1, 2))
+        squares, F = np.linalg.eigh(np.where(good[:, None, None], square, np.eye(A.shape[2])))
+        a, b, z, held = norm(A, True), norm(B, True), norm(Z, True), _trace(Q)
+        lost = a * a + held * z * z + squares.sum(axis=1)
+        lost += _trace(P) * (a * b + held * z) ** 2 / values[:, 0]
+        value = np.where(good, np.sqrt(squares[:, -1] + 2.0 * GUARD * lost), np.inf)
+        f = F[:, :, -1:]
+        inner = V @ ((Y @ f) / values[..., None])  # u = -L times it
+        w = np.abs(self.columns @ np.linalg.solve(back_L, inner))[..., 0] / tau
+        seen = np.abs(self.rows @ (Z @ f + L @ inner))[..., 0]
+        if self.inputs is not None:
+            seen += np.abs(self.inputs @ f)[..., 0]
+        return value, tau * _share(w, self.radius * seen)
+
+
+def norm(M: np.ndarray, loosely: bool = False) -> Array:
+    """σ_max of matrices (..., p, q); `loosely` the root of the sum of squares, which it is where
+    the rank is one and else not above."""
+    if loosely or 1 in M.shape[-2:]:
+        if M.shape[-2:] == (1, 1):
+            return np.asarray(np.abs(M[..., 0, 0]))
+        return np.asarray(np.sqrt((np.abs(M) ** 2).sum(axis=(-2, -1))))
+    return sigma_max(M)
+
+
+def _share(above: Array, below: Array) -> Array:
+    """The quotient, terms that are far smaller than others as if they were not."""
+    parts = (part + LEAST * part.max(axis=1, keepdims=True) + 1e-300 for part in (above, below))
+    above, below = parts
+    found = above / below
+    return np.where(np.isfinite(found), np.clip(found, 1e-100, 1e100), 1.0)
+
+
+def _products(weights: Array, rows: Array) -> Array:
+    """Σ w_i r_i r_iᵀ (N, p, p) of w (N, n) and r (n, p)."""
+    p = rows.shape[1]
+    return (weights @ (rows[:, :, None] * rows[:, None]).reshape(-1, p * p)).reshape(-1, p, p)
+
+
+def _adjoint(M: np.ndarray) -> np.ndarray:
+    return np.asarray(M.conj().transpose(0, 2, 1))
+
+
+def _trace(M: np.ndarray) -> Array:
+    return np.asarray(np.trace(M, axis1=1, axis2=2).real)
+
+
+def _lengths(M: np.ndarray, axis: int) -> Array:
+    return np.asarray(np.linalg.norm(M, axis=axis))

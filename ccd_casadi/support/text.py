@@ -1,0 +1,179 @@
+"""Units and numbers in words, texts that ship beside the sources, and versions."""
+
+import importlib.metadata
+import math
+import platform
+import re
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Environment, Template
+
+
+HZ = 2.0 * math.pi  # rad/s in one hertz
+LARGE = (("G", 1e-9), ("M", 1e-6), ("k", 1e-3))
+
+
+_spoken = {"m": "m", "N": "N"}
+
+
+def use_units(output: str, input_: str) -> None:
+    """From now on these are the units that `spoken` gives, until the next problem is used."""
+    _spoken.update({"m": output, "N": input_})
+
+
+def spoken(words: str) -> str:
+    """Words with metres of the plant's outputs and newtons of its inputs, in the units they have.
+
+    >>> spoken("1 N moves it 3 mm, 3 mm/N"), use_units("rad", "N m")
+    ('1 N moves it 3 mm, 3 mm/N', None)
+    >>> spoken("1 N moves it 3 mm, 3 mm/N; N/m"), use_units("m", "N")
+    ('1 N m moves it 3 mrad, 3 mrad/(N m); N m/rad', None)
+    """
+    output, force = _spoken["m"], _spoken["N"]
+    words = re.sub(r"(?<!\w)([nµum]?)m(?!\w)", rf"\g<1>{output}", words)
+    if force == "N":
+        return words
+    words = re.sub(r"\bkg\b", "kg m²", words)
+    words = re.sub(r"/N\b", f"/({force})", words)
+    return re.sub(r"(?<![\w(])([kMG]?)N\b", rf"\g<1>{force}", words)
+
+
+def display_unit(unit: str, largest: float) -> tuple[str, float]:
+    """The unit to show values up to this size in, and the factor to it: the one rule for the eye.
+
+    Lengths, times, forces and stiffnesses get the SI prefix with which the largest is 1 or more;
+    what has another unit keeps it.
+
+    >>> display_unit("m", 4e-3), display_unit("s", 2e-5), display_unit("kg", 4e-3)
+    (('mm', 1000.0), ('µs', 1000000.0), ('kg', 1.0))
+    >>> display_unit("N/m", 3.6e7)
+    ('MN/m', 1e-06)
+    """
+    if unit in ("N", "N/m", "N m", "N m/rad") and abs(largest) >= 1e4:
+        prefix, factor = next(one for one in LARGE if abs(largest) * one[1] >= 1.0)
+        return prefix + unit, factor
+    if unit not in ("m", "s", "rad") or largest == 0.0:
+        return unit, 1.0
+    for prefix, factor in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
+        if abs(largest) * factor >= 0.9995:  # which rounds to 1
+            return prefix + unit, factor
+    return f"n{unit}", 1e9
+
+
+def with_unit(value: float, unit: str, digits: int = 3) -> str:
+    """A value in the unit that an engineer would read it in.
+
+    >>> with_unit(4.1e-5, "m"), with_unit(0.01, "m"), with_unit(0.18, "s"), with_unit(0.0, "m")
+    ('41 µm', '10 mm', '180 ms', '0 m')
+    >>> with_unit(9.996e-7, "m")
+    '1 µm'
+    """
+    read, factor = display_unit(unit, value)
+    return f"{number(factor * value, digits)} {read}"
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things.
+
+    >>> counted(1, "plant"), counted(5, "plant")
+    ('1 plant', '5 plants')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def of_a_bound(excess: float) -> str:
+    """exp(excess) as a share of a bound; one that is missed by far as a multiple.
+
+    >>> of_a_bound(0.0), of_a_bound(-0.1), of_a_bound(10.0)
+    ('100 % of a bound', '90.4837 % of a bound', '2.2e+04 times a bound')
+    """
+    if excess < math.log(10.0):
+        return f"{100.0 * math.exp(excess):.6g} % of a bound"
+    return f"{math.exp(min(excess, 700.0)):.3g} times a bound"
+
+
+def small_share(share: float) -> str:
+    """A relative error in per cent; what is below rounding to an engineer is not written out.
+
+    >>> small_share(0.0123), small_share(1.9e-9)
+    ('1.2 %', 'under 0.0001 %')
+    """
+    return f"{100.0 * share:.2g} %" if share >= 1e-6 else "under 0.0001 %"
+
+
+def number(value: Any, digits: int = 5) -> str:
+    """A number to `digits` significant digits; a dash where there is none.
+
+    >>> number(72.0451741), number(1.5e-9, 3), number(None), number(1800.0), number(999.6, 3)
+    ('72.045', '1.5e-09', '–', '1800', '999.6')
+    """
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return str(value)
+    size = abs(float(value))
+    if 1.0 <= size < 1e7:
+        # never fewer digits than the whole part has: 110023 stays 110023
+        digits = max(digits, len(str(round(size))))
+    return f"{float(value):.{digits}g}"
+
+
+PLAIN = (".c", ".h", ".md", ".st", ".txt")  # what no mark-up is in
+
+
+def package_path(name: str) -> Path:
+    """Of a file of the package, by its path in there."""
+    return Path(__file__).parents[1] / name
+
+
+@cache
+def package_text(name: str) -> str:
+    """Its text."""
+    return package_path(name).read_text(encoding="utf-8")
+
+
+def template(name: str, **known: Any) -> "Template":
+    """A template of Jinja by its path; `known`: functions that it calls."""
+    return _templates().get_template(name, globals=known)
+
+
+def printable(value: Any) -> Any:
+    """A text whose control characters show as a replacement sign; another value as it is."""
+    if not isinstance(value, str) or hasattr(value, "__html__"):  # mark-up of our own
+        return value
+    return "".join(c if c.isprintable() or c in "\n\t\xa0" else "\ufffd" for c in value)
+
+
+@cache
+def _templates() -> "Environment":
+    """Texts are escaped where there is mark-up, and a name that nobody gives is an error."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    made = Environment(
+        loader=FileSystemLoader(package_path("")), undefined=StrictUndefined, finalize=printable,
+        autoescape=lambda name: not str(name).endswith(PLAIN), trim_blocks=True, lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )  # fmt: skip
+    made.globals["spoken"] = spoken
+    return made
+
+
+PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "numba")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of what the numbers depend on."""
+    found = {"python": platform.python_version(), "ccd-casadi": _version("ccd-casadi")}
+    return found | {name: _version(name) for name in PACKAGES}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
