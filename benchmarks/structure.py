@@ -1,0 +1,127 @@
+"""How the code is cut: modules, functions, constants, documentation, names; beside other packages.
+
+    python benchmarks/structure.py [FOLDER ...]
+
+Counts by the syntax tree alone, of the two packages and of each folder that is named (a checkout of
+scikit-fem, optimistix, pyMOR, python-control, ...). A *bare constant* is an upper-case name of a
+module that is bound to numbers. *Used across rooms*: public functions and classes that another
+package folder imports; documented is one whose docstring has a section of NumPy's (Parameters,
+Returns, Attributes, Raises).
+"""
+
+import ast
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import mean, median
+
+ROOT = Path(__file__).parents[1]
+OURS = [ROOT / "ccd_casadi", ROOT / "surrogates"]
+SECTIONS = ("Parameters\n", "Returns\n", "Attributes\n", "Raises\n")
+Tree = tuple[Path, ast.Module, list[str]]
+Definition = ast.FunctionDef | ast.ClassDef
+
+
+def trees(folders: list[Path]) -> list[Tree]:
+    """Every module: its path, syntax tree and lines."""
+    found = []
+    for path in sorted(p for folder in folders for p in folder.rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        found.append((path, ast.parse(text), text.splitlines()))
+    return found
+
+
+def bare_constants(tree: ast.Module) -> Iterator[str]:
+    """Upper-case names of a module that are bound to numbers or tuples of these."""
+
+    def is_number(node: ast.expr | None) -> bool:
+        if isinstance(node, ast.UnaryOp):
+            return is_number(node.operand)
+        if isinstance(node, ast.Tuple):
+            return bool(node.elts) and all(map(is_number, node.elts))
+        return isinstance(node, ast.Constant) and type(node.value) in (int, float, complex)
+
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        if isinstance(node, ast.AnnAssign):
+            targets = [node.target]
+        if not targets or not is_number(getattr(node, "value", None)):
+            continue
+        for name in ast.walk(targets[0]):
+            if isinstance(name, ast.Name) and name.id.isupper():
+                yield name.id
+
+
+def across_rooms(modules: list[Tree]) -> set[tuple[str, str]]:
+    """(module, name) of what a module of another folder imports."""
+    return {
+        (node.module, alias.name)
+        for path, tree, _ in modules
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module
+        and node.module.split(".")[-2:-1] != [path.parent.name]
+        for alias in node.names
+    }  # fmt: skip
+
+
+def counted(folders: list[Path]) -> dict[str, str]:
+    """What the table says of these folders."""
+    modules = trees(folders)
+    functions = [
+        n for _, tree, _ in modules for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)
+    ]
+    lengths = [n.end_lineno - n.lineno + 1 for n in functions if n.end_lineno]
+    lines = sum(len(text) for _, _, text in modules)
+    constants = sum(len(list(bare_constants(tree))) for _, tree, _ in modules)
+    comments = sum(line.lstrip().startswith("#") for _, _, text in modules for line in text)
+    used = across_rooms(modules)
+    rooms = {name.rpartition(".")[2]: set() for name, _ in used}  # type: dict[str, set[str]]
+    for module, name in used:
+        rooms[module.rpartition(".")[2]].add(name)
+    public = [
+        node
+        for path, tree, _ in modules
+        for node in tree.body
+        if isinstance(node, Definition) and node.name in rooms.get(path.stem, ())
+    ]
+    documented = [n for n in public if any(s in (ast.get_docstring(n) or "") for s in SECTIONS)]
+    classes = Counter(
+        n.name for _, tree, _ in modules for n in tree.body if isinstance(n, ast.ClassDef)
+    )
+    stems = Counter(path.stem for path, _, _ in modules if path.stem[0] != "_")
+    sizes = [len(text) for _, _, text in modules]
+    return {
+        "modules": f"{len(modules)}",
+        "lines": f"{lines}",
+        "lines of a module, median": f"{median(sizes):g}",
+        "most lines of a module": f"{max(sizes)}",
+        "lines of a function, mean": f"{mean(lengths):.1f}",
+        "bare constants": f"{constants} ({1e3 * constants / lines:.1f} a thousand lines)",
+        "own-line comments": f"{100.0 * comments / lines:.1f} %",
+        "used across rooms": f"{len(public)}",
+        "documented of these": f"{100.0 * len(documented) / max(len(public), 1):.0f} %",
+        "class names twice": f"{sum(count > 1 for count in classes.values())}",
+        "module names twice": f"{sum(count > 1 for count in stems.values())}",
+    }
+
+
+def main() -> None:
+    """Print the table, ours first."""
+    columns = {"ours": counted(OURS)} | {Path(f).name: counted([Path(f)]) for f in sys.argv[1:]}
+    names = list(columns)
+    print("| | " + " | ".join(names) + " |\n|---|" + "---|" * len(names))
+    for row in columns["ours"]:
+        print(f"| {row} | " + " | ".join(columns[name][row] for name in names) + " |")
+    scripts = sum(len(p.read_text().splitlines()) for p in (ROOT / "benchmarks").glob("*.py"))
+    words = sum(len(p.read_text().split()) for p in (ROOT / "docs/development").glob("*.md"))
+    patched = sum(
+        p.read_text().count("monkeypatch.setattr") for p in (ROOT / "tests").rglob("*.py")
+    )
+    print(
+        f"\nbenchmarks {scripts} lines; docs/development {words} words; tests patch {patched} times"
+    )
+
+
+if __name__ == "__main__":
+    main()
