@@ -1,0 +1,153 @@
+"""What `tune` is given: files, responses and models, each as lines that a search can run on."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from ccd_casadi.lti.loop import delay_parts, delayed, sampled
+from ccd_casadi.lti.state_space import FLANKS, StateSpace, balanced, frequency_grid, root_flanks
+from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
+from ccd_casadi.plants.response_table import holds_lines
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.terminal import Tell
+from ccd_casadi.support.text import HZ
+from ccd_casadi.synthesis import interchange
+
+PER_DECADE = 60
+BELOW, ABOVE = 3e-3, 0.98  # first line over the slowest root, last line over half the rate
+ON_AXIS = 1e-8  # |Re p| over |p| up to which a pole has no damping
+BESIDE = 1e-3  # half width that it is taken to have for its lines
+HIDDEN = 1e-12  # relative: how near a mode is to one that is not driven or not seen
+NEARBY = np.linspace(0.98, 1.02, 9)
+APART = 1e-6  # relative, of lines
+AT_REST = 1e-7  # of the largest root: below, it lies at 0
+
+Plant = MeasuredResponse | StateSpace
+
+
+def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
+    """A plant as it was given, and what it is behind in s."""
+    if isinstance(item, str | Path):
+        name, item = Path(item).name, _of_file(Path(item))
+        tell(f"{name}: {item.words}")
+    elif hasattr(item, "frdata"):
+        item = from_control(item)
+    if isinstance(item, MeasuredResponse):
+        return item, delay
+    if isinstance(item, interchange.NamedSystem):
+        return item.system, delay + item.delay
+    return interchange.from_control(item), delay
+
+
+def as_lines(
+    item: Plant, rate_hz: float | None, delay: float
+) -> tuple[MeasuredResponse, StateSpace | None]:
+    """The response as the controller sees it; of a model also itself in discrete time."""
+    if isinstance(item, MeasuredResponse):
+        kept = item.hz < (np.inf if rate_hz is None else 0.5 * rate_hz)
+        lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
+        G = (item.matrix * lag).reshape(item.G.shape)
+        spread = item.spread if item.spread is None else item.spread[kept]
+        return replace(item, hz=item.hz[kept], G=G[kept], spread=spread), None
+    system = item
+    own = system.period
+    if own and rate_hz is None:
+        rate_hz = 1.0 / own
+    if rate_hz is None:
+        words = "rate_hz is missing: nothing else limits the bandwidth of a controller for a model"
+        raise UserError(f"{words}; give the controller's rate (--rate-hz) and its delay (--delay)")
+    if system.D.any():
+        raise UserError("the plant has feedthrough; give it the lag of its sensor or actuator")
+    T = 1.0 / rate_hz
+    if not own:
+        model = sampled(system, T, delay)
+    elif not np.isclose(own, T) or not np.isclose(delay_parts(T, delay)[1], 0.0, atol=1e-6 * T):
+        raise UserError("a plant in discrete time runs at its rate, and a delay of whole periods")
+    else:
+        whole = delay_parts(T, delay)[0]
+        model = delayed(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)
+    _require_seen(system)
+    top, rates = np.pi / T, system.rates
+    rest = np.abs(rates) <= AT_REST * np.abs(rates).max(initial=0.0)
+    zeros = system.rates_of(system.zeros(1.0 if own else top))
+    if (np.abs(zeros) <= AT_REST * top).any():
+        raise UserError("the plant has a zero at 0: no controller holds its output at rest")
+    roots = np.concatenate([rates[~rest], zeros, [top]])
+    low = BELOW * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
+    roots = _folded(roots, T)
+    undamped = np.abs(rates.real) <= ON_AXIS * np.abs(rates)
+    axis = _folded(rates[undamped & ~rest & (rates.imag > 0.0)], T).imag
+    narrow = np.abs(roots.real) <= ON_AXIS * np.abs(roots)
+    beside = root_flanks(
+        BESIDE * np.abs(roots[narrow]) + 1j * roots[narrow].imag, FLANKS[FLANKS != 0.0]
+    )
+    omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),
+                           root_flanks(roots[~narrow]), beside, apart=APART)  # fmt: skip
+    close = np.abs(omega[:, None] - axis) <= 0.1 * BESIDE * axis
+    omega = omega[~close.any(axis=1)]
+    unstable = int((rates[~rest & ~undamped].real > 0.0).sum())
+    G = model.response(omega)
+    one = G.shape[1:] == (1, 1)
+    found = MeasuredResponse(omega / HZ, G[:, 0, 0] if one else G, unstable, modelled=True,
+                             undamped_hz=tuple((axis / HZ).tolist()))  # fmt: skip
+    return found, model
+
+
+def _folded(rates: np.ndarray, T: float) -> np.ndarray:
+    """Rates in 1/s with their frequencies where a sampled system has them, up to half the rate."""
+    turns = np.abs(rates.imag) * T
+    return np.asarray(
+        rates.real + 1j * np.abs(turns - 2.0 * np.pi * np.round(turns / (2.0 * np.pi))) / T
+    )
+
+
+def _require_seen(system: StateSpace) -> None:
+    """Raises UserError where a mode that is not stable is not driven or not measured: Hautus."""
+    if not system.B.any() or not system.C.any():
+        raise UserError("the plant is 0: no input moves what is measured")
+    A, B, C = balanced(system.A, system.B, system.C)
+    size = np.linalg.norm(A, 2) or 1.0
+    parts = {"driven by no input": (B * (size / np.linalg.norm(B, 2)), 1),
+             "seen at no output": (C * (size / np.linalg.norm(C, 2)), 0)}  # fmt: skip
+    rates = np.log(system.poles.astype(complex) + 0j) if system.period else system.poles
+    for root, rate in zip(system.poles, rates, strict=True):
+        if not rate.real >= -ON_AXIS * max(abs(rate), AT_REST * size):
+            continue
+        for words, (beside, axis) in parts.items():
+            joined = np.concatenate([root * np.eye(len(A)) - A, beside], axis=axis)
+            if np.linalg.svd(joined, compute_uv=False)[-1] <= HIDDEN * size:
+                at = f"{abs(rate) / (system.period or 1.0) / HZ:.4g} Hz"
+                raise UserError(f"a mode of the plant at {at} is not stable and {words}: no "
+                                "controller changes it; leave it out")  # fmt: skip
+
+
+def _of_file(path: Path) -> MeasuredResponse | interchange.NamedSystem:
+    """A measured response, or the one model of a .mat file."""
+    try:
+        variables = scipy.io.whosmat(path) if path.suffix.lower() == ".mat" else []
+    except Exception:  # a damaged file: what reads it says so
+        variables = []
+    names = {name for name, _, _ in variables}
+    if holds_lines(sorted(names)) or not (
+        {"A", "B", "C"} <= names or any(kind == "struct" for _, _, kind in variables)
+    ):
+        return read_frequency_response(path)
+    systems = interchange.read_mat(path).systems
+    if len(systems) != 1:
+        raise UserError(f"{path}: holds the systems {', '.join(systems)}; save one plant a file")
+    return next(iter(systems.values()))
+
+
+def with_lines_near(
+    response: MeasuredResponse, G: StateSpace, omega: list[float]
+) -> MeasuredResponse:
+    """With lines where |S| was too large between two, or the bandwidth ends, and nearby."""
+    more = (np.array(omega)[:, None] * NEARBY).ravel() / HZ
+    known = response.hz
+    hz = frequency_grid(float(known[0]), float(known[-1]), 2, known, more, apart=APART)
+    axis = np.array(response.undamped_hz)
+    hz = hz[~(np.abs(hz[:, None] - axis) <= 0.1 * BESIDE * axis).any(axis=1)]
+    return replace(response, hz=hz, G=G.response(HZ * hz).reshape(len(hz), *response.G.shape[1:]))
