@@ -1,0 +1,225 @@
+"""Columns of numbers from CSV, .npz and .mat files, and what their names and units mean."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from ccd_casadi.support.errors import UserError, described
+from ccd_casadi.support.text import HZ
+
+NAMES = {
+    "f": "f", "freq": "f", "frequency": "f",
+    "re": "re", "real": "re", "real part": "re",
+    "im": "im", "imag": "im", "imaginary": "im", "imaginary part": "im",
+    "magnitude": "size", "mag": "size", "amplitude": "size",
+    "phase": "angle", "angle": "angle",
+    "g": "G", "response": "G",
+    "spread": "spread", "coherence": "coherence",
+}  # fmt: skip
+COMPLIANCE = {"": 1.0, "m/n": 1.0, "mm/n": 1e-3, "um/n": 1e-6, "µm/n": 1e-6, "nm/n": 1e-9}
+UNITS = {
+    "f": {"hz": 1.0, "khz": 1e3, "rad/s": 1.0 / HZ, "rad s": 1.0 / HZ},
+    "size": COMPLIANCE | {"db": -1.0},  # a size in decibels
+    "angle": dict.fromkeys(("deg", "degree", "degrees", "°"), np.pi / 180.0)
+    | dict.fromkeys(("rad", "radian", "radians"), 1.0),
+    "re": COMPLIANCE, "im": COMPLIANCE, "G": COMPLIANCE, "spread": COMPLIANCE,
+    "coherence": {"": 1.0},
+}  # fmt: skip
+WANTED = (
+    "f_hz and re, im (or magnitude or magnitude_db, and phase_deg or phase_rad, or a complex G)"
+)
+READ = "CSV, .npz and .mat are read"
+DIGITS = "0123456789+-."
+
+
+def npz_arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or described(error)
+        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
+
+
+@dataclass(frozen=True)
+class Column:
+    """Values under a name; `rows`: the numbers of the lines of the file they are from."""
+
+    name: str
+    values: np.ndarray
+    rows: tuple[int, ...] = ()
+
+
+def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[Column]:
+    """Those that hold numbers; texts are notes."""
+    found = []
+    for name, value in content.items():
+        numbers = np.asarray(value.toarray() if scipy.sparse.issparse(value) else value)
+        if name.startswith("__") or numbers.dtype.kind in "US" or not numbers.size:
+            continue
+        if numbers.dtype.kind not in "biufc":
+            raise UserError(f"{path}: {name}: holds no numbers; drop it")
+        if meaning_of(name) is None and not numbers.any():
+            continue
+        if numbers.ndim != 3:
+            if numbers.ndim > 1 and numbers.size != max(numbers.shape):
+                words = "is no response: give (lines,) for one channel or (lines, outputs, inputs)"
+                raise UserError(f"{path}: {name}: {numbers.shape} {words}")
+            numbers = numbers.ravel()
+        found.append(Column(name, numbers))
+    return found
+
+
+def columns_of_csv(path: Path) -> tuple[list[Column], list[str]]:
+    """The columns of a text table, and what of its form is to be reported."""
+    text, notes = _text(path)
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1)
+             if line.strip(" \t,;") and not line.lstrip().startswith(("#", "%"))]  # fmt: skip
+    if not lines:
+        raise UserError(f"{path}: is empty; it needs a header and lines of numbers")
+    if lines[0][1].strip() == "-1" or path.suffix.lower() in (".uff", ".unv"):
+        raise UserError(f"{path}: is a universal file; {READ}: write it as one of them")
+    last = lines[-1][1]
+    mark = next((mark for mark in "\t;," if mark in last), None)
+    rows = [(i, _cells(line, mark)) for i, line in lines]
+    comma, note = _decimal_comma(path, rows, mark)
+    notes += note
+    numeric = (len(row) > 1 and all(_is_number(cell, comma) for cell in row) for _, row in rows)
+    first = next((k for k, found in enumerate(numeric) if found), None)
+    if first is None:
+        bad = next((cell for cell in rows[-1][1] if not _is_number(cell, comma)), last.strip())
+        words = f"is not a table of numbers with a header: {bad!r} in line {rows[-1][0]}"
+        raise UserError(f"{path}: {words} is no number; {READ}")
+    if first == 0:
+        raise UserError(f"{path}: line {rows[0][0]}: has no header above it; name {WANTED}")
+    at = first - 1
+    names = rows[at][1]
+    units = {unit for known in UNITS.values() for unit in known} | {"-", "abs", "linear"}
+    if (
+        at
+        and all(cell.casefold() in units for cell in names)
+        and len(rows[at - 1][1]) == len(names)
+    ):
+        names = [_with_unit(path, rows[at][0], name, unit)
+                 for name, unit in zip(rows[at - 1][1], names, strict=True)]  # fmt: skip
+        notes.append(f"line {rows[at][0]} holds the units")
+        at -= 1
+    if at:
+        notes.append(f"what is above the header in line {rows[at][0]} is left out")
+    table = []
+    for i, row in rows[first:]:
+        if len(row) != len(names):
+            words = f"has {len(row)} cells and the header {len(names)}"
+            if mark == "," and len(row) == 2 * len(names):
+                words += ": are its decimals commas too? separate the columns by semicolons"
+            raise UserError(f"{path}: line {i}: {words}")
+        table.append([_number(path, i, cell, comma) for cell in row])
+    numbers = tuple(i for i, _ in rows[first:])
+    values = np.array(table)
+    parts = [values[:, j] if values[:, j].imag.any() else values[:, j].real
+             for j in range(len(names))]  # fmt: skip
+    return [Column(n, part, numbers) for n, part in zip(names, parts, strict=True)], notes
+
+
+def _text(path: Path) -> tuple[str, list[str]]:
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        try:
+            return raw.decode("utf-16"), ["encoded as UTF-16"]
+        except UnicodeDecodeError:
+            raise UserError(f"{path}: is not a table of numbers; {READ}") from None
+    if b"\0" in raw:
+        raise UserError(f"{path}: is not a table of numbers but a binary file; {READ}")
+    try:
+        return raw.decode("utf-8-sig"), []
+    except UnicodeDecodeError:
+        return raw.decode("latin-1"), ["encoded as Latin-1"]
+
+
+def _cells(line: str, mark: str | None) -> list[str]:
+    parts = [part.strip().strip('"').strip() for part in line.split(mark)]
+    while len(parts) > 1 and not parts[-1]:
+        parts.pop()
+    return parts
+
+
+def _decimal_comma(
+    path: Path, rows: Sequence[tuple[int, list[str]]], mark: str | None
+) -> tuple[bool, list[str]]:
+    """Whether its decimals are commas, and what is to be reported of its form."""
+    word = {"\t": "tabs", ";": "semicolons", None: "spaces"}.get(mark, "")
+    notes = [f"separated by {word}"] if word else []
+    if mark == ",":
+        return False, notes
+    cells = [
+        (i, c) for i, row in rows for c in row if c and set(c.casefold()) <= set(DIGITS + ",e")
+    ]
+    with_comma = [(i, c) for i, c in cells if "," in c]
+    if not with_comma:
+        return False, notes
+    both = next((i for i, c in with_comma if "." in c or c.count(",") > 1), None)
+    if both is None and any("." in c for _, c in cells):
+        both = with_comma[0][0]
+    thousands = all(re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", c) for _, c in with_comma)
+    if both is not None or thousands:
+        words = "a comma may be a decimal or part thousands; write decimals with a point"
+        raise UserError(f"{path}: line {both or with_comma[0][0]}: {words}")
+    return True, [*notes, "decimals by commas"]
+
+
+def _is_number(cell: str, comma: bool) -> bool:
+    try:
+        _parsed(cell, comma)
+    except ValueError:
+        return False
+    return True
+
+
+def _parsed(cell: str, comma: bool) -> complex:
+    cell = cell.replace(",", ".") if comma else cell
+    return complex(re.sub(r"(?<=[\d.])[iI]$", "j", cell.replace(" ", "")))
+
+
+def _number(path: Path, line: int, cell: str, comma: bool) -> complex:
+    try:
+        found = _parsed(cell, comma)
+    except ValueError:
+        raise UserError(f"{path}: line {line}: {cell!r} is not a number") from None
+    if not np.isfinite(found):
+        raise UserError(f"{path}: line {line}: {cell!r} is not a finite number; drop the line")
+    return found
+
+
+def meaning_of(name: str) -> tuple[str, str] | None:
+    """The quantity under a name, and its unit as it is written; None where it is not known."""
+    name = " ".join(name.replace("_", " ").split()).casefold()
+    if name == "hz":
+        return "f", "hz"
+    if name in NAMES:
+        return NAMES[name], ""
+    bracket = re.fullmatch(r"(.*?)\s*[(\[]\s*(.*?)\s*[)\]]", name)
+    base, unit = bracket.groups() if bracket else name.split(" ", 1) if " " in name else (name, "")
+    if base not in NAMES:
+        return None
+    unit = "" if bracket and unit in ("-", "1", "abs", "linear") else unit
+    return NAMES[base], unit
+
+
+def _with_unit(path: Path, line: int, name: str, unit: str) -> str:
+    """The name of a column with the unit that a line below it states."""
+    found = meaning_of(name)
+    if not unit or found is None or not found[1]:
+        return f"{name} ({unit})" if unit else name
+    factors = [UNITS[found[0]].get(word) for word in (found[1], unit.casefold())]
+    if factors[0] != factors[1]:
+        raise UserError(f"{path}: line {line}: gives {name!r} the unit {unit!r}; keep one")
+    return name
