@@ -13,7 +13,7 @@ from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 from ccd_casadi.studies.backends import SOLVERS, TITLES, synthesise_with, verdicts
 from ccd_casadi.support.worker_process import Runner
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path += [str(Path(__file__).parents[1] / folder) for folder in (".", "tests")]
 
 from oracles import lmi
 

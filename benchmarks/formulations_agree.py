@@ -31,7 +31,7 @@ from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, true_inner
 from ccd_casadi.plants.plant import hardware_cost
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path += [str(Path(__file__).parents[1] / folder) for folder in (".", "tests")]
 
 from oracles.chain_plants import chain_problem
 

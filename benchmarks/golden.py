@@ -16,7 +16,7 @@ from typing import Any
 
 from processors import ROOT, available
 
-sys.path.append(str(ROOT / "tests"))
+sys.path += [str(ROOT), str(ROOT / "tests")]
 
 from oracles.golden import FILE, apart, cases, solved
 

@@ -33,7 +33,7 @@ from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth, started
 from ccd_casadi.plants.scaling import ScaledPlant
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path += [str(Path(__file__).parents[1] / folder) for folder in (".", "tests")]
 
 from oracles.random_sections import case, impossible
 from oracles.sections_judge import Case

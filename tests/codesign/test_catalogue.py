@@ -310,6 +310,7 @@ def listed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_is_of_the_value_that_was_chosen(listed_run: Path) -> None:
     run = read_run(listed_run)
     result = run.result

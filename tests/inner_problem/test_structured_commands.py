@@ -171,6 +171,7 @@ def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
         assert (drawn.survived, drawn.draws) == (survived, 40)
 
 
+@pytest.mark.slow
 def test_inner_and_deploy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert inner_main([str(folder / "quick.toml"), "--theta", "m1=59,m2=59", *COMMON]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -88,6 +88,7 @@ def kink(problem: CoDesignProblem, total: float) -> StructuredValue:
     return at(meet)[0]
 
 
+@pytest.mark.slow
 def test_the_co_design_ends_on_a_kink_that_is_an_optimum(
     anchored: CoDesignProblem, tmp_path: Path
 ) -> None:

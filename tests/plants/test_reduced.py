@@ -63,6 +63,7 @@ def test_at_a_known_theta_displacements_move_as_those_of_the_elements(stage: Rib
     np.testing.assert_allclose(found, moved, atol=5e-3 * np.abs(moved).max())
 
 
+@pytest.mark.slow
 def test_beside_what_is_known_it_is_off_by_the_square_of_the_way() -> None:
     known = [HERE]
 

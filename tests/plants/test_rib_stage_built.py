@@ -37,8 +37,7 @@ def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
         loop = closed_loop(sampled(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K).S
         figures = sampled_figures(loop)
         assert figures.stable
-        # It was designed on a suspension: on the free stage its peak is 9e-4 above S_max.
-        assert figures.sensitivity_peak <= built.S_MAX * (1.0 + 1e-3)
+        assert figures.sensitivity_peak <= built.S_MAX * (1.0 + 1e-4)
         assert figures.bandwidth > kept["bandwidth_hz"] * built.HZ * (1.0 - 1e-3)
 
 

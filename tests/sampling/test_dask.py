@@ -22,6 +22,7 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> None:
     found = []
     for name, pool in (("serial", Workers(1)), ("dask", Cluster(shared.address))):

@@ -243,6 +243,7 @@ print(json.dumps([part.tolist() for part in everything()]))
 """
 
 
+@pytest.mark.slow
 def test_the_kernels_are_what_they_say_as_plain_python() -> None:
     """Interpreted they have the same constraints, slopes and curvature as compiled."""
     path = os.pathsep.join(str(ROOT / f) for f in (".", "tests"))

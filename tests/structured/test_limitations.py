@@ -231,6 +231,7 @@ def test_two_plants_of_the_set_forbid_more_than_the_model() -> None:
     assert reached == [False, True]
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(ROOT / "runs" / "two_mass_built.toml"), "--theta", "m1=60,m2=60"]) == 0
     answer = json.loads(capsys.readouterr().out)

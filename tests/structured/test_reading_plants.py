@@ -226,6 +226,7 @@ def hidden_case(seed: int) -> tuple[StateSpace, MeasuredResponse]:
     return G, MeasuredResponse(hz, lines, poles_at_zero=2)
 
 
+@pytest.mark.slow
 def test_no_loop_is_sure_that_a_hidden_resonance_makes_unstable() -> None:
     """What is sure is stable; of what is not some are, and some are not."""
     sure, unstable = 0, 0

@@ -106,6 +106,7 @@ def test_a_judge_without_an_answer_has_not_passed(monkeypatch: pytest.MonkeyPatc
     assert not found.design.usable
 
 
+@pytest.mark.slow
 @few(max_examples=25)
 @given(st.integers(0, 10**6), st.floats(0.05, 20.0), st.integers(0, 2), st.booleans())
 def test_lines_are_judged_as_the_poles_of_the_loop_are(

@@ -147,6 +147,7 @@ def flexible_errors(seed: int) -> tuple[Errors, bool]:
     return check(plant_at, case.theta, case.weights), limited
 
 
+@pytest.mark.slow
 def test_total_derivatives_of_flexible_plants_of_both_limits() -> None:
     results = [flexible_errors(seed) for seed in (5, 23)]
     total = summed([errors for errors, _ in results])
