@@ -11,7 +11,7 @@ from oracles.helpers import HZ, problem
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import closed_loop
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.synthesis import second_engine
 from ccd_casadi.synthesis.second_engine import AGREEMENT, second_opinion, weighted_loop
 from ccd_casadi.synthesis.synthesis import Design, synthesise
@@ -89,3 +89,31 @@ def test_a_false_claim_an_unstable_loop_and_no_answer_are_told_apart(
         unknown = second_opinion(plant, design.controller)
         assert not unknown.known
         assert "SLICOT has no" in unknown.reason
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_stiff_link_hides_no_peak(seed: int) -> None:
+    """A speck of mass on a stiff spring: the second engine meets what a dense grid meets."""
+    rng = np.random.default_rng(seed)
+    mass = np.array([5.0, 7.0, 10.0 ** rng.uniform(-6.0, -4.0)])
+    springs = (5e4, 1e6, 10.0 ** rng.uniform(8.0, 10.0))  # to ground, between, the link
+    K = np.diag([springs[0], 0.0, 0.0])
+    for i, k in enumerate(springs[1:]):
+        K[i : i + 2, i : i + 2] += k * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    D = 1e-5 * K + np.diag([5.0, 5.0, 0.0])
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-K / mass[:, None], -D / mass[:, None]]])
+    B = np.concatenate([np.zeros(3), [1.0 / mass[0], 0.0, 0.0]])[:, None]
+    plant = StateSpace(A, B, np.eye(6)[:1], np.zeros((1, 1)))
+    pole = 2e3  # a lead: k (1 + s/40)/(1 + s/pole)
+    gain = 2e4 * rng.uniform(0.5, 2.0)
+    lead = StateSpace(
+        np.array([[-pole]]), np.array([[1.0]]),
+        np.array([[gain * pole * (1.0 - pole / 40.0)]]), np.array([[gain * pole / 40.0]]),
+    )  # fmt: skip
+    opinion = second_opinion(plant, lead)
+    assert opinion.stable
+    omega = np.geomspace(1.0, 3e3, 20_000)
+    s = 1j * omega
+    G = np.array([np.linalg.solve(K + x * D + x * x * np.diag(mass), np.eye(3)[0])[0] for x in s])
+    S = 1.0 / (1.0 + G * gain * (1.0 + s / 40.0) / (1.0 + s / pole))
+    assert opinion.norms["S"] >= np.abs(S).max() * (1.0 - 1e-6)
