@@ -110,5 +110,5 @@ def test_the_library_computes_with_one_blas_thread() -> None:
         after = threads()
     assert seen
     assert {count for each in seen for count in each.values()} == {1}
-    assert set(before.values()) == {2}
+    assert 2 in before.values()  # not every BLAS takes more than one
     assert before.items() <= after.items()  # another test may have another library loaded

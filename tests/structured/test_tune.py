@@ -4,6 +4,7 @@ import json
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import control
 import numpy as np
@@ -22,7 +23,7 @@ from ccd_casadi.fixed_structure.judgement import judge_lines
 from ccd_casadi.fixed_structure.line_problem import line_problem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
-from ccd_casadi.studies import tuning
+from ccd_casadi.studies import tuned_plants, tuning
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.tune import main
@@ -79,17 +80,17 @@ def test_every_form_of_a_plant_is_the_same_plant(tmp_path: Path) -> None:
     np.testing.assert_allclose([d.bandwidth / found[0].bandwidth for d in found], 1.0, rtol=1e-2)
 
 
-@pytest.mark.parametrize("wrong", ["sampled", "realised"])
+@pytest.mark.parametrize(("place", "wrong"), [(tuned_plants, "sampled"), (tuning, "realised")])
 def test_what_a_search_gets_wrong_the_judge_refutes(
-    monkeypatch: pytest.MonkeyPatch, wrong: str
+    monkeypatch: pytest.MonkeyPatch, place: ModuleType, wrong: str
 ) -> None:
     """A plant with a third of its gain, and code with a third of the controller's."""
-    right = getattr(tuning, wrong)
+    right = getattr(place, wrong)
 
     def third(system: StateSpace, *others: float) -> object:
         return right(replace(system, C=system.C / 3.0, D=system.D / 3.0), *others)
 
-    monkeypatch.setattr(tuning, wrong, third)
+    monkeypatch.setattr(place, wrong, third)
     found = ccd.tune(1.0 / (s**2 * (s + 10.0)), rate_hz=200.0, starts=4)
     assert found.judge.passed is False
     assert not found.design.usable
