@@ -17,7 +17,8 @@ from ccd_casadi.plants.differenced import reparametrised
 from ccd_casadi.plants.modal import FREE, ModalPlant, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.support.arrays import Array, VectorCallback, states
+from ccd_casadi.support.arrays import Array, states
+from ccd_casadi.support.casadi_callback import VectorCallback
 
 REMEMBERED = 64  # θ whose figures are kept
 

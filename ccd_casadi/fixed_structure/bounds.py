@@ -32,17 +32,6 @@ def kind_and_channel(name: str) -> tuple[str, str]:
     return kind, channel
 
 
-BINDS = {  # by kind of bound, as a case has it
-    "S_MAX": "S_max",
-    "SHAPE": "shape",
-    "LEVEL": "|S| below omega_b",
-    "S_LOW": "S_low",
-    "KS": "weighted_level of KS",
-    "T": "weighted_level of T",
-    "GS": "compliance_max",
-}
-
-
 def key_words(name: str) -> str:
     """The key of a bound by kind and channel, or by the name of a figure over it."""
     kind, channel = kind_and_channel(name)

@@ -16,7 +16,8 @@ from ccd_casadi.inner_problem.problem import (
     true_design,
 )
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, hardware_slopes
-from ccd_casadi.support.arrays import Array, VectorCallback
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, synthesise

@@ -14,7 +14,8 @@ import numpy as np
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.support.arrays import Array, VectorCallback
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import require
 
 om: Any = require("openmdao.api", "openmdao")

@@ -19,7 +19,8 @@ from ccd_casadi.plants.plant import (
     model_parts,
     named_values,
 )
-from ccd_casadi.support.arrays import Array, VectorCallback
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import raised_words
 

@@ -37,7 +37,8 @@ from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.studies.steepest_descent import baseline_of
-from ccd_casadi.support.arrays import Array, VectorCallback
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.text import HZ, number

@@ -1,13 +1,7 @@
-"""The array type, linear recurrences, and numeric functions as casadi.Function."""
+"""The array type, and linear recurrences of arrays."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
-
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-
-from ccd_casadi.support.interrupts import ctrl_c_pending
 
 Array = NDArray[np.float64]
 
@@ -35,66 +29,3 @@ def states(A: Array, driven: Array) -> Array:
         x[:, k] += start
         start = start @ A.T
     return x[:, :steps].reshape(-1, len(A))[: len(driven)]
-
-
-Map = Callable[[Array], Array]
-
-
-class _Dense(ca.Callback):
-    """The first of some inputs -> a dense output."""
-
-    def __init__(
-        self, name: str, inputs: Sequence[ca.Sparsity], output: ca.Sparsity,
-        values: Map, options: Mapping[str, Any],
-    ) -> None:  # fmt: skip
-        ca.Callback.__init__(self)
-        self._inputs, self._output, self._values = inputs, output, values
-        self.construct(name, options)
-
-    def get_n_in(self) -> int:
-        return len(self._inputs)
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return self._inputs[i]
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return self._output
-
-    def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
-        return [self._values(np.array(arguments[0]).ravel())]
-
-
-class VectorCallback(_Dense):
-    """x (n,) -> values (m,) and ∂values (m, n); keep a reference to it while it is in use.
-
-    NaN values make IPOPT shorten its step. Hessians are not available, and a quasi-Newton method is
-    to be used, unless x is of the order of 1 and `hessians` asks for CasADi's central differences
-    of the Jacobian.
-    """
-
-    def __init__(
-        self, name: str, inputs: int, outputs: int, values: Map, jacobian: Map,
-        hessians: bool = False,
-    ) -> None:  # fmt: skip
-        column, out = (ca.Sparsity.dense(size, 1) for size in (inputs, outputs))
-        super().__init__(name, [column], out, values, {})
-        self._sizes, self._jacobian, self._hessians = (outputs, inputs), jacobian, hessians
-        self._derivative: ca.Callback | None = None
-
-    def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
-        if ctrl_c_pending():  # NaN ends IPOPT quickly; the interrupt is raised when it has returned
-            return [np.full(self._sizes[0], np.nan)]
-        return super().eval(arguments)
-
-    def has_jacobian(self) -> bool:
-        return True
-
-    def get_jacobian(
-        self, name: str, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]
-    ) -> ca.Function:
-        more = {"enable_fd": True, "fd_method": "central"} if self._hessians else {}
-        inputs = [*self._inputs, ca.Sparsity(self._sizes[0], 1)]  # of its own output none is used
-        self._derivative = _Dense(
-            name, inputs, ca.Sparsity.dense(*self._sizes), self._jacobian, {**options, **more}
-        )
-        return self._derivative

@@ -15,7 +15,8 @@ from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
 from ccd_casadi.plants.differenced import remembered, with_fixed
 from ccd_casadi.plants.plant import Mechanics, Plant
-from ccd_casadi.support.arrays import Array, VectorCallback
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import PlantError, require
 
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")  # of the rigid body, about its centre of gravity
