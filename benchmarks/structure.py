@@ -4,7 +4,8 @@
 
 Counts by the syntax tree alone, of the two packages and of each folder that is named (a checkout of
 scikit-fem, optimistix, pyMOR, python-control, ...). A *bare constant* is an upper-case name of a
-module that is bound to numbers. *Used across rooms*: public functions and classes that another
+module that is bound to numbers; of ours, neither one of drawing nor of `EXEMPT` (physics, units,
+indices). *Used across rooms*: public functions and classes that another
 package folder imports; documented is one whose docstring has a section of NumPy's (Parameters,
 Returns, Attributes, Raises).
 """
@@ -18,6 +19,18 @@ from statistics import mean, median
 
 ROOT = Path(__file__).parents[1]
 OURS = [ROOT / "ccd_casadi", ROOT / "surrogates"]
+# Rooms and modules whose numbers are sizes, colours and positions on a page.
+DRAWING = (
+    "ccd_casadi.drawing.", "ccd_casadi.reporting.", "ccd_casadi.explorer.",
+    "ccd_casadi.case_studies.rib_stage.pictures",
+)  # fmt: skip
+# Numbers that no algorithm could take otherwise: of physics, units, file formats and other
+# programs' interfaces, of the machine's rounding; indices; nodes of a quadrature.
+EXEMPT: dict[str, tuple[str, ...]] = {
+    "ccd_casadi.support.text": ("HZ",),
+    "ccd_casadi.support.guard": ("DIES_WITH_PARENT",),
+}
+OF_NUMBERS = ("np.", "math.", "float", "int", "range", "tuple")
 SECTIONS = ("Parameters\n", "Returns\n", "Attributes\n", "Raises\n")
 Tree = tuple[Path, ast.Module, list[str]]
 Definition = ast.FunctionDef | ast.ClassDef
@@ -32,25 +45,59 @@ def trees(folders: list[Path]) -> list[Tree]:
     return found
 
 
-def bare_constants(tree: ast.Module) -> Iterator[str]:
-    """Upper-case names of a module that are bound to numbers or tuples of these."""
+def is_numbers(node: ast.AST | None, known: set[str]) -> bool:
+    """Whether an expression is made of numbers alone: literals, arithmetic, NumPy of these."""
 
-    def is_number(node: ast.expr | None) -> bool:
-        if isinstance(node, ast.UnaryOp):
-            return is_number(node.operand)
-        if isinstance(node, ast.Tuple):
-            return bool(node.elts) and all(map(is_number, node.elts))
-        return isinstance(node, ast.Constant) and type(node.value) in (int, float, complex)
+    def all_numbers(nodes: list[ast.expr]) -> bool:
+        return bool(nodes) and all(is_numbers(n, known) for n in nodes)
 
+    match node:
+        case ast.Constant(value):
+            return type(value) in (int, float, complex)
+        case ast.UnaryOp(operand=inner) | ast.Attribute(value=ast.Call() as inner):
+            return is_numbers(inner, known)
+        case ast.BinOp(left=left, right=right):
+            return all_numbers([left, right])
+        case ast.Tuple(elts) | ast.List(elts) | ast.Set(elts):
+            return all_numbers(elts)
+        case ast.Subscript(value=inner):
+            return is_numbers(inner, known)
+        case ast.Dict(values=values):
+            return all_numbers(values)
+        case ast.Call(func=func, args=args):
+            return ast.unparse(func).startswith(OF_NUMBERS) and all_numbers(args)
+        case ast.Attribute():
+            return ast.unparse(node) in ("np.pi", "math.pi")
+        case ast.Name(id=name):
+            return name in known or name == "float"
+    return False
+
+
+def bare_constants(tree: ast.Module, module: str = "") -> Iterator[str]:
+    """Upper-case names of a module that are bound to numbers, and belong to no algorithm's options.
+
+    With the dotted name of one of our modules, those of `EXEMPT` and `DRAWING` are left out.
+    """
+    if module.startswith(DRAWING):
+        return
+    known = set[str]()
     for node in tree.body:
         targets = node.targets if isinstance(node, ast.Assign) else []
         if isinstance(node, ast.AnnAssign):
             targets = [node.target]
-        if not targets or not is_number(getattr(node, "value", None)):
+        if not targets or not is_numbers(getattr(node, "value", None), known):
             continue
-        for name in ast.walk(targets[0]):
+        for name in getattr(targets[0], "elts", targets[:1]):
             if isinstance(name, ast.Name) and name.id.isupper():
-                yield name.id
+                known.add(name.id)
+                if name.id not in EXEMPT.get(module, ""):
+                    yield name.id
+
+
+def module_name(path: Path) -> str:
+    """The dotted name of one of our modules; of a file elsewhere its stem."""
+    inside = path.relative_to(ROOT) if path.is_relative_to(ROOT) else Path(path.name)
+    return ".".join(inside.with_suffix("").parts)
 
 
 def across_rooms(modules: list[Tree]) -> set[tuple[str, str]]:
@@ -73,7 +120,7 @@ def counted(folders: list[Path]) -> dict[str, str]:
     ]
     lengths = [n.end_lineno - n.lineno + 1 for n in functions if n.end_lineno]
     lines = sum(len(text) for _, _, text in modules)
-    constants = sum(len(list(bare_constants(tree))) for _, tree, _ in modules)
+    constants = sum(len(list(bare_constants(tree, module_name(path)))) for path, tree, _ in modules)
     comments = sum(line.lstrip().startswith("#") for _, _, text in modules for line in text)
     used = across_rooms(modules)
     rooms = {name.rpartition(".")[2]: set() for name, _ in used}  # type: dict[str, set[str]]

@@ -1,0 +1,74 @@
+"""How the code is cut: numbers of algorithms belong to the options of these."""
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+import structure
+
+# Rooms whose constants are not yet fields of options.
+NOT_YET = (
+    "ccd_casadi.fixed_structure.", "ccd_casadi.optim.", "ccd_casadi.inner_problem.",
+    "ccd_casadi.robust.", "ccd_casadi.codesign.", "ccd_casadi.synthesis.", "ccd_casadi.sampling.",
+    "ccd_casadi.deployment.", "ccd_casadi.analysis.", "ccd_casadi.limitations.", "surrogates.",
+    "ccd_casadi.plants.", "ccd_casadi.lti.", "ccd_casadi.support.", "ccd_casadi.budget.",
+    "ccd_casadi.cases.", "ccd_casadi.studies.", "ccd_casadi.kernels.",
+    "ccd_casadi.case_studies.",
+)  # fmt: skip
+
+
+def modules() -> Iterator[tuple[str, ast.Module]]:
+    """Every module of both packages by its dotted name."""
+    for path, tree, _ in structure.trees(structure.OURS):
+        yield structure.module_name(path), tree
+
+
+def test_numbers_of_algorithms_are_fields_of_options() -> None:
+    bare = {
+        f"{module}.{name}"
+        for module, tree in modules()
+        if not module.startswith(NOT_YET)
+        for name in structure.bare_constants(tree, module)
+    }
+    assert not bare, "make them fields of the algorithm's `...Options`"
+
+
+def test_exempt_constants_are_there() -> None:
+    of = {module: set(structure.bare_constants(tree)) for module, tree in modules()}
+    for module, names in structure.EXEMPT.items():
+        assert set(names) <= of[module], f"{module}: delete from EXEMPT what is gone"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "X = 1.0", "X: Final = -2", "X = (1e-3, 2.0)", "X, Y = 1, 2", "X = [1, 2]", "X = {1, 2}",
+        "X = float(np.log(0.1))", "X = 4.0 * np.pi", "X = np.array([1.0, 2.0])[:1]",
+        "X = 4.0 * np.finfo(float).eps", "X, Y = range(2)", "X = {'a': 1e-3}",
+        "Y = 2.0\nX = 3.0 * Y", "_X = 1", "X = np.radians(20.0)",
+    ],
+)  # fmt: skip
+def test_bare_numbers_are_seen(line: str) -> None:
+    assert {"X", "_X"} & set(structure.bare_constants(ast.parse(line)))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "X = XOptions()", "X = 'a'", "X = ('a', 1.0)", "x = lambda: 1.0", "X = True", "X = ()",
+        "class X:\n    A: float = 1.0", "def f():\n    X = 1.0",
+    ],
+)  # fmt: skip
+def test_what_is_no_bare_number(line: str) -> None:
+    assert not list(structure.bare_constants(ast.parse(line)))
+
+
+def test_a_bare_number_outside_drawing_is_counted() -> None:
+    tree = ast.parse("HZ = 6.28\nSTEP = 1e-3")
+    assert list(structure.bare_constants(tree, "ccd_casadi.support.text")) == ["STEP"]
+    assert list(structure.bare_constants(tree, "ccd_casadi.lti.norms")) == ["HZ", "STEP"]
+    assert not list(structure.bare_constants(tree, "ccd_casadi.drawing.svg"))
