@@ -19,7 +19,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity
-    from ccd_casadi.cases.plant_report import SHARES, plant_report
+    from ccd_casadi.cases.plant_report import PlantReportOptions, plant_report
     from ccd_casadi.reporting.facts import theta_words
     from ccd_casadi.support.json_files import json_text, json_values, write_json
     from ccd_casadi.support.text import template
@@ -39,7 +39,9 @@ def main(options: argparse.Namespace) -> ExitCode:
         say(json_text(found))
     else:
         words = template("templates/check.txt", counted=counted)
-        say(words.render(found, start=theta_words(found), shares=SHARES).rstrip())
+        say(
+            words.render(found, start=theta_words(found), shares=PlantReportOptions.shares).rstrip()
+        )
         inform(f"next          {program('ccd_casadi.solve')} {options.case}")
     return ExitCode.DONE
 

@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, run_folder
-from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.process_pool import PoolOptions
 from ccd_casadi.support.terminal import inform, say
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -47,7 +47,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     case, problem = case_to_compare(options.case, "compare")
     out = options.out or options.case.with_name(options.case.stem + "_compare")
     folder = run_folder(options.case, out)
-    with pool(options.scheduler, options.workers, PATIENCE) as workers:
+    with pool(options.scheduler, options.workers, PoolOptions.patience) as workers:
         comparison = compare(case, problem, folder, workers, seed=options.seed, quiet=options.quiet)
     (folder / "case.toml").write_text(case_to_toml(case))
     answer = comparison_dict(comparison, options.seed)

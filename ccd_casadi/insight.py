@@ -9,7 +9,7 @@ import argparse
 
 from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command, run_folder
 from ccd_casadi.support.options import integer, valued
-from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.process_pool import PoolOptions
 from ccd_casadi.support.terminal import inform
 
 
@@ -31,7 +31,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     done = read_run(options.run)
     folder = run_folder(options.run, options.out or options.run)
     with (
-        pool(options.scheduler, options.workers, PATIENCE) as workers,
+        pool(options.scheduler, options.workers, PoolOptions.patience) as workers,
         SampleStore(done.folder / "samples.sqlite") as samples,
     ):
         sampler = Sampler(done.problem, samples, workers, quiet=options.quiet)

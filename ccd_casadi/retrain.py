@@ -9,7 +9,7 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import RUN, SCHEDULER, ExitCode, command
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, option, real, valued
-from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.process_pool import PoolOptions
 from ccd_casadi.support.terminal import say
 from surrogates.files import copy_run
 
@@ -44,7 +44,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     problem = problem_of(case)
     require_solvable(problem)
     with (
-        pool(options.scheduler, options.workers, PATIENCE) as workers,
+        pool(options.scheduler, options.workers, PoolOptions.patience) as workers,
         SampleStore(folder / "samples.sqlite") as store,
     ):
         outer = outer_of(Sampler(problem, store, workers, quiet=options.quiet))

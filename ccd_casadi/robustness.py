@@ -7,7 +7,7 @@ from ccd_casadi.robust.demands import MOVE_OPTIONS, Demands, move_limits
 from ccd_casadi.support.command_line import RUN, ExitCode, command, run_folder
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import integer, option, positive, real, valued
-from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.process_pool import PoolOptions, Workers
 from ccd_casadi.support.terminal import inform, plain
 
 PERCENT = real(0.0, 50.0, strict=True)
@@ -64,7 +64,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         window=options.window,
         axis=options.axis - 1,
     )
-    with Workers(options.workers, PATIENCE) as workers:
+    with Workers(options.workers, PoolOptions.patience) as workers:
         found = robustness(finished, demands, options.seed, options.quiet, workers)
     answer = study_dict(finished, found)
     answer |= {"seed": options.seed, "versions": versions(), "seconds": options.seconds()}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.cases.first_look import DRAWING, SAMPLING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import SCHEDULER, ExitCode, command, option, run_folder
-from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.process_pool import PoolOptions
 from ccd_casadi.support.terminal import inform, say
 from ccd_casadi.support.text import counted
 
@@ -155,7 +155,7 @@ def main(options: argparse.Namespace) -> ExitCode:
         if slow:
             say(f"warning: {slow}", sys.stderr)
     store = folder / "samples.sqlite"
-    with pool(options.scheduler, options.workers, PATIENCE) as workers:
+    with pool(options.scheduler, options.workers, PoolOptions.patience) as workers:
         with SampleStore(store) as samples:
             if options.resume:
                 held = counted(samples.count(), "row") if samples.count() else "nothing yet"

@@ -29,7 +29,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.process_pool import PoolOptions, Workers
 from ccd_casadi.support.worker_process import one_blas_thread
 
 
@@ -90,7 +90,7 @@ def solve(
         problem.source.given.require_found()
     with (
         TemporaryDirectory() as folder,
-        Workers(workers, PATIENCE) as pool,
+        Workers(workers, PoolOptions.patience) as pool,
         SampleStore(store or Path(folder) / "samples.sqlite") as samples,
     ):
         sampler = Sampler(problem, samples, pool, quiet=quiet)

@@ -12,7 +12,7 @@ from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import Setpoint, feedforward, setpoint
 from ccd_casadi.deployment.realisation import Realisation, with_anti_windup
-from ccd_casadi.lti.loop import INSTANT
+from ccd_casadi.lti.loop import DelayOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -90,7 +90,7 @@ def move(
         force[k] = _stepped(u, hardware.force_step)
         now, end = float(k), k + 1.0
         while now < end:  # from one arrival to the next
-            while arriving <= k and reaches[arriving] <= now + INSTANT:
+            while arriving <= k and reaches[arriving] <= now + DelayOptions.instant:
                 u_now = force[arriving]
                 arriving += 1
             following = min(end, reaches[arriving]) if arriving <= k else end

@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
 from ccd_casadi.kernels.loop_grid import NONE, Answers, maxima, merged, second, unseen
 from ccd_casadi.kernels.loop_point import LoopArrays, close, levels, rows
 from ccd_casadi.kernels.modes import form_slopes
-from ccd_casadi.lti.state_space import FLANKS
+from ccd_casadi.lti.state_space import RootOptions
 from ccd_casadi.support.arrays import Array
 
 HIDDEN = 1e-2  # ln of the share of its bound above which a maximum between grid points is sought
@@ -58,7 +58,7 @@ def frequency_grid(
     """
     fixed, base = problem.fixed, problem.base
     own, ends = roots[np.abs(roots) > 0.0], (float(base[0]), float(base[-1]))
-    v, place = merged(fixed, own, poles, FLANKS, ends, APART, FAR)
+    v, place = merged(fixed, own, poles, np.array(RootOptions.flanks), ends, APART, FAR)
     return v, (place >= 0) & (place < len(base)), Answers(place, *problem.answers)
 
 

@@ -20,8 +20,6 @@ from ccd_casadi.lti.state_space import (
 )
 from ccd_casadi.support.arrays import Array
 
-INSTANT = 1e-9  # share of a period that counts as none
-
 
 @dataclass(frozen=True)
 class Sampling:
@@ -53,9 +51,37 @@ class Sampling:
         return 1e-6 * self.delay_us
 
 
-def delay_parts(period: float, delay: float) -> tuple[int, float]:
-    """Whole periods of a delay (s), and the rest in s."""
-    whole = int(np.floor(delay / period + INSTANT))
+@dataclass(frozen=True)
+class DelayOptions:
+    """How a delay is split.
+
+    Attributes
+    ----------
+    instant : float
+        Share of a period that counts as zero.
+    """
+
+    instant: float = 1e-9
+
+
+def delay_parts(
+    period: float, delay: float, *, options: DelayOptions = DelayOptions()
+) -> tuple[int, float]:
+    """Split a delay into whole periods and a rest.
+
+    Parameters
+    ----------
+    period, delay : float
+        s.
+    options : DelayOptions
+
+    Returns
+    -------
+    whole : int
+    rest : float
+        s.
+    """
+    whole = int(np.floor(delay / period + options.instant))
     return whole, max(delay - whole * period, 0.0)
 
 
@@ -68,7 +94,22 @@ def transfer(p: np.ndarray, omega: Array, period: float, delay: float) -> np.nda
 
 
 def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Whole periods d of delay, and what u_{k-d} and u_{k-d-1} give a mode in one period."""
+    """Integrate a mode e^{pt} over a period in which the held force changes once.
+
+    Parameters
+    ----------
+    p : complex array (n,)
+        Poles, 1/s.
+    T, delay : float
+        Period and delay, s.
+
+    Returns
+    -------
+    d : float
+        Whole periods of delay.
+    late, early : complex arrays (n,)
+        Gains of u_{k-d} and u_{k-d-1} on a mode in one period, s.
+    """
     d, rest = delay_parts(T, delay)
     h, free = T - rest, p == 0.0
     over = np.where(free, 1.0, p)
@@ -78,7 +119,20 @@ def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, n
 
 
 def moment_slopes(p: np.ndarray, T: float, delay: float) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of `moments` to p."""
+    """Differentiate `moments` to p.
+
+    Parameters
+    ----------
+    p : complex array (n,)
+        Poles, 1/s.
+    T, delay : float
+        s.
+
+    Returns
+    -------
+    late, early : complex arrays (n,)
+        s².
+    """
     _, late, early = moments(p, T, delay)
     rest = delay_parts(T, delay)[1]
     h, free = T - rest, p == 0.0
@@ -90,10 +144,22 @@ def moment_slopes(p: np.ndarray, T: float, delay: float) -> tuple[np.ndarray, np
 
 
 def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
-    """u_k to y_k of a plant without feedthrough behind hold and delay (s); states [x; u_{k-1}; …].
+    """Discretise a plant behind hold and delay, u_k to y_k.
 
     One exponential over each part of a period: before and after the delayed force changes. Analytic
     in the plant's matrices.
+
+    Parameters
+    ----------
+    G : StateSpace
+        Continuous, without feedthrough.
+    period, delay : float
+        s.
+
+    Returns
+    -------
+    StateSpace
+        With the states [x; u_{k-1}; …].
     """
     n, m = G.B.shape
     whole, rest = delay_parts(period, delay)
@@ -110,7 +176,22 @@ def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
 
 
 def delayed(A: np.ndarray, gains: Sequence[np.ndarray], C: np.ndarray, T: float) -> StateSpace:
-    """x_{k+1} = A x_k + Σ gains_i u_{k-i}, y = C x as one state space, [x; u_{k-1}; …]."""
+    """Make one state space of x_{k+1} = A x_k + Σ gains_i u_{k-i}, y = C x.
+
+    Parameters
+    ----------
+    A : array (n, n)
+    gains : sequence of arrays (n, m)
+        Of u_k, u_{k-1}, …
+    C : array (p, n)
+    T : float
+        Period, s.
+
+    Returns
+    -------
+    StateSpace
+        With the states [x; u_{k-1}; …].
+    """
     n, m = gains[0].shape
     kept = m * (len(gains) - 1)
     older = np.hstack([np.zeros((n, 0)), *gains[1:]])
@@ -123,7 +204,21 @@ def delayed(A: np.ndarray, gains: Sequence[np.ndarray], C: np.ndarray, T: float)
 
 
 def tustin(K: StateSpace, period: float) -> StateSpace:
-    """K(z) = K(s) at s = (2/T)(z - 1)/(z + 1), without prewarping; analytic in its matrices."""
+    """Discretise a controller by Tustin's rule: s = (2/T)(z - 1)/(z + 1), without prewarping.
+
+    The result is analytic in the controller's matrices.
+
+    Parameters
+    ----------
+    K : StateSpace
+        Continuous.
+    period : float
+        T in s.
+
+    Returns
+    -------
+    StateSpace
+    """
     one, half = np.eye(len(K.A)), 0.5 * period
     inverse = np.linalg.inv(one - half * K.A)
     C = K.C @ inverse
@@ -132,7 +227,20 @@ def tustin(K: StateSpace, period: float) -> StateSpace:
 
 
 def in_w(G: StateSpace) -> StateSpace:
-    """A system in discrete time over w, z = (1 + wT/2)/(1 - wT/2): stable left of the axis."""
+    """Transform a system in discrete time to w, z = (1 + wT/2)/(1 - wT/2).
+
+    The system is stable where its poles in w lie left of the axis.
+
+    Parameters
+    ----------
+    G : StateSpace
+        With a period.
+
+    Returns
+    -------
+    StateSpace
+        Without a period.
+    """
     T = G.period
     inverse = np.linalg.inv(G.A + np.eye(len(G.A)))
     root = 2.0 / np.sqrt(T)
@@ -144,16 +252,18 @@ def in_w(G: StateSpace) -> StateSpace:
     )
 
 
-PER_DECADE = 60
-APART = 1e-7  # relative: closer points of the grid differ in gain by rounding alone
-NEAR = 0.9  # of the largest gain on the grid: local maxima below it lie below it between points too
-
-
 @dataclass(frozen=True)
 class Loop:
-    """The plant G and the controller K in SI, both continuous; `sampling` None: so is the loop.
+    """A feedback loop as it runs.
 
-    G has no feedthrough. A controller in discrete time runs as it is, at the rate of `sampling`.
+    Attributes
+    ----------
+    plant : StateSpace
+        G, continuous, without feedthrough, SI.
+    controller : StateSpace
+        K in SI; one in discrete time runs as it is, at the rate of `sampling`.
+    sampling : Sampling, optional
+        Without, the loop is continuous.
     """
 
     plant: StateSpace
@@ -203,18 +313,19 @@ class Loop:
         """Closed-loop poles in rad/s; of a sampled loop ln(z)/T, those of a delay left out."""
         return self.closed.S.rates
 
-    def grid(self) -> Array:
+    def grid(self, *, per_decade: int = 60, apart: float = 1e-7) -> Array:
         """ω in rad/s from far below the slowest pole to far above the fastest, ascending.
 
-        It runs through every pole of plant, controller and loop, and their flanks.
+        It has every pole of plant, controller and loop, and their flanks. Points closer than
+        `apart` (relative) differ in gain by rounding alone.
         """
         roots = np.concatenate([self.poles, self.plant.rates, self.controller.rates])
         roots = roots[np.abs(roots) > 1e-9 * np.abs(roots).max()]
         low, high = 0.1 * np.abs(roots).min(), 10.0 * np.abs(roots).max()
         if self.sampling is not None:
             high = np.pi / self.sampling.period
-        count = int(PER_DECADE * np.log10(high / low)) + 1
-        return frequency_grid(low, high, count, root_flanks(roots), apart=APART)
+        count = int(per_decade * np.log10(high / low)) + 1
+        return frequency_grid(low, high, count, root_flanks(roots), apart=apart)
 
     @cached_property
     def peak(self) -> float:
@@ -226,7 +337,7 @@ class Loop:
         grid = self.grid()
         S = gain(grid)
         at = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
-        at = at[S[at] > NEAR * S.max()]
+        at = at[S[at] > 0.9 * S.max()]  # lower ones are lower between the points, too
         return float(max(S.max(), *zoomed(gain, grid[at - 1], grid[at + 1])[1]))
 
     @cached_property
@@ -249,9 +360,23 @@ def at_instants(loop: ClosedLoop, period: float) -> ClosedLoop:
 
 
 def constant_drive(loop: ClosedLoop, drive: Array, count: int) -> Array:
-    """y (p, count) at the instants, from rest under the constant input B_r r or B_d d (n,).
+    """Simulate the output of a loop at its instants, from rest under a constant input.
 
     By doubling: the states of 2n instants are those of n, and Aⁿ times them.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        In discrete time.
+    drive : array (n,)
+        B_r r or B_d d.
+    count : int
+        Number of instants.
+
+    Returns
+    -------
+    array (p, count)
+        y.
     """
     n = len(loop.A)
     P = np.eye(n + 1)

@@ -4,6 +4,8 @@ Nothing here comes from the compiled kernels, so that the two may judge each oth
 Balakrishnan & Kabamba 1989; Bruinsma & Steinbuch 1990.)
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.linalg import eigvals, solve
 
@@ -11,17 +13,46 @@ from ccd_casadi.lti.loop import in_w
 from ccd_casadi.lti.state_space import StateSpace, balanced, root_flanks
 from ccd_casadi.support.arrays import Array
 
-NEAR_AXIS = 1e-3  # |Re λ|/|λ| of a candidate: a spurious one costs an evaluation, no more
-RESOLUTION = 1e-10  # relative step of the level
-ROUNDS = 40
-MEMORY = 1_000_000  # complex numbers at once
+
+@dataclass(frozen=True)
+class NormOptions:
+    """Numbers of the computation of the H∞ norm.
+
+    Attributes
+    ----------
+    near_axis : float
+        |Re λ|/|λ| up to which an eigenvalue is a candidate; a spurious one costs an evaluation.
+    resolution : float
+        Relative step of the level.
+    rounds : int
+        Largest number of steps.
+    """
+
+    near_axis: float = 1e-3
+    resolution: float = 1e-10
+    rounds: int = 40
 
 
-def gains(system: StateSpace, omega: Array) -> Array:
-    """σ_max of C(jω - A)⁻¹B + D at every ω in rad/s; infinite at a pole on the axis."""
+def gains(system: StateSpace, omega: Array, *, memory: int = 1_000_000) -> Array:
+    """Evaluate σ_max of C(jω - A)⁻¹B + D.
+
+    Parameters
+    ----------
+    system : StateSpace
+        Continuous.
+    omega : array (k,)
+        rad/s, infinity allowed.
+    memory : int
+        Complex numbers of the responses that are held at once.
+
+    Returns
+    -------
+    array (k,)
+        Infinite at a pole on the axis.
+    """
     out = np.full(len(omega), np.linalg.norm(system.D, 2))
     finite = np.flatnonzero(np.isfinite(omega))
-    size = max(1, MEMORY // max(1, system.A.size))
+    size = max(1, memory // max(1, system.A.size))
     for first in range(0, len(finite), size):
         part = finite[first : first + size]
         try:
@@ -39,7 +70,9 @@ def _gains(system: StateSpace, omega: Array) -> Array:
     return np.where(known, sizes, np.inf)
 
 
-def level_frequencies(system: StateSpace, level: float) -> Array:
+def level_frequencies(
+    system: StateSpace, level: float, *, options: NormOptions = NormOptions()
+) -> Array:
     """Sorted ω >= 0 where a singular value of the response may equal `level` > σ_max(D).
 
     They are the imaginary eigenvalues of [[F, BR⁻¹Bᵀ], [-Cᵀ(I + DR⁻¹Dᵀ)C, -Fᵀ]], R = level² -
@@ -50,21 +83,40 @@ def level_frequencies(system: StateSpace, level: float) -> Array:
     RDC, RB = solve(R, D.T @ C, assume_a="sym"), solve(R, B.T, assume_a="sym")
     F = A + B @ RDC
     values = eigvals(np.block([[F, B @ RB], [-C.T @ C - C.T @ D @ RDC, -F.T]]))
-    near = np.abs(values.real) <= NEAR_AXIS * np.abs(values)
+    near = np.abs(values.real) <= options.near_axis * np.abs(values)
     return np.unique(values.imag[near & (values.imag >= 0.0)])
 
 
-def hinf_norm(system: StateSpace, start: float | None = None) -> tuple[float, float]:
-    """sup over ω of σ_max(C(jω - A)⁻¹B + D), and the ω in rad/s where it is; A is stable.
+def hinf_norm(
+    system: StateSpace, start: float | None = None, *, options: NormOptions = NormOptions()
+) -> tuple[float, float]:
+    """Compute the H∞ norm, the largest σ_max of the response over ω.
 
-    The value is attained at that ω. It is raised until the Hamiltonian shows no higher level,
-    each candidate confirmed on the frequency response; infinite where A has an eigenvalue with
-    Re >= 0. `start` is an ω near it, in place of a grid. Of a system in discrete time the same over
-    w, whose axis is its circle (`in_w`).
+    The value is attained at the ω returned. It is raised until the Hamiltonian matrix has no higher
+    level, each candidate confirmed on the frequency response. A system in discrete time is
+    transformed to w, whose axis is its circle (`in_w`).
+
+    Parameters
+    ----------
+    system : StateSpace
+    start : float, optional
+        ω near the maximum in rad/s, in place of a grid.
+    options : NormOptions
+
+    Returns
+    -------
+    norm : float
+        Infinite where A has an eigenvalue with Re >= 0.
+    omega : float
+        rad/s.
+
+    References
+    ----------
+    Boyd, Balakrishnan & Kabamba (1989); Bruinsma & Steinbuch (1990).
     """
     if T := system.period:
         near = None if start is None else 2.0 / T * np.tan(0.5 * start * T)
-        norm, v = hinf_norm(in_w(system), near)
+        norm, v = hinf_norm(in_w(system), near, options=options)
         return norm, float(2.0 / T * np.arctan(0.5 * v * T))
     if not len(system.A):
         return float(np.linalg.norm(system.D, 2)), 0.0
@@ -77,11 +129,11 @@ def hinf_norm(system: StateSpace, start: float | None = None) -> tuple[float, fl
     values = gains(scaled, omega)
     i = int(np.argmax(values))
     best, at = float(values[i]), float(omega[i])
-    for _ in range(ROUNDS):
-        level = best * (1.0 + RESOLUTION)
+    for _ in range(options.rounds):
+        level = best * (1.0 + options.resolution)
         if level == 0.0:
             break
-        edges = level_frequencies(scaled, level)
+        edges = level_frequencies(scaled, level, options=options)
         inner = edges[edges > 0.0]
         if not inner.size:
             break
@@ -100,6 +152,6 @@ def _first_grid(poles: np.ndarray) -> Array:
     size = np.abs(poles)
     low, high = 0.01 * size.min(), 100.0 * size.max()
     count = int(10 * np.log10(high / low)) + 2
-    flanks = root_flanks(poles[poles.imag > 0.0], np.array([-1.0, 0.0, 1.0]))
+    flanks = root_flanks(poles[poles.imag > 0.0], (-1.0, 0.0, 1.0))
     grid = np.concatenate([[0.0, np.inf], np.geomspace(low, high, count), flanks])
     return np.unique(grid[grid >= 0.0])

@@ -1,7 +1,7 @@
 """State-space systems: response, poles, zeros, series connection, the closed loop of two, and
 frequency grids through their poles and zeros."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,30 +11,79 @@ from scipy.linalg import eig, matrix_balance
 
 from ccd_casadi.support.arrays import Array
 
-FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
-FIRST, HALVINGS = 11, 16  # points between a maximum's neighbours, then of their spacing
-LIGHT = 0.3  # damping ratio below which a pole or zero is a resonance
+
+@dataclass(frozen=True)
+class RootOptions:
+    """Frequencies around a pole or zero.
+
+    Attributes
+    ----------
+    flanks : tuple of float
+        In half widths of the root: |Im p| + flank |Re p|.
+    """
+
+    flanks: tuple[float, ...] = (-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0)
 
 
-def root_flanks(roots: np.ndarray, flanks: Array = FLANKS) -> Array:
-    """|Im p| + flank |Re p| (..., kf) of roots p (..., k) of any plane in 1/s, rad/s, unsorted."""
-    found = np.abs(roots.imag)[..., None] + np.abs(roots.real)[..., None] * flanks
+def root_flanks(roots: np.ndarray, flanks: Sequence[float] | Array = RootOptions.flanks) -> Array:
+    """Place frequencies around poles or zeros p: |Im p| + flank |Re p|.
+
+    Parameters
+    ----------
+    roots : array (..., k)
+        Of any plane in 1/s.
+    flanks : sequence of float (f,)
+        In half widths of a root.
+
+    Returns
+    -------
+    array (..., k f)
+        rad/s, unsorted.
+    """
+    found = np.abs(roots.imag)[..., None] + np.abs(roots.real)[..., None] * np.array(flanks)
     return np.asarray(found.reshape(*roots.shape[:-1], -1))
 
 
-def resonant(roots: np.ndarray) -> np.ndarray:
-    """Those of the upper half plane with a damping ratio below 0.3, ascending by size."""
+def resonant(roots: np.ndarray, *, light: float = 0.3) -> np.ndarray:
+    """Select the resonances among poles or zeros.
+
+    Parameters
+    ----------
+    roots : complex array (k,)
+        1/s.
+    light : float
+        Damping ratio below which a root is a resonance.
+
+    Returns
+    -------
+    complex array
+        Those of the upper half-plane, ascending by size.
+    """
     upper = roots[roots.imag > 1e-9 * np.abs(roots)]
-    upper = upper[np.abs(upper.real) < LIGHT * np.abs(upper)]
+    upper = upper[np.abs(upper.real) < light * np.abs(upper)]
     return np.asarray(upper[np.argsort(np.abs(upper))])
 
 
 def frequency_grid(
     low: float, high: float, points: int, *special: Array, apart: float = 0.0
 ) -> Array:
-    """`points` frequencies evenly spread over ln ω from `low` to `high`, and special ones within.
+    """Make a grid of frequencies, evenly spread over ln ω, and special ones within.
 
-    Ascending, each at least `apart` (relative) above the one before.
+    Parameters
+    ----------
+    low, high : float
+        Ends, rad/s.
+    points : int
+        Evenly spread ones.
+    *special : arrays
+        Further frequencies, rad/s; those outside are dropped.
+    apart : float
+        Least relative distance from the one before.
+
+    Returns
+    -------
+    array (g,)
+        Ascending.
     """
     grid = np.unique(np.concatenate([np.geomspace(low, high, points), *special]))
     grid = grid[(grid >= low) & (grid <= high)]  # NaN compares false
@@ -42,8 +91,22 @@ def frequency_grid(
 
 
 def thinned(values: Array, width: float) -> Array:
-    """Those above 0, ascending: the least of each interval of ln ω that is so wide.
+    """Keep the least value of each interval of ln ω.
 
+    Parameters
+    ----------
+    values : array
+        Those above 0 are taken.
+    width : float
+        Of an interval.
+
+    Returns
+    -------
+    array
+        Ascending.
+
+    Examples
+    --------
     >>> thinned(np.array([1.0, 1.01, 2.0, 1.02]), 0.1).tolist()
     [1.0, 2.0]
     """
@@ -53,17 +116,49 @@ def thinned(values: Array, width: float) -> Array:
 
 
 def local_maxima(values: Array) -> np.ndarray:
-    """Places inside the array that are above their left neighbour and not below their right one."""
+    """Find the entries above their left neighbour and not below their right one.
+
+    Parameters
+    ----------
+    values : array (n,)
+
+    Returns
+    -------
+    int array
+        Their places, from 1 to n - 2.
+    """
     return np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
 
 
-def zoomed(function: Callable[[Array], Array], low: Array, high: Array) -> tuple[Array, Array]:
-    """Where N brackets that close in on a maximum end, and its value; `function` of (N, k)."""
+def zoomed(
+    function: Callable[[Array], Array],
+    low: Array,
+    high: Array,
+    *,
+    first: int = 11,
+    halvings: int = 16,
+) -> tuple[Array, Array]:
+    """Refine N local maxima, each in its bracket, by halving the spacing of points.
+
+    Parameters
+    ----------
+    function : callable
+        array (N, k) -> array (N, k).
+    low, high : arrays (N,)
+        Brackets.
+    first : int
+        Points of a bracket at first.
+    halvings : int
+
+    Returns
+    -------
+    where, height : arrays (N,)
+    """
     if not len(low):
         return low, low
-    points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, FIRST)
+    points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, first)
     value = function(points)
-    for _ in range(HALVINGS):
+    for _ in range(halvings):
         inner = np.argmax(value[:, 1:-1], axis=1)[:, None] + np.arange(3)
         x, f = (np.take_along_axis(part, inner, axis=1) for part in (points, value))
         between = 0.5 * (x[:, :-1] + x[:, 1:])
@@ -78,20 +173,26 @@ def zoomed(function: Callable[[Array], Array], low: Array, high: Array) -> tuple
 def refine_peak(
     gain: Callable[[float], float], low: float, high: float, xatol: float = 1e-10
 ) -> tuple[float, float]:
-    """(ω, gain) at the local maximum between two frequencies above 0, by Brent's method in ln ω.
+    """Refine a local maximum by Brent's method in ln ω.
 
-    `xatol`: in ln ω.
+    Parameters
+    ----------
+    gain : callable
+        ω -> gain.
+    low, high : float
+        Bracket above 0, rad/s.
+    xatol : float
+        Tolerance in ln ω.
+
+    Returns
+    -------
+    ω, gain : float
     """
     top = scipy.optimize.minimize_scalar(
         lambda x: -gain(float(np.exp(x))), bounds=(np.log(low), np.log(high)),
         method="bounded", options={"xatol": xatol},
     )  # fmt: skip
     return float(np.exp(top.x)), -float(top.fun)
-
-
-SOUND = 1e8  # condition of eigenvectors up to which they give a response
-GONE = 1e-6  # a pole z of a delay: it is gone after a sample, and has no frequency
-REACH = 1e5  # size of the zeros, over the unit given, from which on they count as infinite
 
 
 @dataclass(frozen=True)
@@ -156,11 +257,11 @@ class StateSpace:
         """Poles in 1/s: ln(z)/T of a system in discrete time, those of a delay left out."""
         return self.rates_of(self.poles)
 
-    def rates_of(self, roots: np.ndarray) -> np.ndarray:
-        """Poles or zeros of this system in 1/s."""
+    def rates_of(self, roots: np.ndarray, *, decayed: float = 1e-6) -> np.ndarray:
+        """Poles or zeros of this system in 1/s, without those |z| <= `decayed` of a delay."""
         if not self.period:
             return roots
-        return np.log(roots[np.abs(roots) > GONE].astype(complex)) / self.period
+        return np.log(roots[np.abs(roots) > decayed].astype(complex)) / self.period
 
     @property
     def stable(self) -> bool:
@@ -174,12 +275,12 @@ class StateSpace:
         """Poles (n,), V⁻¹B (n, m) and CV (p, n) with eigenvectors V; None where these are not
         sound."""
         poles, V = np.linalg.eig(self.A)
-        if len(V) and not np.linalg.cond(V) < SOUND:
+        if len(V) and not np.linalg.cond(V) < 1e8:  # a response of fewer than 8 digits
             return None
         return poles, np.linalg.solve(V, self.B + 0j), self.C @ V
 
-    def zeros(self, unit: float = 1.0) -> np.ndarray:
-        """Finite invariant zeros of a square system, |z| < 1e5 `unit`; none of another.
+    def zeros(self, unit: float = 1.0, *, infinite: float = 1e5) -> np.ndarray:
+        """Finite invariant zeros of a square system, |z| < `infinite` `unit`; none of another.
 
         The eigenvalues of [[A, B], [C, D]] - z [[1, 0], [0, 0]], each part scaled to about one.
         """
@@ -193,7 +294,7 @@ class StateSpace:
         weight = np.zeros_like(system)
         weight[:n, :n] = np.eye(n)
         values = eig(system, weight, right=False)
-        return np.asarray(values[np.isfinite(values) & (np.abs(values) < REACH)] * unit)
+        return np.asarray(values[np.isfinite(values) & (np.abs(values) < infinite)] * unit)
 
     def series(self, then: "StateSpace") -> "StateSpace":
         """`then` behind this system."""
@@ -214,14 +315,34 @@ class StateSpace:
 
 
 def strictly_proper(A: Array, B: Array, C: Array, period: float = 0.0) -> StateSpace:
-    """The system with D = 0."""
+    """Make a system with D = 0.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+    period : float
+        s; 0: continuous.
+
+    Returns
+    -------
+    StateSpace
+    """
     return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), period=period)
 
 
 def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
-    """T⁻¹AT, T⁻¹B, CT with a diagonal T of powers of two that evens out the states' scales.
+    """Balance a system: T⁻¹AT, T⁻¹B, CT with a diagonal T of powers of two.
 
-    Inputs and outputs keep their units: balancing leaves alone what has an empty row or column.
+    T evens out the states' scales. Inputs and outputs keep their units: balancing does not change
+    what has an empty row or column.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+
+    Returns
+    -------
+    A, B, C : arrays of the same shapes
     """
     n, m, p = len(A), B.shape[1], C.shape[0]
     system = np.zeros((n + m + p, n + m + p))
@@ -234,8 +355,19 @@ def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
 
 
 def weighted(system: StateSpace, filters: Array) -> StateSpace:
-    """Each output of a continuous system behind its own filter of one state, rows of pole,
-    feedthrough and zero: feedthrough times (s + zero)/(s + pole)."""
+    """Filter each output of a continuous system: through (s + zero)/(s + pole).
+
+    Parameters
+    ----------
+    system : StateSpace
+        With p outputs.
+    filters : array (p, 3)
+        Rows of pole (1/s), feedthrough and zero (1/s).
+
+    Returns
+    -------
+    StateSpace
+    """
     pole, through, zero = filters.T
     A, B, C, D = system.A, system.B, system.C, system.D
     return StateSpace(
@@ -248,9 +380,18 @@ def weighted(system: StateSpace, filters: Array) -> StateSpace:
 
 @dataclass(frozen=True)
 class ClosedLoop:
-    """ẋ = A x + B_r r + B_d d (x⁺ with a `period` > 0 in s), y = C_y x, u = C_u x + D_u r.
+    """ẋ = A x + B_r r + B_d d (x⁺ in discrete time), y = C_y x, u = C_u x + D_u r.
 
     x = [x_G; x_K]; sensor noise n enters as -r does.
+
+    Attributes
+    ----------
+    A : array (n, n)
+    B_r, B_d : arrays (n, p), (n, m)
+        Of the reference and of a force that adds to u.
+    C_y, C_u, D_u : arrays (p, n), (m, n), (m, p)
+    period : float
+        s; 0: continuous.
     """
 
     A: Array
@@ -283,7 +424,19 @@ class ClosedLoop:
 
 
 def closed_loop(G: StateSpace, K: StateSpace) -> ClosedLoop:
-    """The loop of a plant without feedthrough (u to y) and a controller (e to u), of one time."""
+    """Close the loop u = K(r - y).
+
+    Parameters
+    ----------
+    G : StateSpace
+        Plant without feedthrough, u to y.
+    K : StateSpace
+        Controller, e to u, of the same time.
+
+    Returns
+    -------
+    ClosedLoop
+    """
     m, p, k = G.B.shape[1], len(G.C), len(K.A)
     return ClosedLoop(
         A=np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]]),
@@ -297,19 +450,47 @@ def closed_loop(G: StateSpace, K: StateSpace) -> ClosedLoop:
 
 
 def sensitivity(L: np.ndarray) -> np.ndarray:
-    """(1 + L)⁻¹ (k, p, p) of an open loop L = GK (k, p, p)."""
+    """Evaluate S = (1 + L)⁻¹.
+
+    Parameters
+    ----------
+    L : complex array (k, p, p)
+        Open loop GK.
+
+    Returns
+    -------
+    complex array (k, p, p)
+    """
     return 1.0 / (1.0 + L) if L.shape[-1] == 1 else np.linalg.inv(np.eye(L.shape[-1]) + L)
 
 
 def equivalent_open_loop(L: np.ndarray, i: int) -> np.ndarray:
-    """1/S_ii - 1 (k,) of S = (1 + L)⁻¹: what channel i sees while the others are closed."""
+    """Evaluate 1/S_ii - 1, S = (1 + L)⁻¹: the open loop of channel i with the others closed.
+
+    Parameters
+    ----------
+    L : complex array (k, p, p)
+    i : int
+
+    Returns
+    -------
+    complex array (k,)
+    """
     return np.asarray(L[:, 0, 0] if L.shape[1] == 1 else 1.0 / sensitivity(L)[:, i, i] - 1.0)
 
 
 def sigma_max(response: np.ndarray) -> Array:
-    """σ_max (...) of matrices (..., p, m): the root of the largest eigenvalue of MMᴴ.
+    """Compute the largest singular value, the root of the largest eigenvalue of MMᴴ.
 
-    Squaring leaves it as exact as singular values are, in two thirds of their time.
+    Squaring keeps the precision of singular values and takes two thirds of their time.
+
+    Parameters
+    ----------
+    response : complex array (..., p, m)
+
+    Returns
+    -------
+    array (...)
     """
     if response.shape[-2:] == (1, 1):
         return np.abs(response[..., 0, 0])
@@ -318,6 +499,15 @@ def sigma_max(response: np.ndarray) -> Array:
 
 
 def responses_of(G: np.ndarray, K: np.ndarray) -> dict[str, np.ndarray]:
-    """S, KS, T and GS (k, ·, ·) by name, of G (k, p, m) and K (k, m, p)."""
+    """Evaluate S, KS, T and GS of a loop.
+
+    Parameters
+    ----------
+    G, K : complex arrays (k, p, m), (k, m, p)
+
+    Returns
+    -------
+    dict of str to complex array (k, ., .)
+    """
     S = sensitivity(G @ K)
     return {"S": S, "KS": K @ S, "T": G @ K @ S, "GS": S @ G}

@@ -24,11 +24,22 @@ from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import raised_words
 
-PLANTS_REMEMBERED = 64  # θ whose matrices are kept
-
 
 def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:
-    """The model as a function of the free parameters alone."""
+    """Restrict a model to its free parameters.
+
+    Parameters
+    ----------
+    model : callable
+        model(theta, **options).
+    fixed : mapping
+        Values of the other parameters by name, SI.
+
+    Returns
+    -------
+    callable
+        The model as a function of the free parameters alone.
+    """
     if not fixed:
         return model
 
@@ -41,9 +52,22 @@ def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFuncti
 def with_fixed(
     plant: Plant, fixed: Mapping[str, float], names: Sequence[str] | None = None
 ) -> Plant:
-    """The plant as a function of the parameters that `fixed` does not name, in their order or that
-    of `names`.
+    """Restrict a plant to the parameters that are not fixed.
 
+    Parameters
+    ----------
+    plant : Plant
+    fixed : mapping
+        Values by name, SI.
+    names : sequence of str, optional
+        Order of the free parameters; by default that of the plant.
+
+    Returns
+    -------
+    Plant
+
+    Examples
+    --------
     >>> from ccd_casadi.plants.plant import build_plant, mechanics
     >>> from ccd_casadi.plants.registry import two_mass
     >>> both = build_plant(two_mass, ["m1", "m2"], {})
@@ -90,9 +114,21 @@ def reparametrised(
     own: Callable[[Sequence[float]], tuple[float, ...]],
     **others: Any,
 ) -> Plant:
-    """The plant as a function of another θ: `own` makes its own of that, `of` wraps what evaluates.
+    """Make a plant a function of another θ.
 
-    `others`: fields that are given as they are, of the new θ.
+    Parameters
+    ----------
+    plant : Plant
+    of : callable
+        Wraps a function θ -> Mechanics of the plant into one of the new θ.
+    own : callable
+        New θ -> θ of the plant.
+    **others
+        Fields that are given as they are, of the new θ.
+
+    Returns
+    -------
+    Plant
     """
     shapes, drawing, nearby = plant.shapes, plant.drawing, plant.nearby
     seen: dict[str, Any] = {
@@ -109,20 +145,57 @@ def reparametrised(
 
 
 def remembered(
-    mechanics: Callable[[tuple[float, ...], bool], Mechanics], derivatives: bool = True
+    mechanics: Callable[[tuple[float, ...], bool], Mechanics],
+    derivatives: bool = True,
+    *,
+    plants: int = 64,
 ) -> Evaluate:
-    """θ -> `mechanics(θ, derivatives)`, of which the last ones are kept."""
-    kept = lru_cache(maxsize=PLANTS_REMEMBERED)(mechanics)
+    """Keep the last values of θ -> `mechanics(θ, derivatives)`.
+
+    Parameters
+    ----------
+    mechanics : callable
+        (θ, derivatives) -> Mechanics.
+    derivatives : bool
+        Second argument of every call.
+    plants : int
+        Number of θ whose matrices are kept.
+
+    Returns
+    -------
+    callable
+        θ -> Mechanics.
+    """
+    kept = lru_cache(maxsize=plants)(mechanics)
     return lambda theta: kept(tuple(map(float, theta)), derivatives)
 
 
-STEP = 1e-3  # share of the box: h⁴ is 1e-12, rounding is magnified a thousandfold
-REMEMBERED = 256  # values of the function kept: matrices and hardware cost ask for the same θ
-WRONG = 0.1  # relative disagreement of two difference formulas from which a derivative is wrong
-LEAP = 1e-2  # of a matrix: what its values differ by over one step where they leap
-NOISE = 1e-4  # of a matrix over the box: a derivative below it is none
-OFFSETS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])  # steps, of the points about θ
-AGREEMENT = 1e-9  # relative; a function gives the same numbers for numbers and for symbols
+@dataclass(frozen=True)
+class DifferenceOptions:
+    """Numbers of derivatives by differences.
+
+    Attributes
+    ----------
+    step : float
+        Share of the box: h⁴ is 1e-12, and rounding is magnified a thousandfold.
+    values_kept : int
+        θ whose values are kept: matrices and hardware cost are evaluated at the same ones.
+    wrong : float
+        Relative disagreement of two difference formulas from which a derivative is wrong.
+    jump : float
+        Share of a matrix by which its values differ over one step where they jump.
+    noise : float
+        Share of a matrix over the box below which a derivative counts as zero.
+    agreement : float
+        Relative difference between the values of symbols and of numbers.
+    """
+
+    step: float = 1e-3
+    values_kept: int = 256
+    wrong: float = 0.1
+    jump: float = 1e-2
+    noise: float = 1e-4
+    agreement: float = 1e-9
 
 
 def user_plant(
@@ -131,15 +204,38 @@ def user_plant(
     options: Mapping[str, Any],
     lower: Sequence[float],
     upper: Sequence[float],
+    *,
+    differences: DifferenceOptions = DifferenceOptions(),
 ) -> Plant:
-    """A user's model as CasADi expressions; as numbers with differences where it has none.
+    """Make a plant of a user's model: CasADi expressions, or numbers with differences.
 
     The expressions must give the numbers that the model returns for numbers, in the middle of the
-    box: `math.sqrt` or `float` of a symbol is silently nan. Raises what `build_plant` raises where
-    the model takes neither symbols nor numbers.
+    box: `math.sqrt` or `float` of a symbol is silently nan.
+
+    Parameters
+    ----------
+    model : callable
+        model(theta, **options), as in `build_plant`.
+    names : sequence of str (n,)
+        Of θ.
+    options : mapping
+        Keyword arguments of the model.
+    lower, upper : sequences (n,)
+        Box of θ in SI; it scales the steps of the differences.
+    differences : DifferenceOptions
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    PlantError
+        What `build_plant` raises where the model takes neither symbols nor numbers.
     """
     box = np.array([lower, upper], float)
-    numeric, middle = DifferencedModel(model, tuple(names), options, *box), box.mean(axis=0)
+    numeric = DifferencedModel(model, tuple(names), options, box[0], box[1], differences)
+    middle = box.mean(axis=0)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # CasADi's notice on NumPy functions
@@ -162,7 +258,8 @@ def user_plant(
         raise  # `float` of a symbol is nan: what it raised of numbers is what is wrong
     for one, other in zip(found.matrices, expected.matrices, strict=True):
         size = np.abs(other).max(initial=0.0)
-        if np.isfinite(size) and not np.abs(one - other).max(initial=0.0) <= AGREEMENT * size:
+        gap = np.abs(one - other).max(initial=0.0)
+        if np.isfinite(size) and not gap <= differences.agreement * size:
             return numeric.plant("its expressions differ from the numbers that it returns")
     return plant
 
@@ -202,12 +299,13 @@ class DifferencedModel:
     options: Mapping[str, Any]
     lower: Array
     upper: Array
+    differences: DifferenceOptions = DifferenceOptions()
 
     @cached_property
     def _read(self) -> Callable[[tuple[float, ...]], _Values]:
         """What the model returns; the last ones are kept."""
 
-        @lru_cache(maxsize=REMEMBERED)
+        @lru_cache(maxsize=self.differences.values_kept)
         def read(theta: tuple[float, ...]) -> _Values:
             try:
                 found = self.model(dict(zip(self.names, theta, strict=True)), **self.options)
@@ -245,8 +343,8 @@ class DifferencedModel:
         def notes(theta: Sequence[float]) -> tuple[str, ...]:
             return (
                 f"the plant function takes numbers only ({short}): its derivatives are "
-                f"differences over {STEP:g} of the box, at most {self.error(theta):.1e} wrong "
-                "(relative, from a second step)",
+                f"differences over {self.differences.step:g} of the box, at most "
+                f"{self.error(theta):.1e} wrong (relative, from a second step)",
             )
 
         return Plant(
@@ -274,7 +372,7 @@ class DifferencedModel:
             return item.system.matrices
 
         M, D, K, B, C = (fine for fine, _ in self._slopes(theta, parts))
-        jump = self._disagreement(theta, LEAP)
+        jump = self._disagreement(theta, self.differences.jump)
         if jump:  # a value leaps between neighbouring points, not only bends
             raise PlantError(jump)
         return replace(here, derivatives=(M, D, K, B, C))
@@ -294,12 +392,13 @@ class DifferencedModel:
         return self._disagreement(theta, 0.0)
 
     def _disagreement(self, theta: Sequence[float] | Array, leap: float) -> str:
-        """The worst derivative whose two formulas differ by `WRONG` of it, and over a step by
+        """The worst derivative whose two formulas differ by `wrong` of it, and over a step by
         `leap` of the matrix."""
-        worst, words = WRONG, ""
+        numbers = self.differences
+        worst, words = numbers.wrong, ""
         for k, i, gap, slope, size in self._gaps(theta):
-            floor = max(slope, NOISE * size)
-            if not gap > worst * floor or STEP * gap <= leap * size:
+            floor = max(slope, numbers.noise * size)
+            if not gap > worst * floor or numbers.step * gap <= leap * size:
                 continue
             worst = gap / floor
             label = (*MATRICES, "hardware_cost or a constraint")[k]
@@ -341,16 +440,17 @@ class DifferencedModel:
         point = np.asarray(theta, float)
         base = parts(self._at(point))
         rows: list[list[Array]] = []
+        offsets = np.arange(-2.0, 3.0)  # steps, of the points about θ
         for i, width in enumerate(self.upper - self.lower):
-            h = STEP * width
+            h = self.differences.step * width
             centre = np.clip(point[i], self.lower[i] + 2.0 * h, self.upper[i] - 2.0 * h)
-            away, weights, found = (point[i] - centre) / h, np.zeros((2, len(OFFSETS))), []
+            away, weights, found = (point[i] - centre) / h, np.zeros((2, len(offsets))), []
             for row, every in zip(weights, (1, 2), strict=True):
-                powers = np.arange(len(OFFSETS[::every]))
+                powers = np.arange(len(offsets[::every]))
                 # row k: ((x - at)^k), of which only k = 1 slopes
-                system = (OFFSETS[::every] - away) ** powers[:, None]
+                system = (offsets[::every] - away) ** powers[:, None]
                 row[::every] = np.linalg.solve(system, (powers == 1) / h)
-            for offset in OFFSETS:
+            for offset in offsets:
                 moved = point.copy()
                 moved[i] = point[i] if offset == away else centre + offset * h
                 found.append(parts(self._at(moved)))

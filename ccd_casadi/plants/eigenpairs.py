@@ -18,20 +18,49 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.worker_process import OwnThreads
 
-TOGETHER = 4  # columns solved at once: of two to five each takes half as long, of more twice
-BLOCK = 3  # vectors that modes are searched with
-STEPS = 200  # blocks of a space at most
-EXACT, SOLVED = 1e-11, 1e-10  # relative residuals of a mode, and of a solution
-ROUNDING = 1e-13  # of the operator's norm: directions of a block that are no more
+
+@dataclass(frozen=True)
+class KrylovOptions:
+    """Numbers of the block Krylov methods.
+
+    Attributes
+    ----------
+    block : int
+        Vectors of a block with which modes are searched.
+    most_blocks : int
+        Blocks of a space.
+    mode_residual : float
+        Relative residual of a mode.
+    solution_residual : float
+        Relative residual of the solution with the resolvent.
+    rounding : float
+        Share of the operator's norm below which a direction of a block is dropped.
+    """
+
+    block: int = 3
+    most_blocks: int = 200
+    mode_residual: float = 1e-11
+    solution_residual: float = 1e-10
+    rounding: float = 1e-13
 
 
 class StageError(UserError):
-    """The stage cannot be evaluated; the message says why and what to change."""
+    """The stage cannot be evaluated; the message has the cause and what to change."""
 
 
 @dataclass(frozen=True)
 class Pencil:
-    """M and the inverse of A = K + shift M on vectors (n, k)."""
+    """Products with M and solutions with A = K + shift M on vectors (n, k).
+
+    Attributes
+    ----------
+    size : int
+        n.
+    shift : float
+        rad²/s².
+    mass, inverse : callable
+        x -> M x, and x -> A⁻¹ x.
+    """
 
     size: int
     shift: float
@@ -45,11 +74,30 @@ def build_pencil(
     shift: float,
     points: Array,
     added: Array,
+    *,
+    columns: int = 4,
 ) -> Pencil:
-    """The direct sum of elastic bodies (A_i, M_i), coupled by point masses; A_i is not kept.
+    """Factor the direct sum of elastic bodies (A_i, M_i), coupled by point masses.
 
-    `points` (n, r) are displacement functionals and `added` (r,) their masses in kg: M gains
-    points diag(added) pointsᵀ.
+    Parameters
+    ----------
+    shifted : iterable of sparse (n_i, n_i)
+        A_i = K_i + shift M_i, N/m; not kept.
+    masses : list of sparse (n_i, n_i)
+        M_i, kg.
+    shift : float
+        rad²/s².
+    points : array (n, r)
+        Displacement functionals of the point masses.
+    added : array (r,)
+        Point masses in kg: M gains points diag(added) pointsᵀ.
+    columns : int
+        Right-hand sides that are solved at once: of two to five each takes half as long as one
+        alone, of more twice as long.
+
+    Returns
+    -------
+    Pencil
     """
     # A is symmetric positive definite: pivots from the diagonal, and its transpose is itself in CSC
     how = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0}
@@ -62,8 +110,8 @@ def build_pencil(
     def bodies(x: Array) -> Array:
         out = np.empty(x.shape)
         for factor, low, high in zip(factors, [0, *cuts], cuts, strict=False):
-            for first in range(0, x.shape[1], TOGETHER):
-                here = slice(low, high), slice(first, first + TOGETHER)
+            for first in range(0, x.shape[1], columns):
+                here = slice(low, high), slice(first, first + columns)
                 out[here] = factor.value.solve(x[here])
         return out
 
@@ -85,7 +133,18 @@ def build_pencil(
 
 
 def orthonormal(pencil: Pencil, vectors: Array) -> Array:
-    """M-orthonormal vectors of the same span (n, k); zero columns are dropped."""
+    """Orthonormalise vectors in the norm of M; zero columns are dropped.
+
+    Parameters
+    ----------
+    pencil : Pencil
+    vectors : array (n, k)
+
+    Returns
+    -------
+    array (n, k')
+        Of the same span.
+    """
     if vectors.shape[1] == 0:
         return vectors
     scale = np.sqrt(np.einsum("ij,ij->j", vectors, pencil.mass(vectors)))
@@ -113,7 +172,9 @@ class Krylov:
         return np.asarray(np.sqrt(np.maximum(np.sum(last * (self.rest @ last), axis=0), 0.0)))
 
 
-def krylov_spaces(pencil: Pencil, start: Array, without: Array) -> Iterator[Krylov]:
+def krylov_spaces(
+    pencil: Pencil, start: Array, without: Array, options: KrylovOptions
+) -> Iterator[Krylov]:
     """Those from `start` (n, b), each a block larger, M-orthogonal to `without` (n, r).
 
     Each block is orthogonalised against all before it: one product with M and one solution a block
@@ -121,7 +182,7 @@ def krylov_spaces(pencil: Pencil, start: Array, without: Array) -> Iterator[Kryl
     """
     V, MV, block = without, pencil.mass(without), start
     out, T, scale = V.shape[1], np.zeros((0, 0)), 0.0
-    for _ in range(STEPS):
+    for _ in range(options.most_blocks):
         for _ in range(2):
             block = block - V @ (MV.T @ block)
         M_block = pencil.mass(block)
@@ -129,7 +190,7 @@ def krylov_spaces(pencil: Pencil, start: Array, without: Array) -> Iterator[Kryl
         scale = scale or float(np.sqrt(gram.max(initial=0.0)))
         if len(T):
             yield Krylov(V[:, out:], T, gram)
-        for least in ((ROUNDING * scale) ** 2, 0.0):
+        for least in ((options.rounding * scale) ** 2, 0.0):
             values, turn = np.linalg.eigh(block.T @ M_block)
             turn = turn[:, values > least] / np.sqrt(values[values > least])
             block, M_block = block @ turn, M_block @ turn
@@ -144,31 +205,75 @@ def krylov_spaces(pencil: Pencil, start: Array, without: Array) -> Iterator[Kryl
         scale = float(np.abs(T).max())
 
 
-def flexible_modes(pencil: Pencil, rigid: Array, count: int) -> tuple[Array, Array]:
-    """The `count` lowest flexible eigenvalues (rad²/s²) and M-orthonormal modes (n, count).
+def flexible_modes(
+    pencil: Pencil, rigid: Array, count: int, *, options: KrylovOptions = KrylovOptions()
+) -> tuple[Array, Array]:
+    """Compute the lowest flexible eigenpairs of K v = λ M v.
 
-    `rigid` (n, r) are the exact rigid-body modes: projected out, they cost no iterations. Blocks
-    find modes of equal frequency, as many as a block has vectors.
+    Blocks find modes of equal frequency, as many as a block has vectors.
+
+    Parameters
+    ----------
+    pencil : Pencil
+    rigid : array (n, r)
+        Exact rigid-body modes, M-orthonormal: projected out, they need no iterations.
+    count : int
+        Number of modes.
+    options : KrylovOptions
+
+    Returns
+    -------
+    λ (count,) in rad²/s², modes (n, count), M-orthonormal
+
+    Raises
+    ------
+    StageError
+        The iteration does not converge.
     """
     # a fixed start: the same θ gives the same digits
-    start = pencil.inverse(np.random.default_rng(0).standard_normal((pencil.size, BLOCK)))
-    for space in krylov_spaces(pencil, start, rigid):
+    draws = np.random.default_rng(0).standard_normal((pencil.size, options.block))
+    for space in krylov_spaces(pencil, pencil.inverse(draws), rigid, options):
         mu, Y = np.linalg.eigh(space.T)
         mu, Y = mu[: -count - 1 : -1], Y[:, : -count - 1 : -1]
-        if len(mu) == count and (space.beside(Y) <= EXACT * mu).all():
+        if len(mu) == count and (space.beside(Y) <= options.mode_residual * mu).all():
             return 1.0 / mu - pencil.shift, space.V @ Y
     raise StageError("the stage's eigen-solve did not converge; check theta")
 
 
 def build_resolvent(
-    pencil: Pencil, modes: Array, F: Array, largest: float
+    pencil: Pencil,
+    modes: Array,
+    F: Array,
+    largest: float,
+    *,
+    options: KrylovOptions = KrylovOptions(),
 ) -> Callable[[float], Array]:
-    """λ -> (K - λM)⁺ F (n, r) from one block Krylov space of A⁻¹M from A⁻¹F, M-orthogonal to
-    `modes` (n, k, all known ones).
+    """Build λ -> (K - λM)⁺ F from one block Krylov space of A⁻¹M from A⁻¹F.
 
     (K - λM)x = F reads (1 - (λ + shift) A⁻¹M) x = A⁻¹F, and Krylov spaces do not depend on λ.
     With every mode up to λ deflated the operator is positive definite: Galerkin's method is
-    then that of conjugate gradients. Grown until the relative residual at `largest` is 1e-10.
+    then that of conjugate gradients. The space grows until the residual at `largest` is small.
+
+    Parameters
+    ----------
+    pencil : Pencil
+    modes : array (n, k)
+        All known modes; the solution is M-orthogonal to them.
+    F : array (n, r)
+        Right-hand sides.
+    largest : float
+        Largest λ of interest, rad²/s².
+    options : KrylovOptions
+
+    Returns
+    -------
+    callable
+        λ -> array (n, r).
+
+    Raises
+    ------
+    StageError
+        The iteration does not converge.
     """
     if not F.shape[1]:
         return lambda value: F
@@ -180,10 +285,10 @@ def build_resolvent(
         operator = np.eye(len(space.T)) - (value + pencil.shift) * space.T
         return np.asarray(np.linalg.solve(operator, space.V.T @ M_start))
 
-    for space in krylov_spaces(pencil, start, orthonormal(pencil, modes)):
+    for space in krylov_spaces(pencil, start, orthonormal(pencil, modes), options):
         size = np.linalg.norm(space.V.T @ M_start, axis=0).max()
         left = (largest + pencil.shift) * space.beside(of(space, largest)).max()
-        if left < SOLVED * size:
+        if left < options.solution_residual * size:
             found = space
             return lambda value: found.V @ of(found, value)
     raise StageError("the stage's mode derivatives did not converge; retain another number")

@@ -33,9 +33,16 @@ class PlantMode:
 
 @dataclass(frozen=True)
 class Zero:
-    """A transmission zero: |z| in Hz, its damping ratio (negative: right half-plane), and its dip.
+    """A transmission zero.
 
-    `dip`: the plant's least gain at |z| over its geometric mean at 0.7 and 1.4 times |z|.
+    Attributes
+    ----------
+    frequency_hz : float
+        |z| in Hz.
+    damping_ratio : float
+        Negative in the right half-plane.
+    dip : float
+        The plant's least gain at |z| over its geometric mean at 0.7 and 1.4 times |z|.
     """
 
     frequency_hz: float
@@ -45,13 +52,21 @@ class Zero:
 
 @dataclass(frozen=True)
 class PlantFacts:
-    """A plant at one θ. `effort_hz`: where M_K σ_r(G) first falls below 1; nan if nowhere.
-
-    `inertia`: the least that an actuator moves where the plant is rigid (kg, of a torque kg m²);
-    infinite where it moves nothing freely.
+    """What limits a loop on a plant at one θ.
 
     σ_r is the r-th singular value, r the number of rigid-body modes where there are fewer of them
-    than inputs and outputs: what is held by a spring anyway needs no force at low frequency.
+    than inputs and outputs: a motion on a spring needs no force at low frequency.
+
+    Attributes
+    ----------
+    theta : tuple of float (n,)
+    modes : tuple of PlantMode
+    zeros : tuple of Zero
+    effort_hz : float
+        Where M_K σ_r(G) first falls below 1, Hz; nan if nowhere.
+    inertia : float
+        The least that an actuator moves where the plant is rigid (kg, of a torque kg m²);
+        infinite where it moves nothing freely.
     """
 
     theta: tuple[float, ...]
@@ -62,7 +77,19 @@ class PlantFacts:
 
 
 def facts_of(theta: tuple[float, ...], modal: ModalPlant, scaled: ScaledPlant) -> PlantFacts:
-    """The facts of a plant at one θ, from its modes and its scaled state space."""
+    """Collect the facts of a plant at one θ.
+
+    Parameters
+    ----------
+    theta : tuple of float (n,)
+    modal : ModalPlant
+    scaled : ScaledPlant
+        The same plant.
+
+    Returns
+    -------
+    PlantFacts
+    """
     effort = _effort_hz(modal, scaled)
     driven = float((modal.B[modal.rigid] ** 2).sum(axis=0).max(initial=0.0))
     inertia = 1.0 / driven if driven > 0.0 else float("inf")
@@ -70,7 +97,16 @@ def facts_of(theta: tuple[float, ...], modal: ModalPlant, scaled: ScaledPlant) -
 
 
 def modes_of(modal: ModalPlant) -> tuple[PlantMode, ...]:
-    """Every mode in the order of the plant."""
+    """List every mode in the order of the plant.
+
+    Parameters
+    ----------
+    modal : ModalPlant
+
+    Returns
+    -------
+    tuple of PlantMode
+    """
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
     zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.where(modal.rigid, 1.0, np.diag(modal.K))))
@@ -112,8 +148,21 @@ def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
 
 
 def bandwidth_limit_hz(zero: Zero, S_max: float) -> float:
-    """The ω_b, in Hz, that no stable loop with ‖S‖∞ <= S_max passes; of a right half-plane zero.
+    """Bound the bandwidth of every stable loop with ‖S‖∞ <= S_max by a right half-plane zero.
 
+    Parameters
+    ----------
+    zero : Zero
+    S_max : float
+        Largest peak of S, above 1.
+
+    Returns
+    -------
+    float
+        ω_b in Hz that no such loop exceeds; see the head of the module.
+
+    Examples
+    --------
     >>> round(bandwidth_limit_hz(Zero(10.0, -1.0, 1.0), 2.0), 2)  # z tan(60°), real zero
     17.32
     """

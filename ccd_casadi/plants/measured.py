@@ -3,37 +3,84 @@
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.plants.response_table import PLACES, least_phase, read_table
+from ccd_casadi.plants.response_table import ReadingOptions, least_phase, read_table
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 
-BELOW = 3  # decades that a response is followed below its first line
-PER_DECADE = 25
 DERIVATIVES = {1: "a mobility (velocity over force); divide it by j 2π f",
                2: "an accelerance (acceleration over force); divide it by -(2π f)²"}  # fmt: skip
-LASTING = PLACES // 10  # places over which it has to, since both turn sharply at a resonance
-UNCLEAR = 2.0  # rad between two lines: from there on whether the angle rises or falls is not known
-RISES = 0.35  # of slope, and rad: so far from those of a derivative
-FIRST = 1.5  # times the first line: up to there its slope says how many poles lie at 0
-LEAST_DAMPING = 5e-4  # of a resonance, where nothing else is known
-PEAK = 1.0  # ln: by so much a resonance stands out of |G|
+
+
+@dataclass(frozen=True)
+class ResponseOptions:
+    """Numbers by which a measured response is read.
+
+    Attributes
+    ----------
+    decades_below : int
+        Decades that a response is extrapolated below its first line.
+    per_decade : int
+        Lines a decade of that.
+    phase_points : int
+        Points over ln f at which the phase is compared with that of a minimum-phase system.
+    lasting_points : int
+        Points over which an excess of phase must last: both turn sharply at a resonance.
+    unclear_turn : float
+        Angle in rad between two lines beyond which its sign is not known.
+    derivative_gap : float
+        Largest distance of slope (1) and angle (rad) from those of a time derivative.
+    first_lines : float
+        Factor of the first line: up to there the slope gives the number of poles at 0.
+    peak : float
+        Prominence of a resonance in ln |G|.
+    """
+
+    decades_below: int = 3
+    per_decade: int = 25
+    phase_points: int = ReadingOptions.bode_points
+    lasting_points: int = ReadingOptions.bode_points // 10
+    unclear_turn: float = 2.0
+    derivative_gap: float = 0.35
+    first_lines: float = 1.5
+    peak: float = 1.0
 
 
 @dataclass(frozen=True)
 class MeasuredResponse:
-    """G (k,), or (k, p, m) of several channels, in m/N at rising lines (k,) in Hz.
+    """A measured frequency response, force to displacement.
 
-    `unstable_poles` of G. `poles_at_zero`: n of G ~ (jω)^-n below the first line; by default by the
-    slope of the first lines. `modelled`: a model stands behind it, which decides what lines leave
-    open. `spread` of repeated measurements, of the shape of G: each entry lies within it of the
-    plant's. `words`: how a file was understood. `least_damping`: no resonance has less, so that one
-    between two lines shows on them or is harmless. `undamped_hz`: poles of G on the axis.
-    Raises UserError where that is no response.
+    Attributes
+    ----------
+    hz : array (k,)
+        Rising frequencies of the lines, Hz.
+    G : array (k,) or (k, p, m)
+        Response in m/N at the lines.
+    unstable_poles : int
+        Number of unstable poles of G.
+    poles_at_zero : int, optional
+        n of G ~ (jω)^-n below the first line; by default from the slope of the first lines.
+    modelled : bool
+        Whether the lines are those of a model, which decides what they leave open.
+    spread : array, optional
+        Of repeated measurements, m/N, shape of G: each entry is within it of the plant's.
+    words : str
+        How a file was understood.
+    least_damping : float
+        Least damping ratio of a resonance: one between two lines shows on them or is harmless.
+    undamped_hz : tuple of float
+        Poles of G on the axis, Hz.
+    options : ResponseOptions
+        Of every response.
+
+    Raises
+    ------
+    UserError
+        The numbers are not a response.
     """
 
     hz: Array
@@ -43,8 +90,9 @@ class MeasuredResponse:
     modelled: bool = False
     spread: Array | None = None
     words: str = field(default="", compare=False)
-    least_damping: float = LEAST_DAMPING
+    least_damping: float = 5e-4
     undamped_hz: tuple[float, ...] = ()
+    options: ClassVar[ResponseOptions] = ResponseOptions()
 
     def __post_init__(self) -> None:
         shape = self.G.shape
@@ -82,7 +130,7 @@ class MeasuredResponse:
     @cached_property
     def _fall(self) -> float:
         """-d ln|G|/d ln f of the first lines."""
-        many = max(3, int(np.searchsorted(self.hz, FIRST * self.hz[0])))
+        many = max(3, int(np.searchsorted(self.hz, self.options.first_lines * self.hz[0])))
         size = np.linalg.norm(self.matrix[:many], axis=(1, 2))
         return -float(np.polyfit(np.log(self.hz[:many]), np.log(size), 1)[0])
 
@@ -92,7 +140,8 @@ class MeasuredResponse:
         agree; empty where of none."""
         order = round(-self._fall)
         angle = float(np.angle((self.matrix[0] * (-1j) ** order).sum()))
-        rises = order in DERIVATIVES and abs(order + self._fall) < RISES and abs(angle) < RISES
+        gap = max(abs(order + self._fall), abs(angle))
+        rises = order in DERIVATIVES and gap < self.options.derivative_gap
         return DERIVATIVES[order] if rises else ""
 
     @cached_property
@@ -114,7 +163,7 @@ class MeasuredResponse:
         from scipy.signal import find_peaks  # slow to import, and every command imports this module
 
         size = sign * np.log(np.linalg.norm(self.matrix, axis=(1, 2)))
-        at, found = find_peaks(size, prominence=PEAK)
+        at, found = find_peaks(size, prominence=self.options.peak)
         return np.asarray(at[np.argsort(-found["prominences"])])
 
     @property
@@ -130,19 +179,23 @@ class MeasuredResponse:
         if used.sum() < 3 or self.matrix.shape[1] != self.matrix.shape[2]:
             return 0.0
         x, F = np.log(self.hz[used]), np.linalg.det(self.matrix[used])
-        places = np.linspace(x[0], x[-1], PLACES)
+        places = np.linspace(x[0], x[-1], self.options.phase_points)
         least = least_phase(np.interp(places, x, np.log(np.abs(F))), places)
         turns = np.angle(F[1:] / F[:-1])
-        turns = np.where(np.abs(turns) > UNCLEAR, -np.abs(turns), turns)  # an unclear one falls
+        unclear = np.abs(turns) > self.options.unclear_turn
+        turns = np.where(unclear, -np.abs(turns), turns)
         risen = np.interp(places, x, np.append(0.0, np.cumsum(turns))) - least
-        lasting = np.lib.stride_tricks.sliding_window_view(risen - risen[0], LASTING).min(axis=1)
+        windows = np.lib.stride_tricks.sliding_window_view
+        lasting = windows(risen - risen[0], self.options.lasting_points).min(axis=1)
         return float(lasting.max() / np.pi)
 
     @cached_property
     def followed(self) -> "MeasuredResponse":
         """With three decades more below the first line, where it turns into its asymptote."""
         hz, first = self.hz, self.matrix[0]
-        below = np.geomspace(10.0**-BELOW * hz[0], hz[0], PER_DECADE * BELOW + 1)[:-1]
+        decades = self.options.decades_below
+        count = self.options.per_decade * decades + 1
+        below = np.geomspace(10.0**-decades * hz[0], hz[0], count)[:-1]
         turned = np.clip(1.0 + np.log10(below / hz[0]), 0.0, 1.0)[:, None, None]  # in a decade
         start = self.static * (-1j) ** self.slope
         lower = (start + turned * (first - start)) * ((below / hz[0]) ** -self.slope)[:, None, None]
@@ -192,7 +245,17 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
 
 
 def from_control(system: Any) -> MeasuredResponse:
-    """Of a python-control FRD (frequencies in rad/s)."""
+    """Convert a python-control FRD.
+
+    Parameters
+    ----------
+    system : control.FrequencyResponseData
+        Frequencies in rad/s, response in m/N.
+
+    Returns
+    -------
+    MeasuredResponse
+    """
     data = np.moveaxis(np.asarray(system.frdata), -1, 0).astype(complex)
     one = data.shape[1:] == (1, 1)
     return MeasuredResponse(np.asarray(system.omega, float) / HZ, data[:, 0, 0] if one else data)

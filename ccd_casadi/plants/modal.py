@@ -21,16 +21,38 @@ from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, nu
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-UNDAMPED = 1e-12  # of the largest modal damping: what is below is rounding of none
-ALIKE = 1e-9  # relative: singular values of outputs
-NONE = 1e-12  # relative: what is below is rounding of no force, no reading or no damping
+
+@dataclass(frozen=True)
+class ModalOptions:
+    """Levels of rounding in the modal form, all relative.
+
+    Attributes
+    ----------
+    undamped : float
+        Share of the largest modal damping below which a flexible mode counts as undamped.
+    equal_outputs : float
+        Difference below which singular values of the outputs of modes of one frequency are equal.
+    negligible : float
+        Share below which a damping between two modes, or a reading of a mode, is set to zero.
+    """
+
+    undamped: float = 1e-12
+    equal_outputs: float = 1e-9
+    negligible: float = 1e-12
 
 
 @dataclass(frozen=True)
 class Suspension:
-    """Where a synthesis puts the rigid-body poles: frequency in Hz and damping ratio.
+    """Where a synthesis puts the rigid-body poles.
 
-    `rigid_modes`: how many there are, where the case states it; see `rigid_modes.natural_modes`.
+    Attributes
+    ----------
+    frequency_hz : float
+        Natural frequency in Hz.
+    damping_ratio : float
+        Damping ratio.
+    rigid_modes : int, optional
+        Number of rigid-body modes, where the case states it; see `rigid_modes.natural_modes`.
     """
 
     frequency_hz: float = 0.1
@@ -39,7 +61,7 @@ class Suspension:
 
     @property
     def free(self) -> "Suspension":
-        """None: rigid-body poles stay at zero, as the machine has them."""
+        """The same without suspension: rigid-body poles stay at zero, as the machine has them."""
         return replace(self, frequency_hz=0.0, damping_ratio=0.0)
 
 
@@ -48,11 +70,17 @@ FREE = Suspension(0.0, 0.0)
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A plant off its model: flexible frequencies times 1 + `shift`, damping times `damping`.
+    """A deviation of a plant from its model; mode shapes stay.
 
-    Mode shapes stay. Modal damping ratios are multiplied by `damping`, or a given damping matrix,
-    which a shift leaves alone. `modes` shift single flexible modes besides, as `numbered` has them;
-    those that it does not reach stay.
+    Attributes
+    ----------
+    shift : float
+        Flexible frequencies are multiplied by 1 + `shift`; a given damping matrix is not changed.
+    damping : float
+        Factor of the modal damping ratios, or of a given damping matrix.
+    modes : tuple of float
+        Further relative shifts of single flexible modes, in the order of `numbered`; the modes
+        beyond its end are not shifted.
     """
 
     shift: float = 0.0
@@ -67,9 +95,20 @@ NOMINAL = Perturbation()
 class ModalPlant:
     """q̈ + D q̇ + K q = B u, y = C q in mass-normalised modal coordinates at one θ, SI.
 
-    `natural` holds the natural frequencies in rad/s before the suspension, `rigid` marks the
-    rigid-body modes, `modes` the mode shapes as columns. The `d…` arrays are derivatives to θ,
-    leading axis θ, in coordinates frozen at this θ, where M = I but dM is not zero.
+    Derivatives to θ are in coordinates frozen at this θ, where M = I but dM is not zero.
+
+    Attributes
+    ----------
+    K, D, B, C : arrays (n, n), (n, n), (n, m), (p, n)
+        Stiffness (rad²/s²), damping (rad/s), input (1/√kg) and output (1/√kg).
+    natural : array (n,)
+        Natural frequencies in rad/s before the suspension.
+    rigid : bool array (n,)
+        Which modes are rigid-body modes.
+    modes : array (N, n)
+        Mode shapes as columns.
+    dM, dK, dD, dB, dC : arrays
+        Derivatives to θ, leading axis θ.
     """
 
     K: Array
@@ -103,16 +142,36 @@ class ModalPlant:
 
 
 def modal_plant(
-    system: Mechanics, suspension: Suspension, perturbation: Perturbation = NOMINAL
+    system: Mechanics,
+    suspension: Suspension,
+    perturbation: Perturbation = NOMINAL,
+    *,
+    options: ModalOptions = ModalOptions(),
 ) -> ModalPlant:
-    """Mass-normalised modal coordinates, with suspension and modal damping.
+    """Transform a plant to mass-normalised modal coordinates, with suspension and modal damping.
 
-    Raises PlantError where a stiffness is negative, and where it is not known whether K resists a
-    motion.
+    Parameters
+    ----------
+    system : Mechanics
+        M, D, K, B, C and their derivatives, SI.
+    suspension : Suspension
+        Replaces the zero frequency and damping of rigid-body modes.
+    perturbation : Perturbation
+        Deviation from the model.
+    options : ModalOptions
+
+    Returns
+    -------
+    ModalPlant
+
+    Raises
+    ------
+    PlantError
+        A stiffness is negative, or it is not known whether K resists a motion.
     """
     lam, modes, rigid = natural_modes(system.K, system.M, suspension.rigid_modes)
     w_r = 2.0 * np.pi * suspension.frequency_hz
-    modes = _aligned(modes, lam, system.C)
+    modes = _aligned(modes, lam, system.C, options.equal_outputs)
     root = np.sqrt(lam)
     own = np.zeros(rigid.size)
     shifted = numbered(modes, rigid)[: len(perturbation.modes)]
@@ -128,7 +187,7 @@ def modal_plant(
 
     D_given = perturbation.damping * to_modal(system.D)
     size = np.sqrt(np.einsum("ij,ik,kj->j", np.abs(modes), np.abs(system.D), np.abs(modes)))
-    apart = np.abs(D_given) <= NONE * perturbation.damping * np.outer(size, size)
+    apart = np.abs(D_given) <= options.negligible * perturbation.damping * np.outer(size, size)
     D_given[apart] = 0.0  # of modes that no damper connects, and of a body that none brakes
     dM, dD, dK, dB, dC = system.derivatives
     dM, dK = to_modal(dM), to_modal(dK)
@@ -138,7 +197,7 @@ def modal_plant(
     dg = dM * g + _divided_differences(lam, g, rigid, slope_g) * dA
     C = system.C @ modes
     seen = np.linalg.norm(C, axis=0)
-    C[:, seen <= NONE * seen.max()] = 0.0
+    C[:, seen <= options.negligible * seen.max()] = 0.0
     return ModalPlant(
         K=np.diag(h),
         D=D_given + np.diag(g),
@@ -156,8 +215,19 @@ def modal_plant(
 
 
 def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
-    """The plant without rigid-body motions that are neither driven nor measured; see
-    `rigid_modes.driven_and_measured`. Derivatives of the plant's response stay what they are."""
+    """Remove rigid-body motions that are neither driven nor measured.
+
+    The derivatives of the plant's response do not change; see `rigid_modes.driven_and_measured`.
+
+    Parameters
+    ----------
+    modal : ModalPlant
+
+    Returns
+    -------
+    ModalPlant
+        The same object where there is no such motion.
+    """
     own = np.flatnonzero(modal.rigid)
     sizes = np.linalg.norm(modal.B, 2), np.linalg.norm(modal.C, 2)
     if not own.size or not all(sizes):
@@ -175,10 +245,21 @@ def without_hidden_rigid_modes(modal: ModalPlant) -> ModalPlant:
     return replace(modal, **both, **drive, **shown, **left)
 
 
-def require_damping(modal: ModalPlant) -> None:
-    """Raise PlantError where a flexible mode is not damped: its gain would be infinite."""
+def require_damping(modal: ModalPlant, *, options: ModalOptions = ModalOptions()) -> None:
+    """Check that every flexible mode is damped: the gain of an undamped one is infinite.
+
+    Parameters
+    ----------
+    modal : ModalPlant
+    options : ModalOptions
+
+    Raises
+    ------
+    PlantError
+        The message names the frequency in Hz and the remedy.
+    """
     damping, natural, rigid = np.diag(modal.D), modal.natural, modal.rigid
-    least = UNDAMPED * max(float(np.abs(damping[~rigid]).max(initial=0.0)), 1e-300)
+    least = options.undamped * max(float(np.abs(damping[~rigid]).max(initial=0.0)), 1e-300)
     wrong = np.flatnonzero(~rigid & (damping <= least))
     if not wrong.size:
         return
@@ -190,7 +271,7 @@ def require_damping(modal: ModalPlant) -> None:
     )
 
 
-def _aligned(modes: Array, lam: Array, C: Array) -> Array:
+def _aligned(modes: Array, lam: Array, C: Array, equal: float) -> Array:
     """Rotate modes of one frequency so that what the sensors do not see stands alone.
 
     Any orthogonal basis of an eigenspace is one of modes. In the singular vectors of its outputs
@@ -203,7 +284,7 @@ def _aligned(modes: Array, lam: Array, C: Array) -> Array:
     for start, end in pairwise([0, *apart, lam.size]):
         if end - start > 1:
             seen, Vh = np.linalg.svd(C @ modes[:, start:end])[1:]
-            if len(seen) < end - start or seen[0] - seen[-1] > ALIKE * seen[0]:
+            if len(seen) < end - start or seen[0] - seen[-1] > equal * seen[0]:
                 modes[:, start:end] = modes[:, start:end] @ Vh.T
     return modes
 

@@ -80,8 +80,19 @@ Position = tuple[Coordinate, ...]
 
 
 def names_in(points: Sequence[Sequence[Coordinate]]) -> tuple[str, ...]:
-    """The parameters that coordinates name, each once.
+    """Collect the parameters that coordinates name, each once.
 
+    Parameters
+    ----------
+    points : sequence of positions
+        Numbers, names of θ, or such a name after a minus sign.
+
+    Returns
+    -------
+    tuple of str
+
+    Examples
+    --------
     >>> names_in((("r", 0.1), ("-r", "s")))
     ('r', 's')
     """
@@ -90,7 +101,13 @@ def names_in(points: Sequence[Sequence[Coordinate]]) -> tuple[str, ...]:
 
 
 class Positions:
-    """Rows of coordinates as a linear function of θ: `constant` (m, d) + `slope` (m, d, n) θ."""
+    """Rows of coordinates as a linear function of θ.
+
+    Attributes
+    ----------
+    constant, slope : arrays (m, d), (m, d, n)
+        Points are constant + slope θ, m.
+    """
 
     def __init__(self, points: Sequence[Sequence[Coordinate]], names: Sequence[str]) -> None:
         shape = (len(points), len(points[0]) if points else 0)

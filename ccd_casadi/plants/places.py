@@ -32,25 +32,40 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.text import HZ
 
-ABSENT = 1e-12  # presence of an actuator that is not there: a root has a slope
-
 
 @dataclass(frozen=True)
 class Places:
-    """Where forces act and sensors read, m; without `sensors` the plant's own outputs are read.
-
-    `nodes` (N, d): of the plant's inputs, in their order. Masses in kg. Actuators, and sensors, are
-    at least `apart` from each other.
+    """Where forces act and sensors read, and with which masses.
 
     With `axes` all forces act, and all sensors read, together along the motions of a rigid body
-    normal to the nodes, 1, x, y, in directions of length 1: as many inputs and outputs, however
-    many actuators. `quiet` flexible modes, from 1 by frequency, are neither driven nor read by
-    them; each `damped` one is an axis of its own. With `reference` points inputs are loads and
-    outputs displacements there, whatever the number of forces and sensors (`axes.at_reference`).
+    normal to the nodes, 1, x, y, in directions of length 1: the number of inputs and outputs is
+    that of the axes, for any number of actuators.
 
-    Of both, `present` names a θ from 0 to 1 for each actuator: its force counts by the root of
-    it (γ² of a mixed sensitivity is convex in it), its mass by itself. At most `choose` are there.
-    Each that is there adds `actuator_cost` to f.
+    Attributes
+    ----------
+    nodes : tuple of points (N, d)
+        Nodes of the plant's inputs, in their order, m.
+    actuators, sensors : tuple of Position
+        Coordinates in m or names of θ; without `sensors` the plant's own outputs are read.
+    actuator_mass, sensor_mass : float
+        kg of each.
+    apart : float
+        Least distance between two actuators, and between two sensors, m.
+    axes : bool
+        Whether forces and sensors are combined to rigid-body axes.
+    quiet : tuple of int
+        Flexible modes, from 1 by frequency, that the axes neither drive nor read.
+    damped : tuple of int
+        Flexible modes that are axes themselves.
+    reference : tuple of points (3 or 4, 2)
+        Inputs are loads and outputs displacements at these points (`nodes.at_reference`).
+    present : tuple of str
+        A θ from 0 to 1 for each actuator: its force is multiplied by √θ (γ² of a mixed sensitivity
+        is convex in θ), its mass by θ.
+    choose : int
+        Largest number of actuators that are present.
+    actuator_cost : float
+        Added to f for each actuator that is present.
     """
 
     nodes: tuple[tuple[float, ...], ...]
@@ -80,9 +95,24 @@ class Places:
 
 
 def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
-    """The plant with its forces and sensors at their places, θ in the order of `names`.
+    """Move a plant's forces and sensors to their places.
 
-    Raises PlantError where nodes and inputs, or coordinates of nodes and places, do not match.
+    Parameters
+    ----------
+    plant : Plant
+        With one input for each node, a unit force there.
+    places : Places
+    names : sequence of str
+        θ (n,) of the new plant, those of `plant` and of `places`, in this order.
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    PlantError
+        Nodes and inputs, or coordinates of nodes and places, do not match.
     """
     nodes = np.array(places.nodes, float)
     if len(nodes) != plant.inputs:
@@ -171,6 +201,7 @@ class PlacedMechanics:
     sensors: Positions
     own: list[int]
     there: list[int]
+    absent: float = 1e-12  # presence of an actuator that is not there: √ has a slope above 0
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         values = np.asarray(theta, float)
@@ -189,10 +220,10 @@ class PlacedMechanics:
         (W, dW), (R, dR) = (
             self.between.weights(points, values) for points in (self.actuators, self.sensors)
         )
-        root = np.sqrt(np.maximum(values[self.there], ABSENT)) if self.there else 1.0
+        root = np.sqrt(np.maximum(values[self.there], self.absent)) if self.there else 1.0
         W, dW, dR = W * root, dW[:count] * root, dR[:count]
         for i, k in enumerate(self.there if count else ()):
-            dW[k, :, i] += 0.5 * W[:, i] / max(values[k], ABSENT)
+            dW[k, :, i] += 0.5 * W[:, i] / max(values[k], self.absent)
         M = below.M
         for w, dw, kg in ((W, dW, places.actuator_mass), (R, dR, places.sensor_mass)):
             F = B0 @ w

@@ -24,19 +24,43 @@ ModelFunction = Callable[..., Mapping[str, Any]]
 Evaluate = Callable[[Sequence[float]], "Mechanics"]
 
 _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
-# Matrices are dense and a synthesis takes time in the cube of this: more is a mistake, not a stage.
-LARGEST = {"mass": 1000, "input": 100, "output": 100}
-LARGEST_ENTRY = 1e100  # its square is still a double
 MATRICES = ("mass", "damping", "stiffness", "input", "output")
 _KNOWN = {*_REQUIRED, "damping", "damping_ratio", "constraints"}
 
 
 @dataclass(frozen=True)
-class Mechanics:
-    """M, D, K (n, n), B (n, m), C (p, n) at one θ in SI, with their derivatives to θ.
+class PlantOptions:
+    """Sizes beyond which a plant is refused.
 
-    `derivatives` holds ∂M, ∂D, ∂K, ∂B, ∂C as arrays with a leading axis over θ.
-    With `damping_ratio` given, D is the modal damping still to be made of it, here zero.
+    Attributes
+    ----------
+    most_coordinates : int
+        Rows of M: matrices are dense, and the time of a synthesis grows with the cube.
+    most_channels : int
+        Inputs, and outputs.
+    largest_entry : float
+        Of any matrix or derivative, SI: its square is still a double.
+    """
+
+    most_coordinates: int = 1000
+    most_channels: int = 100
+    largest_entry: float = 1e100
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """M, D, K, B, C at one θ in SI, with their derivatives to θ.
+
+    Attributes
+    ----------
+    M, D, K : arrays (n, n)
+        Mass, damping and stiffness.
+    B, C : arrays (n, m), (p, n)
+        Input and output.
+    damping_ratio : float or None
+        Modal damping ratio of every flexible mode, from which D is made later; D is then zero.
+    derivatives : tuple of arrays
+        ∂M, ∂D, ∂K, ∂B, ∂C with a leading axis over θ.
     """
 
     M: Array
@@ -54,7 +78,20 @@ class Mechanics:
 
 
 def to_first_order(system: Mechanics, step: Array) -> Mechanics:
-    """The matrices at θ + step by their derivatives at θ, which are kept."""
+    """Extrapolate a plant's matrices by their derivatives, which are kept.
+
+    Parameters
+    ----------
+    system : Mechanics
+        At θ.
+    step : array (k,)
+        Change of θ.
+
+    Returns
+    -------
+    Mechanics
+        At θ + step, to first order.
+    """
     pairs = zip(system.matrices, system.derivatives, strict=True)
     M, D, K, B, C = (matrix + np.tensordot(step, slopes, 1) for matrix, slopes in pairs)
     return Mechanics(M, D, K, B, C, system.damping_ratio, system.derivatives)
@@ -179,7 +216,7 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
 
 
 def model_parts(
-    result: Mapping[str, Any], kind: Any
+    result: Mapping[str, Any], kind: Any, *, options: PlantOptions = PlantOptions()
 ) -> tuple[tuple[Any, ...], float | None, dict[str, Any]]:
     """M, D, K, B, C as matrices of CasADi's `kind`, the damping ratio, and f and λ by name, of what
     a model returns. Raises PlantError where that is no plant."""
@@ -202,9 +239,12 @@ def model_parts(
         _converted(kind, key, result[key]) for key in ("mass", "stiffness", "input", "output")
     )
     n = M.shape[0]
-    for key, size in {"mass": n, "input": B.shape[1], "output": C.shape[0]}.items():
-        if size > LARGEST[key]:
-            words = f"at most {LARGEST[key]} are taken; reduce it to what matters (its first modes)"
+    few = options.most_channels
+    sizes = (("mass", n, options.most_coordinates), ("input", B.shape[1], few),
+             ("output", C.shape[0], few))  # fmt: skip
+    for key, size, most in sizes:
+        if size > most:
+            words = f"at most {most} are taken; reduce it to what matters (its first modes)"
             raise PlantError(f"{key} has {size} rows or columns, of which {words}")
     D = kind(result["damping"]) if "damping" in result else kind.zeros(n, n)
     _check_shapes(M, D, K, B, C)
@@ -242,16 +282,37 @@ def _check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
             raise PlantError(f"{words}: {remedy}")
 
 
-def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True) -> Mechanics:
-    """The plant's matrices and exact derivatives at θ; without derivatives where that is cheaper.
+def mechanics(
+    plant: Plant,
+    theta: Sequence[float],
+    *,
+    derivatives: bool = True,
+    options: PlantOptions = PlantOptions(),
+) -> Mechanics:
+    """Evaluate and check a plant's matrices at θ.
 
-    Raises PlantError where they are not finite, M or K not symmetric, or M not positive definite.
+    Parameters
+    ----------
+    plant : Plant
+    theta : sequence of float (n,)
+    derivatives : bool
+        Without, the derivatives may be missing where the plant is then cheaper.
+    options : PlantOptions
+
+    Returns
+    -------
+    Mechanics
+
+    Raises
+    ------
+    PlantError
+        A matrix is not finite, M or K is not symmetric, or M is not positive definite.
     """
     cheaper = plant.values is not None and not derivatives
     system = plant.values(theta) if cheaper and plant.values else plant.evaluate(theta)
     M, K = system.M, system.K
     place = f"at theta = {named_values(plant.names, theta)}"
-    _require_finite(plant, system, place)
+    _require_finite(plant, system, place, options.largest_entry)
     for name, matrix in (("mass", M), ("stiffness", K)):
         gap = np.abs(matrix - matrix.T)
         if gap.max() > 1e-9 * np.abs(matrix).max():
@@ -271,27 +332,41 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
 
 
 def nearby_model(plant: Plant, known: Sequence[Sequence[float]], here: Sequence[float]) -> Evaluate:
-    """θ -> Mechanics from what is known: the plant's own way, or to first order around `here`."""
+    """Make a cheap model of a plant beside θ at which it is known.
+
+    Parameters
+    ----------
+    plant : Plant
+    known : sequence of θ (n,)
+        Where the plant has been evaluated.
+    here : sequence of float (n,)
+        Centre of the first-order model.
+
+    Returns
+    -------
+    callable
+        θ -> Mechanics: `plant.nearby` where the plant has it, else the model to first order.
+    """
     if plant.nearby is not None and known:
         return plant.nearby(known)
     system = mechanics(plant, here)
     return lambda theta: to_first_order(system, np.array(theta) - np.array(here))
 
 
-def _require_finite(plant: Plant, system: Mechanics, place: str) -> None:
+def _require_finite(plant: Plant, system: Mechanics, place: str, largest: float) -> None:
     """Raise PlantError that names the first entry, or its slope, that is no number or too large."""
     entries = [*zip(MATRICES, system.matrices, strict=True)]
     for key, slopes in zip(MATRICES, system.derivatives, strict=True):
         entries += [(f"the derivative of {key} to {name}", slope)
                     for name, slope in zip(plant.names, slopes, strict=False)]  # fmt: skip
     for what, matrix in entries:
-        wrong = ~(np.abs(matrix) <= LARGEST_ENTRY)
+        wrong = ~(np.abs(matrix) <= largest)
         if not wrong.any():
             continue
         i, j = np.argwhere(wrong)[0]
         entry = f"{what} is {matrix[i, j]:g} in row {i + 1}, column {j + 1}"
         if np.isfinite(matrix[i, j]):
-            words = f"the plant has an entry beyond {LARGEST_ENTRY:g} {place}: {entry}"
+            words = f"the plant has an entry beyond {largest:g} {place}: {entry}"
             raise PlantError(f"{words}; choose other units")
         remedy = "keep divisions, roots and logarithms in their range over all bounds of theta"
         if what not in MATRICES:
@@ -301,7 +376,15 @@ def _require_finite(plant: Plant, system: Mechanics, place: str) -> None:
 
 @dataclass(frozen=True)
 class FromExpressions:
-    """θ -> Mechanics; `matrices`: θ to M, D, K, B, C and their Jacobians, a graph of scalars."""
+    """θ -> Mechanics by CasADi expressions.
+
+    Attributes
+    ----------
+    matrices : casadi.Function
+        θ to M, D, K, B, C and their Jacobians, a graph of scalars.
+    damping_ratio : float or None
+        As in `Mechanics`.
+    """
 
     matrices: ca.Function
     damping_ratio: float | None
@@ -317,21 +400,63 @@ class FromExpressions:
 
 
 def hardware_cost(plant: Plant, theta: Sequence[float] | Array) -> float:
-    """f(θ)."""
+    """Evaluate the hardware cost f(θ).
+
+    Parameters
+    ----------
+    plant : Plant
+    theta : sequence or array (n,)
+
+    Returns
+    -------
+    float
+        In the unit of the plant's cost, usually kg.
+    """
     return float(plant.hardware(np.asarray(theta, float))[0])
 
 
 def constraint_values(plant: Plant, theta: Sequence[float] | Array) -> Array:
-    """λ(θ), one value a name of `plant.constraint_names`; met where <= 0."""
+    """Evaluate the hardware constraints λ(θ), which are met where λ <= 0.
+
+    Parameters
+    ----------
+    plant : Plant
+    theta : sequence or array (n,)
+
+    Returns
+    -------
+    array (m,)
+        In the order of `plant.constraint_names`.
+    """
     return np.array(plant.hardware(np.asarray(theta, float))[1]).ravel()
 
 
 def hardware_slopes(plant: Plant, theta: Sequence[float] | Array) -> tuple[Array, Array]:
-    """∇f (n,) and ∇λ (m, n) at θ."""
+    """Evaluate the gradients of hardware cost and constraints.
+
+    Parameters
+    ----------
+    plant : Plant
+    theta : sequence or array (n,)
+
+    Returns
+    -------
+    ∇f (n,), ∇λ (m, n)
+    """
     df, dlam = (np.array(value) for value in plant.slopes(np.asarray(theta, float)))
     return df.ravel(), dlam.reshape(-1, len(plant.names))
 
 
 def named_values(names: Sequence[str], values: Sequence[float] | Array) -> str:
-    """`name=value, name=value`."""
+    """Write names and values as `name=value, name=value`.
+
+    Parameters
+    ----------
+    names : sequence of str (n,)
+    values : sequence or array (n,)
+
+    Returns
+    -------
+    str
+    """
     return ", ".join(f"{name}={value:g}" for name, value in zip(names, values, strict=True))

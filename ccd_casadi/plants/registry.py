@@ -41,11 +41,20 @@ GROUP = "ccd_casadi.plants"
 
 @dataclass(frozen=True)
 class Model:
-    """`build(names of θ, **options)` gives the plant, and raises PlantError.
+    """A plant model that a case file may name.
 
-    theta: the parameters that it needs; None: any. checks: what is wrong with an option's value,
-    None where nothing is. data: the option that names its data, relative to the case file. sound:
-    known to be, not diagnosed on loading.
+    Attributes
+    ----------
+    build : callable
+        build(names of θ, **options) -> Plant; raises PlantError.
+    theta : tuple of str, optional
+        The parameters that it needs; None: any.
+    checks : mapping
+        Option -> a check of its value, which returns what is wrong or None.
+    data : str
+        The option that names its data, relative to the case file.
+    sound : bool
+        Whether it is known to be sound: it is then not diagnosed on loading.
     """
 
     build: Callable[..., Plant]
@@ -80,13 +89,29 @@ def _offered() -> dict[str, EntryPoint]:
 
 
 def model_names() -> list[str]:
-    """All names, those of installed packages among them; nothing of these is imported."""
+    """List all models, those of installed packages among them, without importing these.
+
+    Returns
+    -------
+    list of str
+        Sorted.
+    """
     return sorted({*OWN, *_offered()})
 
 
 @cache
 def model_named(name: str | None) -> Model | None:
-    """The model of that name; None where there is none."""
+    """Find a model by its name.
+
+    Parameters
+    ----------
+    name : str or None
+
+    Returns
+    -------
+    Model or None
+        None where there is none of that name.
+    """
     if name is not None and name in OWN:
         return _own(name)
     if name is None or name not in _offered():

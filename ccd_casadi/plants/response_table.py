@@ -23,11 +23,33 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import mat_variables
 
-FEW_DEGREES = 30.0  # a phase that stays within them may as well be in radians
-TURNS = 4.0 * np.pi  # radians beyond which a phase may as well be in degrees
-PLACES, DELAYS = 200, 60  # of the test by Bode's relation: places over ln f, delays tried
-MISFIT = np.radians(20.0)  # of a reading that is doubted
-BETTER = 0.85  # of it, of a reading that is as likely
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """Numbers of the test whether the units of magnitude and phase are as stated.
+
+    Attributes
+    ----------
+    few_degrees : float
+        A phase within ± this many degrees may as well be in radians.
+    many_radians : float
+        A phase beyond ± this many radians may as well be in degrees.
+    bode_points : int
+        Points over ln f at which Bode's gain-phase relation is evaluated.
+    bode_delays : int
+        Delays that are tried with it.
+    bode_misfit : float
+        Mean misfit of the relation in rad beyond which a reading is doubted.
+    bode_gain : float
+        Share of the misfit below which another reading is as likely.
+    """
+
+    few_degrees: float = 30.0
+    many_radians: float = 4.0 * np.pi
+    bode_points: int = 200
+    bode_delays: int = 60
+    bode_misfit: float = float(np.radians(20.0))
+    bode_gain: float = 0.85
 
 
 @dataclass(frozen=True)
@@ -40,7 +62,7 @@ class ResponseTable:
     words: str
 
 
-def read_table(path: Path) -> ResponseTable:
+def read_table(path: Path, *, options: ReadingOptions = ReadingOptions()) -> ResponseTable:
     """The response in a .csv, .npz or .mat file. Raises UserError that names what is not clear."""
     suffix, notes = path.suffix.lower(), list[str]()
     if suffix == ".npz":
@@ -49,15 +71,27 @@ def read_table(path: Path) -> ResponseTable:
         columns = columns_of_arrays(path, mat_variables(path))
     else:
         columns, notes = columns_of_csv(path)
-    return _understood(path, columns, notes)
+    return _understood(path, columns, notes, options)
 
 
 def holds_lines(names: Sequence[str]) -> bool:
-    """Whether one of these variables is a frequency."""
+    """Report whether one of these variables is a frequency.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the variables of a file.
+
+    Returns
+    -------
+    bool
+    """
     return any((found := meaning_of(name)) and found[0] == "f" for name in names)
 
 
-def _understood(path: Path, columns: Sequence[Column], notes: Sequence[str]) -> ResponseTable:
+def _understood(
+    path: Path, columns: Sequence[Column], notes: Sequence[str], options: ReadingOptions
+) -> ResponseTable:
     """The response that the columns state."""
     known = dict(_quantities(path, columns))
     if "f" not in known:
@@ -85,7 +119,7 @@ def _understood(path: Path, columns: Sequence[Column], notes: Sequence[str]) -> 
             words = f"{known['G'][0].name}: is real, so its phase is missing; give a complex G"
             raise UserError(f"{path}: {words}, or re and im")
     else:
-        G = _of_size_and_angle(path, hz, known)
+        G = _of_size_and_angle(path, hz, known, options)
     spread = parts.get("spread")
     if spread is not None:
         spread = spread * known["spread"][1]
@@ -137,7 +171,7 @@ def _quantities(
 
 
 def _of_size_and_angle(
-    path: Path, hz: Array, known: Mapping[str, tuple[Column, float]]
+    path: Path, hz: Array, known: Mapping[str, tuple[Column, float]], options: ReadingOptions
 ) -> np.ndarray:
     """G of a magnitude and a phase. Raises UserError where another reading is as possible."""
     (sized, factor), (turned, to_rad) = known.get("size") or known["G"], known["angle"]
@@ -152,16 +186,20 @@ def _of_size_and_angle(
     largest, degrees = np.abs(angle).max(initial=0.0), to_rad != 1.0
     decibels = 10.0 ** (np.clip(size, -6e3, 6e3) / 20.0)
     named = decibels if factor < 0.0 else size * factor
-    own = _bode_misfit(hz, named, angle * to_rad)
-    turned_other = _bode_misfit(hz, named, angle * (1.0 if degrees else np.pi / 180.0))
-    clear = own < MISFIT and turned_other > own / BETTER
-    odd = 0.0 < largest <= FEW_DEGREES if degrees else largest > TURNS and not clear
-    if odd or (own > MISFIT and turned_other < BETTER * own):
+    own = _bode_misfit(hz, named, angle * to_rad, options)
+    turned_other = _bode_misfit(hz, named, angle * (1.0 if degrees else np.pi / 180.0), options)
+    clear = own < options.bode_misfit and turned_other > own / options.bode_gain
+    few, many = options.few_degrees, options.many_radians
+    odd = 0.0 < largest <= few if degrees else largest > many and not clear
+    if odd or (own > options.bode_misfit and turned_other < options.bode_gain * own):
         words = f"is {largest:.4g} at most: {'radians' if degrees else 'degrees'} may be meant"
         raise UserError(f"{path}: {turned.name}: {words}; give re and im, or name it "
                         f"{'phase_rad' if degrees else 'phase_deg'}")  # fmt: skip
-    doubted = factor > 0.0 and own > MISFIT
-    if doubted and _bode_misfit(hz, decibels, angle * to_rad) < BETTER * own:
+    if (
+        factor > 0.0
+        and own > options.bode_misfit
+        and _bode_misfit(hz, decibels, angle * to_rad, options) < options.bode_gain * own
+    ):
         words = "decibels may be meant, with which phase and slope agree"
         raise UserError(f"{path}: {sized.name}: {words}; name it magnitude_db, or give re and im")
     return np.asarray(named * np.exp(1j * angle * to_rad))
@@ -177,18 +215,19 @@ def least_phase(y: Array, x: Array) -> Array:
     return np.asarray(0.5 * np.pi * smooth)
 
 
-def _bode_misfit(hz: Array, size: Array, angle: Array) -> float:
+def _bode_misfit(hz: Array, size: Array, angle: Array, options: ReadingOptions) -> float:
     """Mean |φ - φ₀| (rad) over ln f, φ₀ = `least_phase`, for either sign of G and behind the delay
     that fits best."""
     good = (hz > 0.0) & (size > 0.0)
     x, y = np.log(hz[good]), np.log(size[good])
     if len(x) < 5 or not (np.diff(x) > 0.0).all():
         return 0.0
-    places = np.linspace(x[0], x[-1], PLACES)
+    places = np.linspace(x[0], x[-1], options.bode_points)
     off = np.interp(places, x, np.unwrap(angle[good])) - least_phase(
         np.interp(places, x, y), places
     )
-    lag = np.append(0.0, np.geomspace(0.1, 100.0, DELAYS))[:, None] * np.exp(places - places[-1])
+    delays = np.append(0.0, np.geomspace(0.1, 100.0, options.bode_delays))[:, None]
+    lag = delays * np.exp(places - places[-1])
     apart = np.abs(np.angle(np.exp(1j * (off + lag)))).mean(axis=1)
     opposite = np.abs(np.angle(-np.exp(1j * (off + lag)))).mean(axis=1)
     return float(np.minimum(apart, opposite).min())

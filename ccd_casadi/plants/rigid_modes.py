@@ -14,6 +14,8 @@ Flexible modes are those of the M-orthogonal complement, low ones by the inverse
 are many decades apart: an eigenvalue solver errs by ε of its largest eigenvalue.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.linalg import eigh
 
@@ -21,14 +23,36 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 EPS = float(np.finfo(float).eps)
-ROUNDING = 100.0  # times n ε: an eigenvalue of K' that rounding makes of zero is below it
-KNOWN = 1e-10  # eigenvalue of K' from which on K resists: its λ is known to n ε/KNOWN
-STATED = 1e-3  # eigenvalue of K' up to which a motion is rigid where the case states their number
-HIDDEN = 1e-9  # relative: a rigid body that is driven or measured by less is not
-STIFF = 1e8  # λ_max/λ_min from which on low modes are found by the inverse
 
 
-def natural_modes(K: Array, M: Array, stated: int | None = None) -> tuple[Array, Array, np.ndarray]:
+@dataclass(frozen=True)
+class RigidModeOptions:
+    """Numbers that decide which modes are rigid.
+
+    Attributes
+    ----------
+    rounding : float
+        Times n ε: eigenvalues of K' below it may be rounding of zero.
+    known : float
+        Eigenvalue of K' from which on K resists: its λ is known to n ε/known.
+    stated : float
+        Eigenvalue of K' up to which a motion is rigid where the case states their number.
+    hidden : float
+        Relative gain below which a rigid body is not driven, or not measured.
+    stiff : float
+        λ_max/λ_min from which on low modes are found by the inverse.
+    """
+
+    rounding: float = 100.0
+    known: float = 1e-10
+    stated: float = 1e-3
+    hidden: float = 1e-9
+    stiff: float = 1e8
+
+
+def natural_modes(
+    K: Array, M: Array, stated: int | None = None, *, options: RigidModeOptions = RigidModeOptions()
+) -> tuple[Array, Array, np.ndarray]:
     """Eigenvalues λ, modes and which are rigid, with λ = 0 there, lowest first.
 
         K Φ = M Φ Λ,   ΦᵀMΦ = 1
@@ -54,13 +78,13 @@ def natural_modes(K: Array, M: Array, stated: int | None = None) -> tuple[Array,
         raise _negative()
     d = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     w, U = np.linalg.eigh(K / d[:, None] / d)
-    rounding = ROUNDING * len(K) * EPS
+    rounding = options.rounding * len(K) * EPS
     count = int((w <= rounding).sum())
-    if stated is not None and count <= stated < len(w) and w[:stated].max(initial=0.0) <= STATED:
-        count = stated
-    if w[0] < -(rounding if stated is None else STATED):
+    if stated is not None and count <= stated < len(w):
+        count = stated if w[:stated].max(initial=0.0) <= options.stated else count
+    if w[0] < -(rounding if stated is None else options.stated):
         raise _negative()
-    open_ones = w[count:] < KNOWN
+    open_ones = w[count:] < options.known
     if open_ones.any() and count != stated:
         raise PlantError(
             f"the stiffness matrix resists a motion by {w[count]:.2g} of its entries: by rounding, "
@@ -74,7 +98,7 @@ def natural_modes(K: Array, M: Array, stated: int | None = None) -> tuple[Array,
     own, rest = Q[:, :count], Q[:, count:]
     lam, shapes = np.linalg.eigh(rest.T @ (0.5 * (A + A.T)) @ rest)
     modes = np.linalg.solve(L.T, np.hstack([own, rest @ shapes]))
-    if len(lam) and lam[-1] > STIFF * lam[0]:
+    if len(lam) and lam[-1] > options.stiff * lam[0]:
         lam, modes[:, count:] = _low_ones_by_the_inverse(K, M, lam, modes, count)
     return np.append(np.zeros(count), lam), modes, np.arange(len(K)) < count
 
@@ -93,7 +117,9 @@ def numbered(modes: Array, rigid: np.ndarray) -> np.ndarray:
     return flexible
 
 
-def driven_and_measured(B: Array, C: Array) -> tuple[Array, Array]:
+def driven_and_measured(
+    B: Array, C: Array, *, options: RigidModeOptions = RigidModeOptions()
+) -> tuple[Array, Array]:
     """Coordinates z, q = T z, of which the first ones alone are driven and measured.
 
     Free bodies q̈ = B u, y = C q are C B/s², whatever T. Where C, B and C B are of one rank,
@@ -114,11 +140,11 @@ def driven_and_measured(B: Array, C: Array) -> tuple[Array, Array]:
         A motion is driven and not measured, or the reverse: no controller can hold it.
     """
     U, s, _ = np.linalg.svd(B, full_matrices=False)
-    driven = int((s > HIDDEN).sum())
+    driven = int((s > options.hidden).sum())
     _, s, Vt = np.linalg.svd(C)
-    measured = int((s > HIDDEN).sum())
+    measured = int((s > options.hidden).sum())
     both = np.linalg.svd(Vt[:measured] @ U[:, :driven], compute_uv=False)
-    known = int((both > HIDDEN).sum())
+    known = int((both > options.hidden).sum())
     if driven > known:
         words = "it drifts away; add an output that sees it, or a spring that holds it"
         raise PlantError(f"a rigid-body motion is driven and not measured: {words}")
@@ -132,7 +158,21 @@ def driven_and_measured(B: Array, C: Array) -> tuple[Array, Array]:
 
 
 def placed(T: Array, own: np.ndarray, kept: np.ndarray) -> Array:
-    """T of the coordinates `own` (k,) among all, of which the `kept` ones stay: (n, len(kept))."""
+    """Embed a transformation of some coordinates into all of them.
+
+    Parameters
+    ----------
+    T : array (k, r)
+        Transformation of the coordinates `own`.
+    own : int array (k,)
+        Their numbers.
+    kept : int array
+        Numbers of the coordinates that stay, r of them among `own`.
+
+    Returns
+    -------
+    array (n, len(kept))
+    """
     n = len(own) - T.shape[1] + len(kept)
     whole = np.eye(n)[:, kept]
     whole[np.ix_(own, np.isin(kept, own))] = T

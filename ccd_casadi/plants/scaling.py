@@ -18,21 +18,46 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-EXACT = 1e-10  # share of a residue that may lie off the blocks and count as rounding
-MIXTURES = 8
-CERTAIN = 1e-13  # share of the strongest drive or reading under which a mode has none
+
+@dataclass(frozen=True)
+class ChannelOptions:
+    """Numbers of the split into separate channels.
+
+    Attributes
+    ----------
+    exact : float
+        Share of a residue that may lie off the blocks and count as rounding.
+    mixtures : int
+        Random mixtures of residues from which the best-separated one is taken.
+    driven : float
+        Share of the strongest drive or reading below which a mode has none.
+    """
+
+    exact: float = 1e-10
+    mixtures: int = 8
+    driven: float = 1e-13
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One block: its modes, and orthonormal directions of outputs (p, k) and inputs (m, k)."""
+    """One block of a block-diagonal plant.
+
+    Attributes
+    ----------
+    modes : int array
+        Numbers of its modes.
+    outputs, inputs : arrays (p, k), (m, k)
+        Orthonormal directions of outputs and inputs.
+    """
 
     modes: np.ndarray
     outputs: Array
     inputs: Array
 
 
-def find_channels(K: Array, D: Array, B: Array, C: Array) -> tuple[Channel, ...]:
+def find_channels(
+    K: Array, D: Array, B: Array, C: Array, *, options: ChannelOptions = ChannelOptions()
+) -> tuple[Channel, ...]:
     """The blocks of q̈ + D q̇ + K q = B u, y = C q; one, the plant itself, where it has no more.
 
     Modes that are not driven, or not seen, are in no channel. Only square plants are split.
@@ -43,7 +68,7 @@ def find_channels(K: Array, D: Array, B: Array, C: Array) -> tuple[Channel, ...]
     if p != m or p == 1:
         return whole
     b, c = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
-    live = (b > CERTAIN * b.max()) & (c > CERTAIN * c.max())
+    live = (b > options.driven * b.max()) & (c > options.driven * c.max())
     coupled = _components(np.abs(K) + np.abs(D) > 0.0)
     kept = [group for group in coupled if live[group].any()]
     residues = []
@@ -53,20 +78,20 @@ def find_channels(K: Array, D: Array, B: Array, C: Array) -> tuple[Channel, ...]
             np.outer(C[:, i], B[j]) / scale
             for i in group
             for j in group
-            if c[i] * b[j] > CERTAIN * scale
+            if c[i] * b[j] > options.driven * scale
         ]
-    U, s, Vt = _singular_vectors(np.array(residues))
-    if s[-1] <= EXACT * s[0]:
+    U, s, Vt = _singular_vectors(np.array(residues), options.mixtures)
+    if s[-1] <= options.exact * s[0]:
         return whole
     turned = [np.abs(U.T @ residue @ Vt.T) for residue in residues]
     share = np.max([t / max(t.max(), 1e-300) for t in turned], axis=0)
-    blocks = _components(np.maximum(share, share.T) > EXACT)
+    blocks = _components(np.maximum(share, share.T) > options.exact)
     if len(blocks) < 2:
         return whole
     found = []
     for block in blocks:
         out, into = U[:, block], Vt[block].T
-        modes = [g for g in kept if np.linalg.norm(out.T @ C[:, g]) > EXACT * c[g].max()]
+        modes = [g for g in kept if np.linalg.norm(out.T @ C[:, g]) > options.exact * c[g].max()]
         found.append(Channel(np.sort(np.concatenate(modes)), out, into))
     together = np.concatenate([channel.modes for channel in found])
     if len(np.unique(together)) < len(together):  # a group of coupled modes spans two blocks
@@ -74,7 +99,7 @@ def find_channels(K: Array, D: Array, B: Array, C: Array) -> tuple[Channel, ...]
     return tuple(found)
 
 
-def _singular_vectors(residues: Array) -> tuple[Array, Array, Array]:
+def _singular_vectors(residues: Array, mixtures: int) -> tuple[Array, Array, Array]:
     """Those of the mixture, of some, whose singular values lie furthest apart.
 
     Any mixture will do but for rounding, which grows as two of them meet; the seed is fixed, so
@@ -83,7 +108,7 @@ def _singular_vectors(residues: Array) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng(0)
     found = [
         np.linalg.svd(np.tensordot(rng.uniform(0.5, 1.5, len(residues)), residues, 1))
-        for _ in range(MIXTURES)
+        for _ in range(mixtures)
     ]
     return max(found, key=lambda parts: -np.diff(parts[1]).max())
 
@@ -94,17 +119,46 @@ def _components(linked: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(label == i) for i in range(count)]
 
 
-ROUNDING = 1e-13  # relative: of C Aⁿ B
-ON_AXIS = 1e-9  # |Re p| over |p| up to which no frequency is put on p
-ASIDE = 1e-10  # relative: but so far beside it
-FLANKS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])  # in half widths of a root
+@dataclass(frozen=True)
+class ScalingOptions:
+    """Numbers of a scaled plant's frequency grid.
+
+    Attributes
+    ----------
+    lowest, highest : float
+        Ends of the grid over ω₀.
+    points : int
+        Points of the grid, evenly spread over ln ω, besides those around roots.
+    flanks : tuple of float
+        Points around each resonance and anti-resonance, in half widths of the root.
+    on_axis : float
+        |Re p|/|p| of a pole up to which no frequency is put on p.
+    beside : float
+        Relative distance of the frequency that takes its place.
+    """
+
+    lowest: float = 1e-5
+    highest: float = 1e5
+    points: int = 121
+    flanks: tuple[float, ...] = (-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0)
+    on_axis: float = 1e-9
+    beside: float = 1e-10
 
 
 @dataclass(frozen=True)
 class ScaledChannel:
-    """One block of a block-diagonal plant: Uᵀ G V = C(s - A)⁻¹B, its grid and least gain there.
+    """One block of a block-diagonal plant: Uᵀ G V = C(s - A)⁻¹B.
 
-    `states` are those of the whole plant; U = `outputs` (p, k), V = `inputs` (m, k).
+    Attributes
+    ----------
+    A, B, C : arrays (n, n), (n, k), (k, n)
+        Scaled state space, time in 1/ω₀.
+    grid, gain : arrays (g,)
+        Frequencies over ω₀ and the least singular value there.
+    states : int array (n,)
+        Numbers of its states in the whole plant.
+    outputs, inputs : arrays (p, k), (m, k)
+        U and V.
     """
 
     A: Array
@@ -119,15 +173,31 @@ class ScaledChannel:
 
 @dataclass(frozen=True)
 class ScaledPlant:
-    """State space (A, B, C) of M_K G(jω₀ω), what its kernels need, and the way back to SI.
+    """State space (A, B, C) of M_K G(jω₀ω), its frequency grid, and the way back to SI.
 
-    `grid` are frequencies over ω₀ that resolve every resonance and transmission zero, `gain`
-    the least singular value of the scaled plant there. `dA`, `dB`, `dC` are derivatives to θ
-    with ω₀ and the coordinates frozen. `channels` are the blocks of an exactly block-diagonal
-    plant (see `channels`), empty where it is not. With a `family`, the plant that a controller is
-    designed on (of free bodies, on their suspension) and those that it has to hold on, all with the
-    ω₀, the force and the drive of this one, a synthesis is one for all, and the peak of S the
-    largest on any of these and this one.
+    With a `family` one synthesis serves all its plants, all with the ω₀, the force and the drive of
+    this one, and the peak of S is the largest on this one and on those after the first.
+
+    Attributes
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+        Time in 1/ω₀, force in units of `force`.
+    omega_0 : float
+        Unit of frequency, rad/s.
+    force : float
+        M_K in N/m: the unit of force over that of displacement.
+    grid, gain : arrays (g,)
+        Frequencies over ω₀ that resolve every resonance and transmission zero, and the least
+        singular value of the scaled plant there.
+    natural : array (r,)
+        Natural frequencies in rad/s.
+    dA, dB, dC : arrays
+        Derivatives to θ, leading axis θ, with ω₀ and the coordinates frozen.
+    channels : tuple of ScaledChannel
+        Blocks of an exactly block-diagonal plant, empty where it is not.
+    family : tuple of ScaledPlant
+        The plant that a controller is designed on (free bodies: on their suspension), then those on
+        which it must meet the bounds, too.
     """
 
     A: Array
@@ -181,10 +251,26 @@ class ScaledPlant:
 
 
 def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledPlant:
-    """Scale a modal plant for weights with this M_K; M_K in N/m (force over displacement).
+    """Scale a modal plant for weights with this M_K.
 
-    `bare`: without the grid, the gains and the channels, which a synthesis needs and no loop does.
-    Raises PlantError where no mode is both driven and measured.
+        ω₀² = M_K ‖b‖ ‖c‖,   b and c the sizes of the rows of B and the columns of C
+
+    Parameters
+    ----------
+    modal : ModalPlant
+    M_K : float
+        Force over displacement, N/m.
+    bare : bool
+        Without the grid, the gains and the channels, which only a synthesis needs.
+
+    Returns
+    -------
+    ScaledPlant
+
+    Raises
+    ------
+    PlantError
+        No mode is both driven and measured.
     """
     b = np.linalg.norm(modal.B, axis=1)
     c = np.linalg.norm(modal.C, axis=0)
@@ -251,15 +337,29 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
 
 
-def leading_gain(system: StateSpace) -> tuple[int, float]:
-    """n and ‖C Aⁿ⁻¹ B‖ of the plant's C Aⁿ⁻¹ B / sⁿ at high frequencies: n = 2 where that is not 0,
-    else the first; 0 and 0 where the plant is 0."""
+def leading_gain(system: StateSpace, *, rounding: float = 1e-13) -> tuple[int, float]:
+    """Find the leading term C Aⁿ⁻¹ B/sⁿ of a plant at high frequencies.
+
+    Parameters
+    ----------
+    system : StateSpace
+        D = 0, SI.
+    rounding : float
+        Relative size below which a product is zero.
+
+    Returns
+    -------
+    n : int
+        2 where C A B is not zero, else the first n whose term is not; 0 where the plant is 0.
+    gain : float
+        ‖C Aⁿ⁻¹ B‖; 0 where the plant is 0.
+    """
     A, B, C = balanced(system.A, system.B, system.C)
     sizes = [float(np.linalg.norm(M, 2)) for M in (C, A, B)]
     found, power = {}, B
     for n in range(1, len(A) + 1):
         size = float(np.linalg.norm(C @ power, 2))
-        if size > ROUNDING * sizes[0] * sizes[1] ** (n - 1) * sizes[2]:
+        if size > rounding * sizes[0] * sizes[1] ** (n - 1) * sizes[2]:
             found[n] = size
         power = A @ power
     order = 2 if 2 in found else min(found, default=0)
@@ -283,15 +383,19 @@ def _scaled_channels(
     return tuple(found)
 
 
-def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
+def _gains(
+    A: Array, B: Array, C: Array, *, options: ScalingOptions = ScalingOptions()
+) -> tuple[Array, Array]:
     """A logarithmic grid with points crowded around lightly damped poles and zeros, and the least
     singular value of the plant on it."""
     system = strictly_proper(A, B, C)
     roots = np.concatenate([system.poles, system.zeros()])
-    roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
+    low, high, size = options.lowest, options.highest, np.abs(roots)
+    roots = roots[(roots.imag > 0.0) & (size > low) & (size < high)]
     wide = np.maximum(np.abs(roots.real), 1e-9 * roots.imag) + 1j * roots.imag
-    grid = frequency_grid(1e-5, 1e5, 121, root_flanks(wide, FLANKS))
-    axis = system.poles[np.abs(system.poles.real) < ON_AXIS * np.abs(system.poles)].imag
-    on_pole = (np.abs(grid[:, None] - np.abs(axis)) < ASIDE * grid[:, None]).any(axis=1)
-    grid = np.ascontiguousarray(np.where(on_pole, (1.0 + ASIDE) * grid, grid))
+    grid = frequency_grid(low, high, options.points, root_flanks(wide, options.flanks))
+    poles, beside = system.poles, options.beside
+    axis = poles[np.abs(poles.real) < options.on_axis * np.abs(poles)].imag
+    on_pole = (np.abs(grid[:, None] - np.abs(axis)) < beside * grid[:, None]).any(axis=1)
+    grid = np.ascontiguousarray(np.where(on_pole, (1.0 + beside) * grid, grid))
     return grid, plant_gain(A, B, C, grid)

@@ -8,7 +8,13 @@ import numpy as np
 import scipy
 
 from ccd_casadi.lti.loop import delay_parts, delayed, sampled
-from ccd_casadi.lti.state_space import FLANKS, StateSpace, balanced, frequency_grid, root_flanks
+from ccd_casadi.lti.state_space import (
+    RootOptions,
+    StateSpace,
+    balanced,
+    frequency_grid,
+    root_flanks,
+)
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.plants.response_table import holds_lines
 from ccd_casadi.support.errors import UserError
@@ -81,9 +87,8 @@ def as_lines(
     undamped = np.abs(rates.real) <= ON_AXIS * np.abs(rates)
     axis = _folded(rates[undamped & ~rest & (rates.imag > 0.0)], T).imag
     narrow = np.abs(roots.real) <= ON_AXIS * np.abs(roots)
-    beside = root_flanks(
-        BESIDE * np.abs(roots[narrow]) + 1j * roots[narrow].imag, FLANKS[FLANKS != 0.0]
-    )
+    widened = BESIDE * np.abs(roots[narrow]) + 1j * roots[narrow].imag
+    beside = root_flanks(widened, [x for x in RootOptions.flanks if x])
     omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),
                            root_flanks(roots[~narrow]), beside, apart=APART)  # fmt: skip
     close = np.abs(omega[:, None] - axis) <= 0.1 * BESIDE * axis

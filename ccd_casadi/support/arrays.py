@@ -7,11 +7,21 @@ Array = NDArray[np.float64]
 
 
 def states(A: Array, driven: Array) -> Array:
-    """x_k, k = 0 … N-1, of x_{k+1} = A x_k + d_k from rest.
+    """Compute the states of x_{k+1} = A x_k + d_k from rest.
 
-    A (n, n), `driven` d (N, n), the states (N, n). About √N pieces of √N steps advance side by side
-    from rest; what each starts from follows from piece to piece, and its decay is added: 3√N
-    products instead of N.
+    About √N pieces of √N steps advance side by side from rest; the state at the start of each piece
+    follows from the piece before, and its decay is added: 3√N products instead of N.
+
+    Parameters
+    ----------
+    A : array (n, n)
+    driven : array (N, n)
+        d.
+
+    Returns
+    -------
+    array (N, n)
+        x_k, k = 0 … N-1.
     """
     steps = max(int(np.ceil(np.sqrt(len(driven)))), 1)
     pieces = -(-len(driven) // steps)

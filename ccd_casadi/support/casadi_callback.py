@@ -37,11 +37,20 @@ class _Dense(ca.Callback):
 
 
 class VectorCallback(_Dense):
-    """x (n,) -> values (m,) and ∂values (m, n); keep a reference to it while it is in use.
+    """A numeric function x (n,) -> values (m,) with its Jacobian, as a casadi.Function.
 
-    NaN values make IPOPT shorten its step. Hessians are not available, and a quasi-Newton method is
-    to be used, unless x is of the order of 1 and `hessians` asks for CasADi's central differences
-    of the Jacobian.
+    CasADi holds no reference to it: keep one while it is in use. NaN values make IPOPT shorten its
+    step. Without `hessians` a quasi-Newton method is to be used.
+
+    Parameters
+    ----------
+    name : str
+    inputs, outputs : int
+        n and m.
+    values, jacobian : callable
+        x (n,) -> (m,), and (m, n).
+    hessians : bool
+        Whether CasADi may take central differences of the Jacobian; x is then of the order of 1.
     """
 
     def __init__(

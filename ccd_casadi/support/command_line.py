@@ -37,7 +37,17 @@ RUN = {"dest": "run", "metavar": "RUN_DIR", "help": "the folder of a finished so
 
 
 def program(command: str) -> str:
-    """How a person called a module's command: `ccd solve` or `python -m ccd_casadi.solve`."""
+    """Return how a command was called: `ccd solve` or `python -m ccd_casadi.solve`.
+
+    Parameters
+    ----------
+    command : str
+        Dotted name of its module.
+
+    Returns
+    -------
+    str
+    """
     called = Path(sys.argv[0]).stem if sys.argv else ""
     return f"ccd {command.rpartition('.')[2]}" if called == "ccd" else f"python -m {command}"
 
@@ -84,8 +94,24 @@ def command(
     name: str, description: str, *options: Option, needs: Sequence[str],
     early: Callable[[argparse.Namespace], Sequence[str]] = lambda options: (), **how: Any,
 ) -> Callable[[Body], Callable[..., int]]:  # fmt: skip
-    """Makes the entry point of a command, which takes words and gives an exit code, of what it does
-    with its options; `how` as in `parser`, which `options` are added to, the others as in `run`."""
+    """Decorate a function of parsed options as the entry point of a command.
+
+    Parameters
+    ----------
+    name, description : str
+        Dotted name of the module, and the first line of --help.
+    *options : Option
+        What is added to the options of every command.
+    needs, early
+        As in `run`.
+    **how
+        As in `parser`.
+
+    Returns
+    -------
+    callable
+        The decorator; the entry point takes a list of words and returns an exit code.
+    """
 
     def entry_of(body: Body) -> Callable[..., int]:
         @wraps(body)
@@ -179,7 +205,19 @@ def _place(options: argparse.Namespace) -> object:
 def run_folder(case: Path, out: Path | None) -> Path:
     """Make the run folder: --out, or the case file's path without its suffix.
 
-    Raises UserError where it cannot be made or written.
+    Parameters
+    ----------
+    case : Path
+    out : Path, optional
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    UserError
+        It cannot be made or written.
     """
     folder = case.with_suffix("") if out is None else out
     try:

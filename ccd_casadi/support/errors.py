@@ -5,15 +5,24 @@ from typing import Any
 
 
 class UserError(ValueError):
-    """One line that says what is wrong and what to change; commands print it and exit with 2."""
+    """A mistake of the user, as one line with its remedy; commands print it and exit with 2."""
 
 
 class PlantError(UserError):
-    """A model returned something that is not a plant; the message says what to correct."""
+    """A model returned something that is not a plant; the message has the remedy."""
 
 
 def described(error: BaseException) -> str:
-    """The kind and the words of an exception of somebody else's code, which may have none."""
+    """Write the kind and the message of an exception of foreign code, which may have none.
+
+    Parameters
+    ----------
+    error : BaseException
+
+    Returns
+    -------
+    str
+    """
     try:
         return f"{type(error).__name__}: {error}"
     except Exception:
@@ -27,7 +36,18 @@ class MissingPackage(UserError):
 def require(package: str, extra: str) -> Any:
     """Import a package of the extra `ccd-casadi[extra]`.
 
-    Raises MissingPackage without it, or without a library of the system that it loads.
+    Parameters
+    ----------
+    package, extra : str
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    MissingPackage
+        It, or a library of the system that it loads, is not installed.
     """
     try:
         return import_module(package)

@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-AGAIN = 0.01  # s
 _pressed = threading.Event()
 _noticing = threading.Event()
 _kept = threading.Event()
@@ -30,7 +29,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 def exit_on_ctrl_c() -> None:
-    """Let Ctrl-C end the process at once, unless somebody handles or ignores it."""
+    """Let Ctrl-C end the process at once, unless it is handled or ignored already."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
 
@@ -69,8 +68,8 @@ def ctrl_c_noticed() -> Iterator[None]:
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             before(unraisable)
             return
-        # Not from here, where it could not be raised either.
-        timer = threading.Timer(AGAIN, again)
+        # Not from here, where it could not be raised either, but 10 ms later.
+        timer = threading.Timer(0.01, again)
         timer.daemon = True
         timer.start()
 
@@ -86,9 +85,13 @@ def ctrl_c_noticed() -> Iterator[None]:
 
 
 def raise_dropped() -> None:
-    """Raise the KeyboardInterrupt that a compiled library dropped on its way, if one did.
+    """Raise the KeyboardInterrupt that a compiled library has dropped, if one did.
 
     Long work calls it between its steps; it does nothing outside `ctrl_c_noticed`.
+
+    Raises
+    ------
+    KeyboardInterrupt
     """
     if _pressed.is_set() and _noticing.is_set():
         _noticing.clear()  # once: what is under way to the end is not to be met by another
@@ -119,6 +122,11 @@ def interrupts_kept() -> Iterator[None]:
     """Hold Ctrl-C until the end of the block and raise KeyboardInterrupt there.
 
     Only the main thread receives signals; elsewhere the block runs as it is.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At the end of the block.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -19,7 +19,21 @@ from surrogates.files import write_whole
 
 
 def mat_variables(path: Path) -> dict[str, Any]:
-    """What a .mat file holds by name. Raises UserError where it cannot be read."""
+    """Read the variables of a .mat file by name.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    dict of str to array
+
+    Raises
+    ------
+    UserError
+        The file cannot be read.
+    """
     try:
         with path.open("rb") as stream:
             return dict(scipy.io.loadmat(stream))
@@ -34,22 +48,46 @@ def mat_variables(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: is not a readable .mat file: {words}") from None
 
 
-DIGITS = 7  # of the numbers of an array that is listed
-
-
 def write_json(path: Path, value: Any) -> None:
-    """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
+    """Write a JSON file atomically; NaN and infinity become null.
+
+    Parameters
+    ----------
+    path : Path
+    value
+        As `json_values` takes it.
+    """
     write_whole(path, f"{json_text(value)}\n")
 
 
 def json_text(value: Any) -> str:
-    """What `write_json` writes."""
+    """Write a value as the text of a JSON file.
+
+    Parameters
+    ----------
+    value
+        As `json_values` takes it.
+
+    Returns
+    -------
+    str
+    """
     return json.dumps(json_values(value), indent=2, allow_nan=False)
 
 
 def json_values(value: Any) -> Any:
-    """Plain JSON values: dataclasses to objects, tuples and arrays to lists, NumPy scalars to
-    numbers, what is not finite to None."""
+    """Convert a value to plain JSON values.
+
+    Parameters
+    ----------
+    value
+        Dataclasses become objects, tuples and arrays lists, NumPy scalars numbers; what is not
+        finite becomes None.
+
+    Returns
+    -------
+    dict, list, str, number or None
+    """
     if is_dataclass(value):
         value = vars(value)
     if isinstance(value, np.ndarray):
@@ -64,11 +102,23 @@ def json_values(value: Any) -> Any:
 
 
 def plain(value: Any, listed: bool = False) -> Any:
-    """What JSON holds of a value: of a dataclass its name and fields, of an array (of float64)
-    shape and bytes, of an enumeration the name, of NaN and infinity their words.
+    """Convert a value to JSON such that `restored` gives it back.
 
-    `listed`: of an array the numbers, to seven digits, None for those that are not finite.
+    Of a dataclass its name and fields, of an array (of float64) shape and bytes, of an enumeration
+    the name, of NaN and infinity their words.
 
+    Parameters
+    ----------
+    value
+    listed : bool
+        Of an array the numbers, to seven digits, None for those that are not finite.
+
+    Returns
+    -------
+    dict, list, str, number or None
+
+    Examples
+    --------
     >>> plain((1.5, float("inf"), {"x": np.array([0.0])}))
     [1.5, 'inf', {'x': [[1], 'AAAAAAAAAAA=']}]
     >>> plain(np.array([1.0, 2.0 / 3.0, np.nan]), listed=True)
@@ -94,19 +144,35 @@ def plain(value: Any, listed: bool = False) -> Any:
     return value
 
 
-def _rounded(item: Any) -> Any:
+def _rounded(item: Any, *, digits: int = 7) -> Any:
     if isinstance(item, list):
-        return [_rounded(each) for each in item]
+        return [_rounded(each, digits=digits) for each in item]
     if isinstance(item, float):
-        return float(f"{item:.{DIGITS}g}") if math.isfinite(item) else None
+        return float(f"{item:.{digits}g}") if math.isfinite(item) else None
     return item
 
 
 def restored(kind: Any, data: Any) -> Any:
-    """Its inverse for a type as it is annotated; a field that is not there has its default.
+    """Convert what `plain` has made back, by the type as it is annotated.
 
-    Raises KeyError, TypeError or ValueError where `plain` cannot have written that.
+    Parameters
+    ----------
+    kind : type
+        A field that is missing in a dataclass has its default.
+    data
+        JSON values.
 
+    Returns
+    -------
+    value of `kind`
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        `plain` cannot have written `data`.
+
+    Examples
+    --------
     >>> restored(tuple[float, ...], [1.5, "inf"])
     (1.5, inf)
     """

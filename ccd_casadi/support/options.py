@@ -12,11 +12,10 @@ from ccd_casadi.support.text import HZ
 
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 Option = Callable[[argparse.ArgumentParser], object]  # adds one
-LONGEST = 1000  # characters of a line: somebody else's message in it may have millions
 
 
 class ExitCode(IntEnum):
-    """How a command ended, and the words for it."""
+    """How a command ended; `words` describes it."""
 
     words: str
 
@@ -41,16 +40,32 @@ class ExitCode(IntEnum):
         return cls.DONE if status == "verified" else cls[status.upper()]
 
 
-def one_line(value: object) -> str:
-    """Any text on one line: what a terminal would obey is escaped, a long middle left out."""
+def one_line(value: object, *, longest: int = 1000) -> str:
+    """Write any text on one line; control characters are escaped.
+
+    Parameters
+    ----------
+    value : object
+    longest : int
+        Characters; the middle of a longer text is left out.
+
+    Returns
+    -------
+    str
+    """
     words = " ".join(str(value).split())
-    if len(words) > LONGEST:
-        words = f"{words[: LONGEST - 200]} ... {words[-150:]}"
+    if len(words) > longest:
+        words = f"{words[: longest - 200]} ... {words[-150:]}"
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Count the cores that this process may use.
+
+    Returns
+    -------
+    int
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -63,8 +78,19 @@ class Parser(argparse.ArgumentParser):
 
 
 def integer(least: int, most: int = 999_999_999) -> Callable[[str], int]:
-    """Return the type of an option that is a whole number from `least` to `most`.
+    """Make the type of an option that is a whole number.
 
+    Parameters
+    ----------
+    least, most : int
+
+    Returns
+    -------
+    callable
+        str -> int; raises argparse.ArgumentTypeError.
+
+    Examples
+    --------
     >>> integer(1)("12")
     12
     """
@@ -82,10 +108,21 @@ def integer(least: int, most: int = 999_999_999) -> Callable[[str], int]:
 def real(
     least: float = 0.0, most: float = math.inf, *, strict: bool = False
 ) -> Callable[[str], float]:
-    """Return the type of an option that is a finite number from `least` to `most`.
+    """Make the type of an option that is a finite number.
 
-    `strict` leaves the bounds out.
+    Parameters
+    ----------
+    least, most : float
+    strict : bool
+        Exclude the bounds.
 
+    Returns
+    -------
+    callable
+        str -> float; raises argparse.ArgumentTypeError.
+
+    Examples
+    --------
     >>> real(0.0, strict=True)("2.5")
     2.5
     """
@@ -110,24 +147,73 @@ positive = real(strict=True)
 
 
 def option(*names: str, **how: Any) -> Option:
-    """An option of a command, as argparse takes it."""
+    """Make an option of a command.
+
+    Parameters
+    ----------
+    *names : str
+    **how
+        As in `argparse.ArgumentParser.add_argument`.
+
+    Returns
+    -------
+    Option
+    """
     return lambda arguments: arguments.add_argument(*names, **how)
 
 
 def valued(name: str, metavar: str, kind: Callable[[str], Any], words: str, default: Any) -> Option:
-    """An option with a value; its default is told behind the words."""
+    """Make an option with a value; its help ends with the default.
+
+    Parameters
+    ----------
+    name, metavar : str
+    kind : callable
+        str -> value.
+    words : str
+        Help.
+    default : number
+
+    Returns
+    -------
+    Option
+    """
     words += f" (default: {default:g})"
     return option(name, metavar=metavar, type=kind, default=default, help=words)
 
 
 def break_frequency_options(words: str) -> list[Option]:
-    """--omega-s-hz and --omega-t-hz, which `break_frequencies` reads."""
+    """Make --omega-s-hz and --omega-t-hz, which `break_frequencies` reads.
+
+    Parameters
+    ----------
+    words : str
+        Help of both.
+
+    Returns
+    -------
+    list of Option
+    """
     how: dict[str, Any] = {"type": positive, "metavar": "X", "help": words}
     return [option(f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", **how) for name in "ST"]
 
 
 def break_frequencies(options: argparse.Namespace) -> tuple[float, float] | None:
-    """(ω_S, ω_T) in rad/s; None where neither is given. Raises UserError where one is missing."""
+    """Read the break frequencies of the weights from parsed options.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+
+    Returns
+    -------
+    (ω_S, ω_T) in rad/s, or None where neither is given
+
+    Raises
+    ------
+    UserError
+        One of them is missing.
+    """
     given = options.omega_S_hz, options.omega_T_hz
     if None not in given:
         return HZ * given[0], HZ * given[1]

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from multiprocessing import connection
 from reprlib import Repr
 from typing import Any, Protocol, Self, TypeVar
@@ -22,17 +23,36 @@ from ccd_casadi.support.worker_process import (
 )
 
 K = TypeVar("K")
-PATIENCE = 2.0  # s of work that is not worth starting processes for
-FORKED = 0.3  # s of such work where processes are forked
 Running = dict[connection.Connection, tuple[WorkerProcess, int]]  # by pipe, and the task's number
 _SHORT = Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
 
 
-class Pool(Protocol):
-    """What spreads tasks over processes: `Workers` here, `cluster.Cluster` over Dask.
+@dataclass(frozen=True)
+class PoolOptions:
+    """When worker processes pay.
 
-    A context manager; leaving it ends or abandons what is in flight.
+    Attributes
+    ----------
+    patience : float
+        Work in s below which no processes are started.
+    forked_patience : float
+        The same in s where processes are forked and need not import.
+    """
+
+    patience: float = 2.0
+    forked_patience: float = 0.3
+
+
+class Pool(Protocol):
+    """A context manager that spreads tasks over processes: `Workers`, or `cluster.Cluster` (Dask).
+
+    Leaving it ends or abandons the tasks in flight.
+
+    Attributes
+    ----------
+    count : int
+        Tasks that run at a time.
     """
 
     @property
@@ -54,14 +74,20 @@ class Pool(Protocol):
 
 
 class Workers(AbstractContextManager["Workers"]):
-    """A lazily started process pool; with one worker the tasks run in this process.
+    """A process pool that starts on demand; with one worker the tasks run in this process.
 
     Processes import NumPy with one BLAS thread. They ignore Ctrl-C, which the parent handles, and
     end when the parent does, however it ends.
+
+    Parameters
+    ----------
+    count : int
+        Processes at most.
+    patience : float
+        Work in s below which no processes are started.
     """
 
     def __init__(self, count: int, patience: float = 0.0) -> None:
-        """`patience`: seconds of work below which processes that import do not pay."""
         self.count = max(1, count)
         self.patience = patience
         self._workers: list[WorkerProcess] = []
@@ -80,7 +106,9 @@ class Workers(AbstractContextManager["Workers"]):
         """
         began, done_here = time.monotonic(), 0
         alone = self.count == 1 or len(tasks) <= 1
-        patience = min(self.patience, FORKED) if imported_ahead() else self.patience
+        patience = (
+            min(self.patience, PoolOptions.forked_patience) if imported_ahead() else self.patience
+        )
         while done_here < len(tasks) and (alone or not self._workers):
             raise_dropped()
             each = (time.monotonic() - began) / done_here if done_here else 0.0
@@ -154,7 +182,25 @@ class Workers(AbstractContextManager["Workers"]):
 def results(
     workers: Pool | None, function: Callable[..., R], tasks: Mapping[K, tuple[Any, ...]]
 ) -> Generator[tuple[K, R], None, None]:
-    """Key and `function(*arguments)` of every task, as they complete; None: in this process."""
+    """Run tasks on a pool and yield results as they complete.
+
+    Parameters
+    ----------
+    workers : Pool or None
+        None: in this process.
+    function : callable
+    tasks : mapping
+        Key -> positional arguments of `function`.
+
+    Yields
+    ------
+    key, result
+
+    Raises
+    ------
+    WorkerLost
+        The workers of a task died twice.
+    """
     calls = [(key, function, arguments) for key, arguments in tasks.items()]
     return (workers or Workers(1)).map_unordered(_keyed, calls)
 

@@ -12,9 +12,14 @@ from typing import ClassVar, Self, TextIO, TypeVar
 
 
 class NotebookHtml:
-    """Base of what a notebook shows as more than its `repr`.
+    """Base of what a notebook shows as HTML.
 
-    How is far above most of these classes: the package sets `drawn` (an object to HTML).
+    How it is drawn is known in packages far above this one, which set `drawn`.
+
+    Attributes
+    ----------
+    drawn : callable
+        Object -> HTML.
     """
 
     drawn: ClassVar[Callable[[object], str] | None] = None
@@ -39,7 +44,17 @@ STATE = re.compile(rf"^(\w+\s{{2,}})({'|'.join(COLOURS)})\b")
 
 
 def columns(stream: TextIO) -> int:
-    """Of the terminal behind a stream, at most WIDTH."""
+    """Measure the terminal behind a stream.
+
+    Parameters
+    ----------
+    stream : TextIO
+
+    Returns
+    -------
+    int
+        Characters of a line, at most `WIDTH`.
+    """
     try:
         found = os.get_terminal_size(stream.fileno()).columns if stream.isatty() else WIDTH
     except (OSError, ValueError):
@@ -48,8 +63,20 @@ def columns(stream: TextIO) -> int:
 
 
 def wrapped(line: str, width: int) -> str:
-    """A line broken between words; what follows is under its words, not under its label.
+    """Break a line between words; what follows is under its words, not under its label.
 
+    Parameters
+    ----------
+    line : str
+    width : int
+        Characters.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> print(wrapped("survives      warned   stable for resonances -0.76 to +7.9 %", 48))
     survives      warned   stable for resonances
                            -0.76 to +7.9 %
@@ -72,8 +99,18 @@ def coloured(line: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Words of a page in the signs that every terminal has.
+    """Replace signs that not every terminal has.
 
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> plain("±1 µm, damping × 0.5, 40°")
     '+-1 um, damping x 0.5, 40 deg'
     """
@@ -83,7 +120,14 @@ def plain(text: str) -> str:
 
 
 def say(text: str, stream: TextIO | None = None) -> None:
-    """Print lines, "us" and "um" in all of them; a stream that is no terminal gets them whole."""
+    """Print lines, with "us" and "um" for "µs" and "µm"; a terminal gets them wrapped and coloured.
+
+    Parameters
+    ----------
+    text : str
+    stream : TextIO, optional
+        By default stdout.
+    """
     stream, text = stream or sys.stdout, text.replace("µ", "u")
     if stream.isatty():
         text = "\n".join(coloured(wrapped(line, columns(stream))) for line in text.split("\n"))
@@ -93,13 +137,26 @@ def say(text: str, stream: TextIO | None = None) -> None:
 
 
 def inform(text: str, stream: TextIO | None = None) -> None:
-    """As `say`, unless `kept_quiet` (--quiet) forbids what is no answer and no mistake."""
+    """Print lines as `say` does, unless `kept_quiet` (--quiet) is active.
+
+    Parameters
+    ----------
+    text : str
+    stream : TextIO, optional
+    """
     if not QUIET.get():
         say(text, stream)
 
 
 def remark(text: str, quiet: bool) -> None:
-    """A line of progress on stderr, unless quiet; a stream that fails ends the printing alone."""
+    """Print a line of progress on stderr; a stream that fails ends the printing alone.
+
+    Parameters
+    ----------
+    text : str
+    quiet : bool
+        Print nothing.
+    """
     with suppress(OSError, ValueError):
         if not quiet:
             say(text, sys.stderr)
@@ -107,7 +164,13 @@ def remark(text: str, quiet: bool) -> None:
 
 @contextmanager
 def kept_quiet(yes: bool) -> Iterator[None]:
-    """Within the block `inform` and progress bars print nothing, or (`yes` False) do."""
+    """Within the block `inform` and progress bars print nothing.
+
+    Parameters
+    ----------
+    yes : bool
+        False: they print, also within a block that is quiet.
+    """
     token = QUIET.set(yes)
     try:
         yield
@@ -122,14 +185,21 @@ Tell = Callable[[str], None]  # what is given lines of progress
 
 
 class Progress:
-    """`with Progress(total, label) as bar: bar.advance()`; nothing is printed if quiet or empty.
-
-    `quiet`: by default as `kept_quiet` says.
+    """A progress bar: `with Progress(total, label) as bar: bar.advance()`.
 
     On a terminal, and in a notebook's cell, one line is rewritten a few times a second; elsewhere
     a plain line is printed every few seconds and at the end. Work that ends before its total ends
     the bar, and a single step leaves no line behind. A stream that fails ends the printing, not the
     work.
+
+    Parameters
+    ----------
+    total : int
+        Number of steps; of 0 nothing is printed.
+    label : str
+    quiet : bool, optional
+        Print nothing; by default as `kept_quiet` has it.
+    stream : TextIO, optional
     """
 
     def __init__(
@@ -208,17 +278,44 @@ class Progress:
 
 
 def silent(words: str) -> None:
-    """Lines of progress that nobody reads."""
+    """Discard lines of progress.
+
+    Parameters
+    ----------
+    words : str
+    """
 
 
 def titled(tell: Tell, title: str) -> Tell:
-    """Lines of progress with what they are of."""
+    """Put a title before each line of progress.
+
+    Parameters
+    ----------
+    tell : callable
+        Takes a line.
+    title : str
+
+    Returns
+    -------
+    callable
+        Takes a line.
+    """
     return lambda words: tell(f"{title}: {words}")
 
 
 def duration(seconds: float) -> str:
-    """Seconds in words.
+    """Write a duration in words.
 
+    Parameters
+    ----------
+    seconds : float
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> duration(3.2), duration(59.97), duration(250), duration(7300)
     ('3.2 s', '1 min 00 s', '4 min 10 s', '2 h 01 min')
     """

@@ -20,13 +20,29 @@ _spoken = {"m": "m", "N": "N"}
 
 
 def use_units(output: str, input_: str) -> None:
-    """From now on these are the units that `spoken` gives, until the next problem is used."""
+    """Set the units of `spoken`, until the next problem is used.
+
+    Parameters
+    ----------
+    output, input_ : str
+        Of the plant's outputs and inputs, such as "m" and "N".
+    """
     _spoken.update({"m": output, "N": input_})
 
 
 def spoken(words: str) -> str:
-    """Words with metres of the plant's outputs and newtons of its inputs, in the units they have.
+    """Replace metres and newtons in a text by the units of the plant's outputs and inputs.
 
+    Parameters
+    ----------
+    words : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> spoken("1 N moves it 3 mm, 3 mm/N"), use_units("rad", "N m")
     ('1 N moves it 3 mm, 3 mm/N', None)
     >>> spoken("1 N moves it 3 mm, 3 mm/N; N/m"), use_units("m", "N")
@@ -42,11 +58,26 @@ def spoken(words: str) -> str:
 
 
 def display_unit(unit: str, largest: float) -> tuple[str, float]:
-    """The unit to show values up to this size in, and the factor to it: the one rule for the eye.
+    """Choose the unit to show values in.
 
     Lengths, times, forces and stiffnesses get the SI prefix with which the largest is 1 or more;
-    what has another unit keeps it.
+    another unit stays.
 
+    Parameters
+    ----------
+    unit : str
+        SI unit.
+    largest : float
+        Largest value to be shown.
+
+    Returns
+    -------
+    unit : str
+    factor : float
+        From `unit` to the one returned.
+
+    Examples
+    --------
     >>> display_unit("m", 4e-3), display_unit("s", 2e-5), display_unit("kg", 4e-3)
     (('mm', 1000.0), ('µs', 1000000.0), ('kg', 1.0))
     >>> display_unit("N/m", 3.6e7)
@@ -64,8 +95,22 @@ def display_unit(unit: str, largest: float) -> tuple[str, float]:
 
 
 def with_unit(value: float, unit: str, digits: int = 3) -> str:
-    """A value in the unit that an engineer would read it in.
+    """Write a value in the unit that an engineer would read it in.
 
+    Parameters
+    ----------
+    value : float
+    unit : str
+        SI unit.
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> with_unit(4.1e-5, "m"), with_unit(0.01, "m"), with_unit(0.18, "s"), with_unit(0.0, "m")
     ('41 µm', '10 mm', '180 ms', '0 m')
     >>> with_unit(9.996e-7, "m")
@@ -76,8 +121,20 @@ def with_unit(value: float, unit: str, digits: int = 3) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things.
+    """Write a number of things.
 
+    Parameters
+    ----------
+    number : int
+    noun : str
+        Singular.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> counted(1, "plant"), counted(5, "plant")
     ('1 plant', '5 plants')
     """
@@ -85,8 +142,19 @@ def counted(number: int, noun: str) -> str:
 
 
 def of_a_bound(excess: float) -> str:
-    """exp(excess) as a share of a bound; one that is missed by far as a multiple.
+    """Write exp(excess) as a share of a bound; a large one as a multiple.
 
+    Parameters
+    ----------
+    excess : float
+        ln of figure over bound.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> of_a_bound(0.0), of_a_bound(-0.1), of_a_bound(10.0)
     ('100 % of a bound', '90.4837 % of a bound', '2.2e+04 times a bound')
     """
@@ -96,8 +164,18 @@ def of_a_bound(excess: float) -> str:
 
 
 def small_share(share: float) -> str:
-    """A relative error in per cent; what is below rounding to an engineer is not written out.
+    """Write a relative error in per cent, below 1e-6 as "under 0.0001 %".
 
+    Parameters
+    ----------
+    share : float
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> small_share(0.0123), small_share(1.9e-9)
     ('1.2 %', 'under 0.0001 %')
     """
@@ -105,8 +183,20 @@ def small_share(share: float) -> str:
 
 
 def number(value: Any, digits: int = 5) -> str:
-    """A number to `digits` significant digits; a dash where there is none.
+    """Write a number, or a dash where there is none.
 
+    Parameters
+    ----------
+    value : number, bool or None
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> number(72.0451741), number(1.5e-9, 3), number(None), number(1800.0), number(999.6, 3)
     ('72.045', '1.5e-09', '–', '1800', '999.6')
     """
@@ -127,23 +217,64 @@ PLAIN = (".c", ".h", ".md", ".st", ".txt")  # what no mark-up is in
 
 
 def package_path(name: str) -> Path:
-    """Of a file of the package, by its path in there."""
+    """Find a file of the package.
+
+    Parameters
+    ----------
+    name : str
+        Path in the package.
+
+    Returns
+    -------
+    Path
+    """
     return Path(__file__).parents[1] / name
 
 
 @cache
 def package_text(name: str) -> str:
-    """Its text."""
+    """Read a text file of the package.
+
+    Parameters
+    ----------
+    name : str
+        Path in the package.
+
+    Returns
+    -------
+    str
+    """
     return package_path(name).read_text(encoding="utf-8")
 
 
 def template(name: str, **known: Any) -> "Template":
-    """A template of Jinja by its path; `known`: functions that it calls."""
+    """Load a Jinja template.
+
+    Parameters
+    ----------
+    name : str
+        Path in the package.
+    **known
+        Functions that it calls.
+
+    Returns
+    -------
+    jinja2.Template
+    """
     return _templates().get_template(name, globals=known)
 
 
 def printable(value: Any) -> Any:
-    """A text whose control characters show as a replacement sign; another value as it is."""
+    """Replace the control characters of a text; another value stays as it is.
+
+    Parameters
+    ----------
+    value
+
+    Returns
+    -------
+    str, or the value
+    """
     if not isinstance(value, str) or hasattr(value, "__html__"):  # mark-up of our own
         return value
     return "".join(c if c.isprintable() or c in "\n\t\xa0" else "\ufffd" for c in value)
@@ -167,7 +298,12 @@ PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "nu
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of what the numbers depend on."""
+    """Collect the versions of Python and of the packages that the numbers depend on.
+
+    Returns
+    -------
+    dict of str to str
+    """
     found = {"python": platform.python_version(), "ccd-casadi": _version("ccd-casadi")}
     return found | {name: _version(name) for name in PACKAGES}
 

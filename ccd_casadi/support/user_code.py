@@ -21,8 +21,6 @@ from typing import Any, NoReturn
 
 from ccd_casadi.support.errors import UserError, described
 
-AGAIN = 1.0  # s after which a function that swallowed the first alarm gets another
-
 _refused: ContextVar[bool] = ContextVar("user_code_refused", default=False)
 
 
@@ -44,14 +42,34 @@ _leave = os._exit
 
 
 def name_of(function: object) -> str:
-    """How a plant function is named: as a case file does, or a callable by its own name."""
+    """Return the name of a plant function.
+
+    Parameters
+    ----------
+    function : str or callable
+        As a case file names it, or a callable.
+
+    Returns
+    -------
+    str
+    """
     if isinstance(function, str):
         return function
     return str(getattr(function, "__qualname__", type(function).__name__))
 
 
 def raised_in_user_code(error: BaseException) -> str:
-    """The line of a plant's file that an exception came from last, in words; empty: none."""
+    """Find the line of a plant's file that an exception came from last.
+
+    Parameters
+    ----------
+    error : BaseException
+
+    Returns
+    -------
+    str
+        "line N of FILE"; empty where there is none.
+    """
     place = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
         module = str(frame.f_globals.get("__name__"))
@@ -61,14 +79,33 @@ def raised_in_user_code(error: BaseException) -> str:
 
 
 def raised_words(error: BaseException) -> str:
-    """An exception of a user's function, and the line that it came from."""
+    """Describe an exception of a user's function, with the line that it came from.
+
+    Parameters
+    ----------
+    error : BaseException
+
+    Returns
+    -------
+    str
+    """
     place = raised_in_user_code(error)
     return f"{described(error)} in {place}" if place else described(error)
 
 
 @dataclass(frozen=True)
 class GivenFunction:
-    """A plant function that a program gives as a callable; another process finds it by its name."""
+    """A plant function that a program gives as a callable; a worker process finds it by its name.
+
+    Attributes
+    ----------
+    call : callable
+
+    Raises
+    ------
+    UserError
+        On pickling, where a worker process cannot find it.
+    """
 
     call: Callable[..., Any]
 
@@ -112,7 +149,12 @@ def exit_refused() -> Iterator[None]:
 
 @contextmanager
 def permit_user_code(allowed: bool) -> Iterator[None]:
-    """Within the block, plant functions of users run or (--no-user-code) are refused."""
+    """Within the block plant functions of users run, or (--no-user-code) are refused.
+
+    Parameters
+    ----------
+    allowed : bool
+    """
     token = _refused.set(not allowed)
     try:
         yield
@@ -121,7 +163,17 @@ def permit_user_code(allowed: bool) -> Iterator[None]:
 
 
 def require_user_code(function: str) -> None:
-    """Raise UserCodeRefused where a plant function must not run."""
+    """Check that a plant function may run.
+
+    Parameters
+    ----------
+    function : str
+        Its name.
+
+    Raises
+    ------
+    UserCodeRefused
+    """
     if _refused.get():
         raise UserCodeRefused(
             f"function = {function} is code, which --no-user-code refuses; "
@@ -130,8 +182,9 @@ def require_user_code(function: str) -> None:
 
 
 @contextmanager
-def time_limit(seconds: float, error: UserError) -> Iterator[None]:
-    """Raise `error` in the block after so many seconds of real time.
+def time_limit(seconds: float, error: UserError, *, again: float = 1.0) -> Iterator[None]:
+    """Raise `error` in the block after this many seconds of real time, and again where the block
+    swallows it, every `again` s.
 
     By SIGALRM: in the main thread of a process (every command and every worker of the pool), on
     systems that have it, and between two Python instructions; elsewhere the block runs as it is.
@@ -146,7 +199,7 @@ def time_limit(seconds: float, error: UserError) -> Iterator[None]:
     before = signal.signal(signal.SIGALRM, late)
     try:
         try:
-            signal.setitimer(signal.ITIMER_REAL, seconds, AGAIN)
+            signal.setitimer(signal.ITIMER_REAL, seconds, again)
             yield
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -159,10 +212,21 @@ def time_limit(seconds: float, error: UserError) -> Iterator[None]:
 def with_time_limit(
     function: Callable[..., Any], seconds: float, late: UserError
 ) -> Callable[..., Any]:
-    """The function with a time limit on every call, and with no way out but a value or an error.
+    """Wrap a function: a time limit on every call, and no end but a value or an error.
 
-    Raises `late` after so many seconds, and UserError where the function would end the process
-    (SystemExit, os._exit) or raises what cannot even be shown.
+    Parameters
+    ----------
+    function : callable
+    seconds : float
+        Real time of a call.
+    late : UserError
+        Raised after that.
+
+    Returns
+    -------
+    callable
+        Raises UserError, too, where the function would end the process (SystemExit, os._exit) or
+        raises an exception that cannot be shown.
     """
 
     @functools.wraps(function)

@@ -54,9 +54,19 @@ one_blas_thread = _OneBlasThread()
 
 
 class OwnThreads(Generic[T]):
-    """Something that the thread which made it has to free, as SciPy's SuperLU: another leaks it.
+    """An object that the thread which made it must free, as SciPy's SuperLU: another leaks it.
 
-    What other threads let go is freed when its thread makes the next one.
+    Objects that other threads drop are freed when the thread makes its next one.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the object.
+
+    Attributes
+    ----------
+    value
+        The object.
     """
 
     def __init__(self, make: Callable[[], T]) -> None:
@@ -90,10 +100,21 @@ def _threads(count: int) -> "ThreadPoolExecutor":
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """[function(item), ...] in the items' order, begun in that order: the longest ones first.
+    """Evaluate [function(item), ...] in threads, in the items' order: give the longest ones first.
 
     Not from within `function`: its threads would wait for each other.
 
+    Parameters
+    ----------
+    function : callable
+    items : iterable
+
+    Returns
+    -------
+    list
+
+    Examples
+    --------
     >>> with threads_permitted(2):
     ...     side_by_side(abs, [-3, 2, -1])
     [3, 2, 1]
@@ -106,11 +127,22 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 
 def alongside(function: Callable[[], R]) -> Callable[[], R]:
-    """Begin a function in a thread; what is given waits for its result, or raises what it raised.
+    """Start a function in a thread.
 
-    For work that processes do: of two that compute here each has the lock half of the time. Nothing
-    waits for the thread where its result is not wanted any more, as after Ctrl-C.
+    For work that processes do: two that compute in this process share one lock. Nothing waits for
+    the thread where its result is not needed any more, as after Ctrl-C.
 
+    Parameters
+    ----------
+    function : callable
+
+    Returns
+    -------
+    callable
+        Waits for the result, or raises the exception of `function`.
+
+    Examples
+    --------
     >>> alongside(lambda: 3)()
     3
     """
@@ -131,15 +163,13 @@ def alongside(function: Callable[[], R]) -> Callable[[], R]:
 P = ParamSpec("P")
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-GRACE = 2.0  # s of processor time beyond the deadline, after which the system ends the process
-STARTING = 60.0  # seconds that the process itself may take to come up
 # The last is how processes are started: spawned, as a fork of this one would copy locks that its
 # threads hold, or forked from a server that has no threads.
 _contexts: list[Any] = [multiprocessing.get_context("spawn")]
 
 
 class WorkerLost(RuntimeError):
-    """Workers died again and again on one task (killed, or out of memory), or never came back."""
+    """Workers died repeatedly on one task (killed, or out of memory), or never answered."""
 
 
 class Overrun(RuntimeError):
@@ -147,7 +177,13 @@ class Overrun(RuntimeError):
 
 
 class WorkerProcess:
-    """One process and the parent's end of its pipe."""
+    """One process and the parent's end of its pipe.
+
+    Attributes
+    ----------
+    pipe : multiprocessing.connection.Connection
+    process : multiprocessing.Process
+    """
 
     def __init__(self) -> None:
         with interrupts_held(), _one_thread_each():
@@ -192,9 +228,15 @@ class WorkerProcess:
 
 
 class Runner(AbstractContextManager["Runner"]):
-    """One process for calls that may never return: killed at its deadline, started anew.
+    """A context manager with one process for calls that may never return.
 
-    Compiled code that loops cannot be interrupted from Python; its process can. A context manager.
+    The process is killed at its deadline and started again: compiled code that loops cannot be
+    interrupted from Python.
+
+    Raises
+    ------
+    Overrun
+        By `call`, after its time, or where the process dies.
     """
 
     def __init__(self) -> None:
@@ -217,7 +259,7 @@ class Runner(AbstractContextManager["Runner"]):
                 self.__exit__()
                 self._process = WorkerProcess()
                 self._process.begin(bool, None)
-                self._process.answer(STARTING)
+                self._process.answer(60.0)  # s that the process may take to start
             self._process.begin(_apply, (seconds, function, args, kwargs))
             done, value = self._process.answer(seconds)
         except BaseException as error:  # what it is doing is of no use any more
@@ -237,7 +279,8 @@ def _apply(task: tuple) -> object:
     with suppress(ImportError):  # Windows has no such limit: the parent alone ends the process
         import resource
 
-        spent = math.ceil(time.process_time() + seconds + GRACE)
+        # Two seconds of processor time beyond the deadline the system ends the process.
+        spent = math.ceil(time.process_time() + seconds + 2.0)
         resource.setrlimit(resource.RLIMIT_CPU, (spent, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     return function(*args, **kwargs)
 
@@ -296,7 +339,12 @@ _to_parent: list[connection.Connection] = []  # of a worker
 
 
 def tell(words: str) -> None:
-    """From within a task: how far it is, for who waits for its answer."""
+    """Report, from within a task, how far it is to the process that waits for its result.
+
+    Parameters
+    ----------
+    words : str
+    """
     for pipe in _to_parent:
         pipe.send_bytes(pickle.dumps((None, words)))
 
@@ -321,7 +369,17 @@ def _serve(pipe: connection.Connection) -> None:
 
 
 def answer_message(message: bytes) -> bytes:
-    """The pickled (True, result) or (False, exception) of a pickled (function, task)."""
+    """Run a pickled (function, task).
+
+    Parameters
+    ----------
+    message : bytes
+
+    Returns
+    -------
+    bytes
+        Pickled (True, result) or (False, exception).
+    """
     try:
         function, task = pickle.loads(message)  # of the parent, through our pipe
         return pickle.dumps((True, function(task)))

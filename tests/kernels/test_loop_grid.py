@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.kernels.loop_grid import maxima, merged, unseen
-from ccd_casadi.lti.state_space import FLANKS, root_flanks
+from ccd_casadi.lti.state_space import RootOptions, root_flanks
 
 APART = 1e-8
 
@@ -22,7 +22,7 @@ def test_a_grid_goes_through_every_root(seed: int) -> None:
     fixed = np.concatenate(
         [np.tile(base, (3, 1)), root_flanks(plants), np.abs(plants)], axis=1
     )  # fmt: skip
-    v, place = merged(fixed, own, poles, FLANKS, (1e-2, 1e2), APART, 1e3)
+    v, place = merged(fixed, own, poles, np.array(RootOptions.flanks), (1e-2, 1e2), APART, 1e3)
     assert (np.diff(v, axis=1) > 0.0).all()
     assert (v[:, 0] < 1e-2).all()
     for i in range(3):

@@ -18,13 +18,22 @@ from ccd_casadi.plants.eigenpairs import (
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import require
 
-STIFF, INERT = 2, 4  # orders of quadrature that are exact for K and for M
 AXES = range(3)
 
 
 @dataclass(frozen=True)
 class Material:
-    """Isotropic linear elasticity: E in Pa, Poisson's ratio, density in kg/m³; 6061-T6."""
+    """Isotropic linear elasticity; the defaults are those of aluminium 6061-T6.
+
+    Attributes
+    ----------
+    young : float
+        E in Pa.
+    poisson : float
+        Poisson's ratio.
+    density : float
+        kg/m³.
+    """
 
     young: float = 68.9e9
     poisson: float = 0.33
@@ -55,7 +64,8 @@ class Body:
         """Of K and of M."""
         fem = require("skfem", "cad")
         element = fem.ElementTetP2()
-        return tuple(fem.Basis(self._mesh, element, intorder=n) for n in (STIFF, INERT))
+        exact = (2, 4)  # orders of quadrature
+        return tuple(fem.Basis(self._mesh, element, intorder=n) for n in exact)
 
     @property
     def places(self) -> Array:
@@ -98,7 +108,7 @@ class Body:
         """
         fem = require("skfem", "cad")
         facets = self._facets(triangles)
-        basis = fem.FacetBasis(self._mesh, fem.ElementTetP2(), facets=facets, intorder=STIFF)
+        basis = fem.FacetBasis(self._mesh, fem.ElementTetP2(), facets=facets, intorder=2)
 
         @fem.LinearForm
         def value(v: Any, w: Any) -> Any:
@@ -153,10 +163,8 @@ class Body:
         return sparse.bmat(blocks, format="csc"), mass
 
 
-EXTRA = 2  # modes solved beyond those kept: the resolvent converges the faster
 # corners of a tetrahedron's four faces, counter-clockwise from outside
 OUTWARD = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
-SHIFT = 1e-3  # of E/(ρ L²), the square of a longitudinal wave's time through the body
 
 
 @dataclass(frozen=True)
@@ -240,18 +248,22 @@ def surface(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solved(
-    body: Body, count: int, held: np.ndarray
+    body: Body, count: int, held: np.ndarray, *, extra: int = 2, shift: float = 1e-3
 ) -> tuple[Pencil, sparse.csc_matrix, Array, Array, Array, Array]:
-    """The pencil and M of what is free, rigid motions as they are and orthonormal, λ and modes."""
+    """The pencil and M of what is free, rigid motions as they are and orthonormal, λ and modes.
+
+    `extra` modes are solved beyond `count`: the resolvent converges the faster. `shift` is a share
+    of E/(ρ L²), the square of a longitudinal wave's frequency through the body.
+    """
     free = np.flatnonzero(~held)
     K, M = (item[free][:, free] for item in body.matrices())
     length = float(np.linalg.norm(np.ptp(body.points, axis=0)))
-    shift = SHIFT * body.material.young / (body.material.density * length**2)
+    shift *= body.material.young / (body.material.density * length**2)
     none = np.zeros((len(free), 0))
     pencil = build_pencil([(K + shift * M).tocsr()], [M.tocsr()], shift, none, np.zeros(0))
     R = none if held.any() else _motions(body.places - _centre(M, body.places), True)
     rigid = orthonormal(pencil, R)
-    return pencil, M, R, rigid, *flexible_modes(pencil, rigid, count + EXTRA)
+    return pencil, M, R, rigid, *flexible_modes(pencil, rigid, count + extra)
 
 
 def _motions(arms: Array, shifts: bool) -> Array:

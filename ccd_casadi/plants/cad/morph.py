@@ -21,11 +21,27 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.terminal import Progress
 
 FORMAT = "ccd_casadi morph 1"
-UNSEEN = 5  # θ that measure the fit
-MOST_ERROR = 1e-3  # of the mesh size
-ROUNDING = 1e-12  # m: a coefficient below is none
 # θ by name -> the solid (build123d, in mm, or a STEP file) and a point in mm on each named face
 SolidDrawing = Callable[[Mapping[str, float]], tuple[Any, Mapping[str, Sequence[float]]]]
+
+
+@dataclass(frozen=True)
+class MorphOptions:
+    """Numbers of the fit of a mesh.
+
+    Attributes
+    ----------
+    unseen : int
+        θ beside those of the fit, at which its error is measured.
+    most_error : float
+        Largest error, as a share of the mesh size.
+    rounding : float
+        m: coefficients are rounded to multiples of it.
+    """
+
+    unseen: int = 5
+    most_error: float = 1e-3
+    rounding: float = 1e-12
 
 
 @dataclass(frozen=True)
@@ -76,6 +92,7 @@ def draw_morph(
     size: float,
     degree: int = 3,
     quiet: bool = False,
+    options: MorphOptions = MorphOptions(),
 ) -> Morph:
     """Mesh the solid in the middle of `bounds` with elements of `size` in m, follow it, write it.
 
@@ -87,7 +104,8 @@ def draw_morph(
     lower, upper = np.array([bounds[name] for name in names], float).T
     powers = product(range(degree + 1), repeat=len(names))
     exponents = np.array([row for row in powers if sum(row) <= degree])
-    count = 2 * len(exponents) + UNSEEN
+    unseen, rounding = options.unseen, options.rounding
+    count = 2 * len(exponents) + unseen
     draws = qmc.Halton(len(names), scramble=False).random(count)
     unit = -np.cos(np.pi * draws)
     theta = lower + 0.5 * (unit + 1.0) * (upper - lower)
@@ -116,17 +134,17 @@ def draw_morph(
             bar.advance()
     flat = np.array(samples).reshape(count, -1)
     fit = np.array([_terms(row, exponents) for row in unit])
-    coefficients = np.linalg.lstsq(fit[UNSEEN:], flat[UNSEEN:], rcond=None)[0]
-    gap = (fit[:UNSEEN] @ coefficients - flat[:UNSEEN]).reshape(-1, 3)
+    coefficients = np.linalg.lstsq(fit[unseen:], flat[unseen:], rcond=None)[0]
+    gap = (fit[:unseen] @ coefficients - flat[:unseen]).reshape(-1, 3)
     error = float(np.linalg.norm(gap, axis=1).max())
-    if error > MOST_ERROR * size:
+    if error > options.most_error * size:
         raise PlantError(
             f"a polynomial of degree {degree} is {error:.1e} m off the solid; raise `degree`, "
             "narrow the bounds, or find the face that jumps"
         )
     morph = Morph(
         names, lower, upper, exponents,
-        np.round(coefficients / ROUNDING).reshape(len(exponents), -1, 3) * ROUNDING,
+        np.round(coefficients / rounding).reshape(len(exponents), -1, 3) * rounding,
         mesh.tets, {name: mesh.faces[tag] for name, tag in tags.items()}, error,
     )  # fmt: skip
     write_morph(morph, file)

@@ -35,12 +35,38 @@ def cad_stage(
     poisson: float = 0.33,
     density: float = 2700.0,
 ) -> Plant:
-    """The stage whose mesh `draw_morph` wrote to the file `morph`; hardware cost: its mass in kg.
+    """Make the plant of a stage whose mesh `draw_morph` wrote; its hardware cost is its mass in kg.
 
-    `forces` and `sensors` are "FACE:x", y or z: a force spread evenly over a named face, the mean
-    displacement of one; none of them: all faces along z. `held` names faces that do not move; a
-    stage without floats, and of its motions x, y, z, rx, ry, rz those of `rigid` are in the model.
-    Reference: the same stage with twice as many modes.
+    Its reference is the same stage with twice as many modes.
+
+    Parameters
+    ----------
+    names : sequence of str (n,)
+        θ, those of the mesh in any order.
+    morph : str
+        File of the mesh.
+    forces, sensors : sequences of str
+        "FACE:x", y or z: a force spread evenly over a named face, the mean displacement of one;
+        without, all faces along z.
+    rigid : sequence of str
+        Rigid-body motions in the model, of x, y, z, rx, ry, rz.
+    held : sequence of str
+        Faces that do not move; a stage without floats.
+    modes : int
+        Flexible modes.
+    zeta : float
+        Their damping ratio.
+    young, poisson, density : float
+        Pa, 1, kg/m³.
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    PlantError
+        A name of the case is not one of the mesh; the message has the remedy.
     """
     if not morph:
         raise PlantError('cad_stage needs morph = "stage.npz", relative to the case file')

@@ -18,8 +18,6 @@ from scipy.spatial.distance import cdist
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, require
 
-QUARTERS = np.array([0.25, 0.5, 0.75])
-
 
 @dataclass(frozen=True)
 class Piece:
@@ -53,7 +51,7 @@ def boundary_of(gmsh: Any) -> Boundary:
 
     return Boundary(
         {tag: model.getValue(0, tag, []) for _, tag in model.getEntities(0)},
-        pieces(1, lambda tag: edge_points(gmsh, tag, QUARTERS)),
+        pieces(1, lambda tag: edge_points(gmsh, tag, np.array([0.25, 0.5, 0.75]))),
         pieces(2, lambda tag: np.array([model.occ.getCenterOfMass(2, tag)])),
     )
 
@@ -117,7 +115,6 @@ def _distances(one: Piece, other: Piece) -> tuple[float, float]:
 TRIANGLE, TETRAHEDRON = 2, 4  # gmsh's numbers of linear elements
 MODEL = "ccd_casadi"
 MILLIMETRE = 1e-3  # of a drawing's unit, for points that name faces
-PER_TURN = 20  # elements around a full circle, at least
 
 
 @dataclass(frozen=True)
@@ -178,10 +175,10 @@ def load(gmsh: Any, drawn: Any) -> None:
         raise PlantError(f"the drawing has {solids} solids; fuse its parts into one")
 
 
-def meshed(gmsh: Any, size: float) -> SolidMesh:
-    """The mesh of the solid that is loaded, edges of at most `size` in m."""
+def meshed(gmsh: Any, size: float, *, per_turn: int = 20) -> SolidMesh:
+    """Mesh the solid that is loaded: edges of at most `size` in m, `per_turn` around a circle."""
     gmsh.option.setNumber("Mesh.MeshSizeMax", size)
-    gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", PER_TURN)
+    gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", per_turn)
     gmsh.model.mesh.generate(3)
     labels, coordinates, _ = gmsh.model.mesh.getNodes()
     order = np.argsort(labels)

@@ -20,11 +20,27 @@ from ccd_casadi.plants.plant import Mechanics, named_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-SAME = 1e-6  # of the range: no distance to a sample
 Errors = tuple[float, float]  # of a sample left out: frequency, response
 ANY: Errors = (np.inf, np.inf)
-DAMPED = 0.1  # responses are compared at s = (0.1 + j) ω: resonances that move do not drown it
-FREQUENCIES = 120
+
+
+@dataclass(frozen=True)
+class InterpolationOptions:
+    """Numbers of the interpolation between samples.
+
+    Attributes
+    ----------
+    same : float
+        Share of the range below which a distance to a sample is zero.
+    damped : float
+        Responses are compared at s = (damped + j) ω, where moving resonances do not dominate.
+    frequencies : int
+        Number of these.
+    """
+
+    same: float = 1e-6
+    damped: float = 0.1
+    frequencies: int = 120
 
 
 @dataclass(frozen=True)
@@ -54,7 +70,15 @@ class InterpolatedModes:
     PlantError where samples differ in their number of rigid-body modes, or are too few.
     """
 
-    def __init__(self, table: ModalTable, rigid_below: float, accepted: Errors = ANY) -> None:
+    def __init__(
+        self,
+        table: ModalTable,
+        rigid_below: float,
+        accepted: Errors = ANY,
+        *,
+        options: InterpolationOptions = InterpolationOptions(),
+    ) -> None:
+        self.options = options
         counts = (table.omega < rigid_below).sum(axis=1)
         if np.ptp(counts) > 0:
             s = int(counts.argmin())
@@ -75,7 +99,7 @@ class InterpolatedModes:
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         """M, D, K, B, C and their derivatives at θ."""
         index, distance = self.nearest(theta)
-        if self.refusal and distance > SAME:
+        if self.refusal and distance > self.options.same:
             known = named_values(self.table.names, self.table.theta[index])
             raise PlantError(f"{self.refusal}; at a sample, such as {known}, the plant is known")
         y, slopes = (np.array(value) for value in self._entries(np.asarray(theta, float)))
@@ -126,7 +150,7 @@ class InterpolatedModes:
         unit = theta / np.ptp(theta, axis=0)
         middle = 0.5 * (unit + unit[s])
         half = np.linalg.norm(middle - unit[s], axis=1)
-        beside = cdist(middle, unit).min(axis=1) >= (1.0 - SAME) * half
+        beside = cdist(middle, unit).min(axis=1) >= (1.0 - self.options.same) * half
         beside[s] = False
         return np.asarray(0.5 * (theta[s] + theta[np.where(beside, errors, -np.inf).argmax()]))
 
@@ -195,7 +219,8 @@ class InterpolatedModes:
         K, _ = self._exponential(L, np.zeros((0, *L.shape)))
         flexible = self.table.omega[:, self.rigid :]
         low, high = (flexible.min(), flexible.max()) if flexible.size else (1.0, 10.0)
-        s = (DAMPED + 1j) * np.geomspace(0.3 * low, 1.2 * high, FREQUENCIES)
+        omega = np.geomspace(0.3 * low, 1.2 * high, self.options.frequencies)
+        s = (self.options.damped + 1j) * omega
         inverse = np.linalg.inv(K + (s**2)[:, None, None] * np.eye(len(K)))
         return np.asarray(C @ inverse @ B)
 

@@ -19,17 +19,30 @@ from ccd_casadi.support.errors import PlantError
 
 COLUMNS = ("kind", "name", "dof", "gain")
 KNOWN = ("mass", "stiffness", "results", "damping", "hardware_cost")  # of index.csv: no θ
-SHIFT = 1e-9  # of the largest stiffness over mass: K + s M is regular with rigid-body modes too
-SYMMETRIC = 1e-9
-POINTS = 2  # shape values kept for matching, as a multiple of the modes
 
 
 def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> ModalTable:
-    """The modal table of the lowest `modes` of every sample in a folder.
+    """Reduce the matrices of every sample in a folder to their lowest modes.
 
     With `static_correction` the responses (K + s M)⁻¹ [B, Cᵀ] join the modes as a Ritz basis, so
-    that the compliance at low frequency is that of the full model. Raises PlantError where a file
-    is missing, foreign, not symmetric or of another size than its fellows.
+    that the compliance at low frequency is that of the full model.
+
+    Parameters
+    ----------
+    folder : Path
+        With index.csv, dofs.csv and the matrices, SI.
+    modes : int
+        Number of modes kept.
+    static_correction : bool
+
+    Returns
+    -------
+    ModalTable
+
+    Raises
+    ------
+    PlantError
+        A file is missing, foreign, not symmetric or of another size than the others.
     """
     index = read_index(folder, "mass", "stiffness", "damping")
     dofs = read_dofs(folder, COLUMNS)
@@ -84,19 +97,20 @@ def table_of_samples(
 
 
 def modes_of(
-    M: csc_array, K: csc_array, count: int, extra: Array | None = None
+    M: csc_array, K: csc_array, count: int, extra: Array | None = None, *, shift: float = 1e-9
 ) -> tuple[Array, Array]:
     """ω (r,) in rad/s and mass-normalised shapes (n, r) of the lowest modes of K φ = ω² M φ.
 
     `extra` (n, k) are forces whose static responses are added to the basis. A small model is solved
-    densely; a large one by shift-inverted Lanczos iteration.
+    densely; a large one by shift-inverted Lanczos iteration, at `shift` of the largest stiffness
+    over mass below zero, where K is regular with rigid-body modes, too.
     """
     n = M.shape[0]
     if n <= 3 * count + 20:
         lam, basis = eigh(K.toarray(), M.toarray())
         lam, basis = lam[:count], basis[:, :count]
     else:
-        shift = SHIFT * float(K.diagonal().max() / M.diagonal().max())
+        shift *= float(K.diagonal().max() / M.diagonal().max())
         lam, basis = eigsh(K, count, M, sigma=-shift, which="LM", v0=np.ones(n))
         if extra is not None:
             static = splu(csc_array(K + shift * M)).solve(extra)
@@ -114,14 +128,17 @@ def modes_of(
     return np.sqrt(np.maximum(lam, 0.0)), basis
 
 
-def _shape_values(folder: Path, dofs: Rows, bases: list[Array]) -> list[Array]:
-    """Shapes at the dofs named for it; else, on one mesh, where they tell the modes best apart."""
+def _shape_values(
+    folder: Path, dofs: Rows, bases: list[Array], *, per_mode: int = 2
+) -> list[Array]:
+    """Shapes at the dofs named for it; else, on one mesh, at the `per_mode` times the number of
+    modes rows that distinguish these best."""
     if any(row["kind"] == "shape" for row in dofs.values()):
         return [basis.T @ _selected(folder, dofs, "shape", len(basis)) for basis in bases]
     if len({len(basis) for basis in bases}) > 1:
         return [np.zeros((basis.shape[1], 0)) for basis in bases]
     _, _, pivots = qr(bases[0].T, mode="economic", pivoting=True)
-    rows = np.sort(pivots[: POINTS * min(basis.shape[1] for basis in bases)])
+    rows = np.sort(pivots[: per_mode * min(basis.shape[1] for basis in bases)])
     return [basis[rows].T for basis in bases]
 
 
@@ -147,7 +164,7 @@ def names_of_kind(folder: Path, dofs: Rows, kind: str) -> tuple[str, ...]:
     return names
 
 
-def _matrix(path: Path) -> csc_array:
+def _matrix(path: Path, *, symmetric: float = 1e-9) -> csc_array:
     """A real symmetric matrix from .mtx, .npz (sparse, or one array) or .mat (one matrix)."""
     try:
         if path.suffix == ".mtx":
@@ -174,7 +191,7 @@ def _matrix(path: Path) -> csc_array:
     if not np.isfinite(matrix.data).all() or not matrix.nnz:
         raise PlantError(f"{path}: is empty or not finite; save the matrix again")
     gap = abs(matrix - matrix.T)
-    if gap.max() > SYMMETRIC * abs(matrix).max():
+    if gap.max() > symmetric * abs(matrix).max():
         raise PlantError(f"{path}: is not symmetric; save both triangles")
     return matrix
 
@@ -197,7 +214,23 @@ def read_dofs(folder: Path, columns: Sequence[str]) -> Rows:
 
 
 def read_index(folder: Path, *columns: str) -> Rows:
-    """The rows of index.csv. Raises PlantError where it lacks one of these columns."""
+    """Read the rows of index.csv.
+
+    Parameters
+    ----------
+    folder : Path
+    *columns : str
+        Columns that it must have.
+
+    Returns
+    -------
+    Rows
+
+    Raises
+    ------
+    PlantError
+        A column is missing.
+    """
     path = folder / "index.csv"
     found = read_rows(path)
     for key in columns:
@@ -221,9 +254,21 @@ class ResultModes:
 
 
 def results_table(folder: Path) -> ModalTable:
-    """The modal table of a folder of result files.
+    """Read the modal table of a folder of result files.
 
-    Raises PlantError where a file or node is missing, or a file holds no modes.
+    Parameters
+    ----------
+    folder : Path
+        With index.csv, dofs.csv and the result files (.frd, .f06).
+
+    Returns
+    -------
+    ModalTable
+
+    Raises
+    ------
+    PlantError
+        A file or node is missing, or a file holds no modes.
     """
     index, dofs = read_index(folder, "results", "damping"), read_dofs(folder, RESULT_COLUMNS)
     found = [read_modes(folder / row["results"]) for row in index.values()]

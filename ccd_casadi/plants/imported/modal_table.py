@@ -24,10 +24,22 @@ PREFIXES = ("in:", "out:", "shape:", "constraint:")
 
 @dataclass(frozen=True)
 class ModalTable:
-    """N samples of r modes, mass-normalised: theta (N, n), omega (N, r) rad/s, zeta (N, r).
+    """N samples of r mass-normalised modes, in order of frequency.
 
-    inputs (N, r, m), outputs (N, r, p) and shapes (N, r, q) are displacements in 1/√kg; cost (N,)
-    is f and constraints (N, k) are λ at the samples. Modes are in order of frequency.
+    Attributes
+    ----------
+    names, input_names, output_names, constraint_names : tuple of str
+        Of θ, inputs, outputs and λ.
+    theta : array (N, n)
+        Samples, SI.
+    omega, zeta : arrays (N, r)
+        Natural frequencies in rad/s, damping ratios.
+    inputs, outputs, shapes : arrays (N, r, m), (N, r, p), (N, r, q)
+        Displacements in 1/√kg.
+    cost : array (N,)
+        f at the samples.
+    constraints : array (N, k)
+        λ at the samples.
     """
 
     names: tuple[str, ...]
@@ -101,7 +113,14 @@ def read_modal_table(path: Path) -> ModalTable:
 
 
 def write_modal_table(path: Path, table: ModalTable) -> None:
-    """Write a table that `read_modal_table` gives back, numbers to the last digit."""
+    """Write a table that `read_modal_table` returns again, numbers to the last digit.
+
+    Parameters
+    ----------
+    path : Path
+        CSV file.
+    table : ModalTable
+    """
     groups = {
         "in:": (table.input_names, table.inputs),
         "out:": (table.output_names, table.outputs),

@@ -1,7 +1,7 @@
 """Finite-element models of the user's own as the case file names them."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,23 +9,61 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.plants.imported.frames import fit_entries
-from ccd_casadi.plants.imported.interpolation import SAME, Errors, InterpolatedModes, row_of
+from ccd_casadi.plants.imported.interpolation import Errors, InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
 from ccd_casadi.plants.plant import Plant, named_values
 from ccd_casadi.support.errors import PlantError
 
-# A mode 5 % off moves a response at 10 % of damping by half.
-FREQUENCY_ERROR, RESPONSE_ERROR = 0.05, 0.5  # of a sample left out
-ACCEPTED = (FREQUENCY_ERROR, RESPONSE_ERROR)
 NEAREST = "the nearest sample as it stands"
+
+
+@dataclass(frozen=True)
+class AcceptanceOptions:
+    """Largest relative errors of a sample that is predicted without it.
+
+    A mode 5 % off moves a response at 10 % of damping by half.
+
+    Attributes
+    ----------
+    frequency_error : float
+        Of a frequency.
+    response_error : float
+        Of the response.
+    """
+
+    frequency_error: float = 0.05
+    response_error: float = 0.5
 
 
 def modal_table(
     names: Sequence[str], table: str = "", rigid_below_hz: float = 0.1,
-    frequency_error: float = FREQUENCY_ERROR, response_error: float = RESPONSE_ERROR,
+    frequency_error: float = AcceptanceOptions.frequency_error,
+    response_error: float = AcceptanceOptions.response_error,
 ) -> Plant:  # fmt: skip
-    """The plant interpolated between the modal models of a CSV file (see `modal_table`)."""
+    """Interpolate the plant between the modal models of a CSV file (see `modal_table`).
+
+    Parameters
+    ----------
+    names : sequence of str (n,)
+        θ, those of the table in any order.
+    table : str
+        The CSV file.
+    rigid_below_hz : float
+        Modes below this frequency in Hz are rigid-body modes.
+    frequency_error, response_error : float
+        Largest relative errors of a sample that is predicted without it: beyond, the plant is known
+        at the samples alone.
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    PlantError
+        The table cannot be read, or its parameters are not those of the case.
+    """
     if not table:
         raise PlantError('modal_table needs table = "modes.csv", relative to the case file')
     accepted, file = (frequency_error, response_error), Path(table)
@@ -34,10 +72,33 @@ def modal_table(
 
 def sampled_matrices(
     names: Sequence[str], folder: str = "", modes: int = 10, static_correction: bool = False,
-    rigid_below_hz: float = 0.1, frequency_error: float = FREQUENCY_ERROR,
-    response_error: float = RESPONSE_ERROR,
+    rigid_below_hz: float = 0.1, frequency_error: float = AcceptanceOptions.frequency_error,
+    response_error: float = AcceptanceOptions.response_error,
 ) -> Plant:  # fmt: skip
-    """The plant interpolated between M and K given as files (see `matrices`), reduced to modes."""
+    """Interpolate the plant between M and K given as files (see `matrices`), reduced to modes.
+
+    Parameters
+    ----------
+    names : sequence of str (n,)
+        θ, those of the samples in any order.
+    folder : str
+        Folder of the matrices.
+    modes : int
+        Modes kept of each sample.
+    static_correction : bool
+        Whether static responses join the modes; see `reduced_table`.
+    rigid_below_hz, frequency_error, response_error : float
+        As in `modal_table`.
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    PlantError
+        A file cannot be read, or the parameters are not those of the case.
+    """
     if not folder:
         raise PlantError('sampled_matrices needs folder = "fe", relative to the case file')
     table = reduced_table(Path(folder), modes, static_correction)
@@ -47,7 +108,7 @@ def sampled_matrices(
 
 def plant_of_table(
     table: ModalTable, names: Sequence[str], rigid_below_hz: float, source: str,
-    accepted: Errors = ACCEPTED,
+    accepted: Errors = (AcceptanceOptions.frequency_error, AcceptanceOptions.response_error),
 ) -> Plant:  # fmt: skip
     """Any modal table as the plant that the design loop asks for.
 
@@ -97,7 +158,7 @@ def _notes(modes: InterpolatedModes, source: str, theta: Sequence[float]) -> tup
     frequency, response = 100 * modes.left_out.frequency, 100 * modes.left_out.response
     count = len(modes.table.theta)
     here = f"is {100 * distance:.2g} % of the sampled range away from the nearest sample"
-    if distance < SAME:
+    if distance < modes.options.same:
         here = "is one of the samples"
     return (
         f"designs are verified on the model interpolated between the {count} samples of {source}, "
