@@ -15,8 +15,8 @@ NOT_YET = (
     "ccd_casadi.fixed_structure.", "ccd_casadi.optim.", "ccd_casadi.inner_problem.",
     "ccd_casadi.robust.", "ccd_casadi.codesign.", "ccd_casadi.synthesis.", "ccd_casadi.sampling.",
     "ccd_casadi.deployment.", "ccd_casadi.analysis.", "ccd_casadi.limitations.", "surrogates.",
-    "ccd_casadi.plants.", "ccd_casadi.lti.", "ccd_casadi.support.", "ccd_casadi.budget.",
-    "ccd_casadi.cases.", "ccd_casadi.studies.", "ccd_casadi.kernels.",
+
+    "ccd_casadi.studies.", "ccd_casadi.kernels.",
     "ccd_casadi.case_studies.",
 )  # fmt: skip
 

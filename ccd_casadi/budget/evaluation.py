@@ -24,12 +24,23 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 
-STEP = 1e-30  # along the imaginary axis
+COMPLEX_STEP = 1e-30  # of derivatives by imaginary parts: its square is below any rounding
 
 
 def variances(loop: Loop, budget: ErrorBudget) -> Array | None:
-    """(3,) σ² of error (m²), of its moving average (NaN without a window) and of force (N²) of a
-    loop under all sources; None if it is unstable."""
+    """Compute the variances of a loop under all sources of a budget.
+
+    Parameters
+    ----------
+    loop : Loop
+        SI.
+    budget : ErrorBudget
+
+    Returns
+    -------
+    array (3,), or None of an unstable loop
+        σ² of the error (m²), of its moving average (m²; NaN without a window), of the force (N²).
+    """
     if not loop.stable:
         return None
     return np.asarray(
@@ -58,7 +69,18 @@ def of_source(loop: Loop, source: Source, window: float | None) -> Array:
 
 @dataclass(frozen=True)
 class ErrorVariance:
-    """σ² of the error of a plant (SI) under a budget, with controllers of one order."""
+    """σ² of the error of a plant under a budget, with controllers of one order.
+
+    Attributes
+    ----------
+    plant : StateSpace
+        SI.
+    budget : ErrorBudget
+    hold : Sampling or None
+        How the loop runs.
+    order : int
+        States of the controllers.
+    """
 
     plant: StateSpace
     budget: ErrorBudget
@@ -92,11 +114,11 @@ class ErrorVariance:
         P, X = equation.covariance(model.noise), equation.adjoint(C.T @ C)
         out, after = P @ C.T, P + model.A @ P if model.sampled else P
         to_M = 2.0 * model.L.T @ X @ (after @ model.R.T + model.E @ model.W.T)
-        value, slopes = float(np.sum(C.T * out)), [np.tensordot(M[1:].imag / STEP, to_M, 2)]
+        value, slopes = float(np.sum(C.T * out)), [np.tensordot(M[1:].imag / COMPLEX_STEP, to_M, 2)]
         for G in plants:
             moved = disturbed(G, self.filters, self.hold, self.order).closed(M[0].real)
             moved = moved.transformed(scale)
-            dA, dQ, dC = (part.imag / STEP for part in (moved.A, moved.noise, moved.C))
+            dA, dQ, dC = (part.imag / COMPLEX_STEP for part in (moved.A, moved.noise, moved.C))
             half = np.sum(X * (dA @ after.T)) + 0.5 * np.sum(X * dQ) + np.sum(dC.T * out)
             slopes.append(np.array([2.0 * half]))
         gradient = np.concatenate(slopes)
@@ -156,7 +178,8 @@ class _ResponseChanges:
     def _change(self, name: str, system: StateSpace, s: np.ndarray) -> np.ndarray:
         """By the imaginary parts of a system's matrices over the step."""
         A, B, C = (np.real(part) for part in (system.A, system.B, system.C))
-        dA, dB, dC, dD = (np.imag(part) / STEP for part in (system.A, system.B, system.C, system.D))
+        parts = (system.A, system.B, system.C, system.D)
+        dA, dB, dC, dD = (np.imag(part) / COMPLEX_STEP for part in parts)
         if name not in self.known:
             R = np.linalg.inv(s[:, None, None] * np.eye(len(A)) - A)
             self.known[name] = (R @ B, C @ R)
@@ -165,8 +188,18 @@ class _ResponseChanges:
 
 
 class Lyapunov:
-    """The equations of a process with this A, and with A', by one Schur form; a sampled one's A is
-    the change over a period."""
+    """Lyapunov's equations A P + P Aᵀ + Q = 0 and Aᵀ X + X A + W = 0 by one Schur form.
+
+    Parameters
+    ----------
+    A : array (n, n)
+        1/s; of a sampled process the change over a period.
+    sampled : bool
+
+    Attributes
+    ----------
+    stable : bool
+    """
 
     def __init__(self, A: Array, *, sampled: bool) -> None:
         self.inverse = np.linalg.inv(2.0 * np.eye(len(A)) + A) if sampled else None

@@ -23,9 +23,6 @@ from ccd_casadi.lti.state_space import frequency_grid, root_flanks, sensitivity
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 
-RELATIVE = 1e-9  # error of the whole that ends the bisections
-ROUNDS = 40
-MOST = 200_000  # evaluations
 # Nodes and weights of Kronrod's rule, and those of Gauss's within it (QUADPACK's QK15).
 _X = np.array([0.991455371120812639, 0.949107912342758524,
                0.864864423359769072, 0.741531185599394439,
@@ -41,6 +38,25 @@ NODES = np.concatenate([-_X[:-1], _X[::-1]])
 KRONROD = np.concatenate([_W[:-1], _W[::-1]])
 GAUSS = np.zeros(15)
 GAUSS[1::2] = np.concatenate([_G[:-1], _G[::-1]])
+
+
+@dataclass(frozen=True)
+class QuadratureOptions:
+    """Numbers of the adaptive quadrature.
+
+    Attributes
+    ----------
+    tolerance : float
+        Relative error of the whole that ends the bisections.
+    rounds : int
+        Largest number of bisections of a panel.
+    most_evaluations : int
+        Nodes after which no panel is bisected any more.
+    """
+
+    tolerance: float = 1e-9
+    rounds: int = 40
+    most_evaluations: int = 200_000
 
 
 @dataclass(frozen=True)
@@ -62,12 +78,14 @@ class Integral:
         return np.pad(np.cumsum(self.parts, axis=1), ((0, 0), (1, 0)))
 
 
-def integrate(f: Callable[[Array], Array], ends: Array) -> Integral:
+def integrate(
+    f: Callable[[Array], Array], ends: Array, *, options: QuadratureOptions = QuadratureOptions()
+) -> Integral:
     """Rows f(x) (rows, len(x)) over the panels between `ends`, rising and above 0."""
     low, high = np.log(ends[:-1]), np.log(ends[1:])
     done: list[Array] = []  # low, high, shares and errors of panels, by column
     spent = 0
-    for turn in range(ROUNDS):
+    for turn in range(options.rounds):
         x, weights = _points(low, high)
         value = f(x.ravel())
         value = value.reshape(len(value), *x.shape) * weights
@@ -75,9 +93,9 @@ def integrate(f: Callable[[Array], Array], ends: Array) -> Integral:
         part, rows = value @ KRONROD, len(value)
         error = np.abs(value @ (KRONROD - GAUSS))
         total = part.sum(1) + sum(item[2 : 2 + rows].sum(1) for item in done)
-        allowed = RELATIVE * np.abs(total)[:, None] / (4 * len(ends))
+        allowed = options.tolerance * np.abs(total)[:, None] / (4 * len(ends))
         wide = (error > np.maximum(allowed, 1e-15 * np.abs(part))).any(0)
-        if turn == ROUNDS - 1 or spent > MOST:
+        if turn == options.rounds - 1 or spent > options.most_evaluations:
             wide[:] = False
         done.append(np.vstack([low, high, part, error])[:, ~wide])
         if not wide.any():
@@ -101,9 +119,24 @@ def _points(low: Array, high: Array) -> tuple[Array, Array]:
     return x, half * x
 
 
-LOWEST, HIGHEST = 1e-9, 1e4  # of what is white: over the slowest and the fastest pole
-PER_DECADE = 6  # panels at least, so that a curve is drawn through their ends
-FLANKS = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # in half widths of a root
+@dataclass(frozen=True)
+class PanelOptions:
+    """Numbers of the panels of the quadrature over frequency.
+
+    Attributes
+    ----------
+    lowest, highest : float
+        Ends of a white spectrum, over the slowest and the fastest pole.
+    per_decade : int
+        Panels a decade at least, as a curve is drawn through their ends.
+    flanks : tuple of float
+        Ends of panels around each root, in half widths of it.
+    """
+
+    lowest: float = 1e-9
+    highest: float = 1e4
+    per_decade: int = 6
+    flanks: tuple[float, ...] = (-10.0, -3.0, -1.0, 1.0, 3.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -129,7 +162,18 @@ class Responses:
 
 
 def responses(loop: Loop, hz: Array) -> Responses:
-    """The loop at frequencies in Hz."""
+    """Evaluate a loop's responses.
+
+    Parameters
+    ----------
+    loop : Loop
+    hz : array (k,)
+        Hz.
+
+    Returns
+    -------
+    Responses
+    """
     omega = HZ * np.asarray(hz, float)
     G, K = (part.response(omega) for part in loop.as_run)
     free = G if loop.sampling is None else loop.plant.response(omega)
@@ -167,7 +211,7 @@ def _folded(loop: Loop, source: Source, T: float) -> Callable[[Array], Array]:
     return at
 
 
-def panels(loop: Loop, source: Source) -> Array:
+def panels(loop: Loop, source: Source, *, options: PanelOptions = PanelOptions()) -> Array:
     """Rising frequencies in Hz between which the densities are smooth, from end to end.
 
     A table's own range. What is white goes on from far below the slowest to far above the fastest
@@ -178,14 +222,14 @@ def panels(loop: Loop, source: Source) -> Array:
     corners = source.corners()
     if source.shaped:
         bends = np.concatenate([sizes, corners])
-        low, high = LOWEST * bends.min(), HIGHEST * bends.max()
+        low, high = options.lowest * bends.min(), options.highest * bends.max()
         if loop.sampling is not None:
             high = np.pi / loop.sampling.period
             low = min(low, 1e-6 * high)
     else:
         low, high = corners[0], corners[-1]
-    points = 2 + int(PER_DECADE * np.log10(high / low))
-    special = (corners, sizes, root_flanks(roots, FLANKS))
+    points = 2 + int(options.per_decade * np.log10(high / low))
+    special = (corners, sizes, root_flanks(roots, options.flanks))
     return np.asarray(frequency_grid(low, high, points, *special, apart=1e-9) / HZ)
 
 

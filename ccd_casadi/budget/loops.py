@@ -170,8 +170,19 @@ def _joined(sources: tuple[Source, ...], channels: int) -> tuple[StateSpace, Mat
 
 
 def run_matrix(parts: Sequence[Matrix], period: float | None) -> Matrix:
-    """M = [[D, C], [B, A]] (..., m + o, p + o) of continuous controllers A, B, C, D as they run:
-    sampled by Tustin's rule, A then the change over a period."""
+    """Make M = [[D, C], [B, A]] of continuous controllers as they run.
+
+    Parameters
+    ----------
+    parts : A, B, C, D (..., ., .)
+        SI.
+    period : float or None
+        s: sampled by Tustin's rule, A is then the change over a period.
+
+    Returns
+    -------
+    array (..., m + o, p + o)
+    """
     A, B, C, D = parts
     if period is not None:
         inverse = np.linalg.inv(np.eye(A.shape[-1]) - 0.5 * period * A)
@@ -181,7 +192,18 @@ def run_matrix(parts: Sequence[Matrix], period: float | None) -> Matrix:
 
 
 def process(loop: Loop, source: Source) -> Process:
-    """A loop whose plant has no feedthrough, under a source."""
+    """Make the state space of a loop, whose plant has no feedthrough, under a source.
+
+    Parameters
+    ----------
+    loop : Loop
+    source : Source
+        With a shaping filter.
+
+    Returns
+    -------
+    Process
+    """
     K, T = loop.controller, loop.period
     if K.period:
         K, T = replace(K, A=K.A - np.eye(len(K.A))), None

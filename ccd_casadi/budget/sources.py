@@ -119,7 +119,20 @@ class ShapedSpectrum:
 
 
 def polynomial(corners: Iterable[Corner], unit: float) -> Array:
-    """Π (1 + s/ω) in s over `unit` (rad/s), highest power first."""
+    """Multiply the factors 1 + s/ω (one corner), 1 + 2ζ s/ω + s²/ω² (a pair).
+
+    Parameters
+    ----------
+    corners : iterable of Corner
+        (Hz,) or (Hz, damping ratio).
+    unit : float
+        Unit of s, rad/s.
+
+    Returns
+    -------
+    array
+        Coefficients, highest power first.
+    """
     out: Array = np.ones(1)
     for corner in corners:
         x = unit / (HZ * corner[0])
@@ -129,7 +142,7 @@ def polynomial(corners: Iterable[Corner], unit: float) -> Array:
 
 
 class Kind(StrEnum):
-    """Where a source enters."""
+    """The place where a source enters the loop."""
 
     FORCE = "force"
     FLOOR_MOTION = "floor_motion"
@@ -139,11 +152,23 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Source:
-    """One independent source: N²/Hz of a force, m²/Hz of any other.
+    """One independent source of a budget.
 
-    `path` (m, c, k) in kg, N s/m, N/m carries floor motion to a force; with `of_acceleration` the
-    floor's spectrum is one of its acceleration, in (m/s²)²/Hz. Raises ValueError for floor motion
-    that reaches nothing, a filter that is not proper, and a shaped setpoint that does not fall off.
+    Attributes
+    ----------
+    name : str
+    kind : Kind
+    spectrum : TabulatedSpectrum or ShapedSpectrum
+        One-sided density: N²/Hz of a force, m²/Hz of any other.
+    path : tuple (m, c, k)
+        kg, N s/m, N/m: transmits floor motion to a force.
+    of_acceleration : bool
+        The floor's spectrum is that of its acceleration, (m/s²)²/Hz.
+
+    Raises
+    ------
+    ValueError
+        Floor motion has no path, a filter is not proper, or a shaped setpoint does not fall off.
     """
 
     name: str

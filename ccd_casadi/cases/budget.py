@@ -71,7 +71,6 @@ UNITS: dict[Kind, dict[str, tuple[float, bool]]] = {
     Kind.SENSOR_NOISE: _POSITION,
     Kind.SETPOINT: _POSITION,
 }
-MOST_ROWS = 20_000  # of a table
 PATH = ("mass", "damping", "stiffness")
 
 
@@ -165,7 +164,7 @@ def _pairs(value: Any) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(map(float, several(item))) for item in value)
 
 
-def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
+def _read(path: Path, place: str, fail: Fail, *, most_rows: int = 20_000) -> list[list[float]]:
     """Rows of Hz and density: two columns of numbers, after lines that start with a letter or #."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -182,6 +181,6 @@ def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
             words = f"line {i} of {short_repr(path.name)} is not a pair Hz, density; correct it"
             raise fail(f"{place}.file", words) from None
         found.append([hz, density])
-    if len(found) > MOST_ROWS:
-        raise fail(f"{place}.file", f"has more than {MOST_ROWS} rows; thin it out")
+    if len(found) > most_rows:
+        raise fail(f"{place}.file", f"has more than {most_rows} rows; thin it out")
     return found

@@ -64,7 +64,21 @@ def load_case(path: str | Path) -> Case:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a case file, unchecked. Raises CaseError where it is no TOML."""
+    """Read the tables of a case file, unchecked.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    CaseError
+        It is not TOML.
+    """
 
     def fail(words: str) -> CaseError:
         return CaseError(one_line(f"{path}: {words}"))
@@ -222,7 +236,24 @@ def _options_of(
 
 
 def parse_theta(case: Case, text: str) -> tuple[float, ...]:
-    """θ from `m1=60,m2=60`, in the case's order. Raises CaseError naming what is wrong."""
+    """Read θ from a text.
+
+    Parameters
+    ----------
+    case : Case
+    text : str
+        `m1=60,m2=60`.
+
+    Returns
+    -------
+    tuple of float (n,)
+        In the order of the case.
+
+    Raises
+    ------
+    CaseError
+        A name or a value is wrong or missing.
+    """
 
     fail = partial(Fail(case.path), "--theta")
     names = [parameter.name for parameter in case.theta]

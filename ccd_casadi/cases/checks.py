@@ -21,7 +21,13 @@ class CaseError(UserError):
 
 @dataclass(frozen=True)
 class Fail:
-    """The error of a case file by its key and what is wrong."""
+    """Make the error of a case file from a key and what is wrong.
+
+    Attributes
+    ----------
+    path : Path
+        The case file.
+    """
 
     path: Path
 
@@ -57,7 +63,21 @@ def several(value: Any) -> Any:
 
 
 def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
-    """Inside (low, high), or [low, high) if `closed`; `remedy` says what to give."""
+    """Make the check of a number.
+
+    Parameters
+    ----------
+    low, high : float
+        Bounds, exclusive.
+    remedy : str
+        What to give.
+    closed : bool
+        Include `low`.
+
+    Returns
+    -------
+    Check
+    """
 
     def check(value: Any) -> str | None:
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -101,7 +121,16 @@ def count(least: int) -> Check:
 
 
 def choice(*names: str) -> Check:
-    """One of some texts."""
+    """Make the check of one of some texts.
+
+    Parameters
+    ----------
+    *names : str
+
+    Returns
+    -------
+    Check
+    """
     return _good({"enum": list(names)}, names.__contains__, f"choose one of {', '.join(names)}")
 
 
@@ -196,6 +225,17 @@ numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
 def rows(width: int) -> Check:
+    """Make the check of a list of rows of numbers.
+
+    Parameters
+    ----------
+    width : int
+        Numbers of a row.
+
+    Returns
+    -------
+    Check
+    """
     return every(every(ANY, "", width, width), f"give a list of rows of {width} numbers")
 
 
@@ -248,8 +288,22 @@ def unit_of(item: Field[Any]) -> str:
 def require_good(
     place: str, table: Mapping[str, Any], checks: Mapping[str, Test], fail: Fail
 ) -> None:
-    """Raise the error of the first key of a table that is unknown, or not as its check wants it;
-    `place`: the table's own name, of a whole file none."""
+    """Check every key of a table.
+
+    Parameters
+    ----------
+    place : str
+        Name of the table; empty for a whole file.
+    table : mapping
+    checks : mapping
+        Key -> check.
+    fail : Fail
+
+    Raises
+    ------
+    CaseError
+        Of the first key that is unknown, or whose value is wrong.
+    """
     for name, value in table.items():
         key = f"{place}.{name}" if place else name
         if name not in checks:

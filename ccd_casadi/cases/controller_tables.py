@@ -12,7 +12,6 @@ from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, key, one_or_more
 
 Numbers = float | tuple[float, ...] | None
 OF_A_MOTOR = ("force_constant", "resistance", "peak_current", "moving_mass")
-SHORTEST = 1e-4  # s in which jerk changes, where neither snap nor a sampling rate is given
 
 
 @dataclass(frozen=True)
@@ -87,12 +86,15 @@ def check_motion(tables: Mapping[str, Any], theta: Mapping[str, Any], fail: Fail
         raise fail(f"theta.{motor.size}", f"{words}; narrow it")
 
 
-def motion_problem(move: MoveTable, motor: MotorTable, rate_hz: float | None) -> Motion | None:
-    """The move and its motor in SI; None for a case without a move."""
+def motion_problem(
+    move: MoveTable, motor: MotorTable, rate_hz: float | None, *, shortest: float = 1e-4
+) -> Motion | None:
+    """The move and its motor in SI; None for a case without a move. Jerk changes over `shortest` s
+    where neither snap nor a sampling rate is given."""
     if move == MoveTable():
         return None
     given = {item.name: getattr(move, item.name) for item in fields(move)}
-    shortest = SHORTEST if rate_hz is None else 1.0 / rate_hz
+    shortest = shortest if rate_hz is None else 1.0 / rate_hz
     limits = MoveLimits(
         given["distance"], given["velocity"], move.acceleration or float("inf"), given["jerk"],
         move.snap or given["jerk"] / shortest,
@@ -193,7 +195,7 @@ class ControllerTable:
 
 @dataclass(frozen=True)
 class LoopTable:
-    """[loop]: sampled with a hold at `rate_hz`; `delay_us` from measurement to force."""
+    """[loop]: a loop sampled with a hold at `rate_hz`; `delay_us` from measurement to force."""
 
     rate_hz: float | None = key(
         "sections: sampling rate of the loop, with a hold; absent: continuous", None
@@ -207,7 +209,7 @@ class LoopTable:
 
 @dataclass(frozen=True)
 class SamplingTable:
-    """[sampling]: the plan over θ."""
+    """[sampling]: the sampling plan over θ."""
 
     design: str = key("sampling plan over θ", "grid", check=checks.choice("grid", "sobol", "lhs"))
     points: int = key(
@@ -220,7 +222,7 @@ class SamplingTable:
 
 @dataclass(frozen=True)
 class OuterTable:
-    """[outer]: starts, agreement of prediction and truth, rounds of refinement, global check."""
+    """[outer]: numbers of the search over θ, of the refinement and of the global check."""
 
     starts: int = key("starts of IPOPT on the surrogates", 16, check=checks.count(1))
     direct_starts: int = key("local solves on the true problem", 4, check=checks.count(1))

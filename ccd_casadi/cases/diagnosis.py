@@ -5,7 +5,7 @@ design can be made with; warnings what a designer must know; notes what explains
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 
@@ -46,20 +46,39 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.text import HZ
 
-MAX_CORNERS = 16
-CHECKED = 2  # of the points, start and middle: where derivatives by differences are looked at
-HIDDEN = 1e-6  # a mode whose gain is below this share of the largest is not driven, or measured
-COUPLED = 1e-9  # a share of the modes' own damping above which a damper connects modes
+
+@dataclass(frozen=True)
+class DiagnosisOptions:
+    """Numbers of the diagnosis of a plant.
+
+    Attributes
+    ----------
+    most_corners : int
+        Corners of the box; of more this many are drawn.
+    with_derivatives : int
+        Points at which derivatives by differences are checked: start and middle.
+    hidden : float
+        Share of the largest gain below which a mode is not driven, or not measured.
+    coupled : float
+        Share of the modes' damping above which a damper connects two modes.
+    """
+
+    most_corners: int = 16
+    with_derivatives: int = 2
+    hidden: float = 1e-6
+    coupled: float = 1e-9
 
 
-def points_to_check(problem: CoDesignProblem, seed: int = 0) -> list[tuple[float, ...]]:
-    """Start, middle, and the corners of the box, of which at most 16 (of more they are drawn)."""
+def points_to_check(
+    problem: CoDesignProblem, seed: int = 0, *, options: DiagnosisOptions = DiagnosisOptions()
+) -> list[tuple[float, ...]]:
+    """Start, middle, and the corners of the box, of which some are drawn where they are many."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     n = len(lower)
-    if n <= np.log2(MAX_CORNERS):
+    if n <= np.log2(options.most_corners):
         sides = np.array(list(product((0.0, 1.0), repeat=n)))
     else:
-        sides = np.random.default_rng(seed).integers(0, 2, (MAX_CORNERS, n)).astype(float)
+        sides = np.random.default_rng(seed).integers(0, 2, (options.most_corners, n)).astype(float)
     corners = lower + (upper - lower) * sides
     rows = [problem.start, 0.5 * (lower + upper), *corners]
     return list(dict.fromkeys(tuple(float(value) for value in row) for row in rows))
@@ -67,13 +86,36 @@ def points_to_check(problem: CoDesignProblem, seed: int = 0) -> list[tuple[float
 
 @lru_cache(maxsize=4)
 def diagnose(
-    problem: CoDesignProblem, rigid_modes: int | None = None, seed: int = 0
+    problem: CoDesignProblem,
+    rigid_modes: int | None = None,
+    seed: int = 0,
+    *,
+    options: DiagnosisOptions = DiagnosisOptions(),
 ) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
-    """Facts and findings of the problem's plant over its box; `rigid_modes` are expected if given.
+    """Check the plant of a problem over its box.
 
-    Facts are of the points where the matrices are those of a plant, in the order of
-    `points_to_check`; asked again, they are not computed again. What varies is among θ there.
-    Raises PlantError where the model's function fails.
+    The plant is checked at `points_to_check`, where parameters that vary belong to θ. Repeated
+    calls are answered from a cache.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    rigid_modes : int, optional
+        Number of rigid-body modes that is expected.
+    seed : int
+        Of the corners that are drawn.
+    options : DiagnosisOptions
+
+    Returns
+    -------
+    facts : tuple of PlantFacts
+        At the points where the matrices are those of a plant.
+    findings : tuple of Finding
+
+    Raises
+    ------
+    PlantError
+        The model's function fails.
     """
     if isinstance(problem.controller, StructuredProblem):
         problem = with_ranges(problem)
@@ -82,7 +124,7 @@ def diagnose(
     findings = list(_outside(problem, plant))
     if findings:
         return (), tuple(findings)
-    points = points_to_check(problem, seed)
+    points = points_to_check(problem, seed, options=options)
     with Progress(len(points), "checking the plant") as progress:
         for index, theta in enumerate(points):
             progress.advance(int(index > 0))
@@ -97,10 +139,13 @@ def diagnose(
                 findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
                 continue
             found = facts_of(theta, modal, scaled)
-            doubt = plant.doubt(theta) if index < CHECKED else ""
+            doubt = plant.doubt(theta) if index < options.with_derivatives else ""
             here = [Finding(Severity.ERROR, Topic.DERIVATIVES, doubt)] if doubt else []
             here += _rigid(modal, problem.suspension, rigid_modes, place)
-            here += [*_hidden(modal, place), *zero_findings(found, problem.inner.S_max, place)]
+            here += [
+                *_hidden(modal, place, options),
+                *zero_findings(found, problem.inner.S_max, place),
+            ]
             if index == 0:
                 here += unit_findings(problem, found, scaled) + entry_findings(problem, system)
                 here += loop_findings(problem, found, modal) + _unused(problem, plant, system)
@@ -144,15 +189,35 @@ def _unused(problem: CoDesignProblem, plant: Plant, system: Mechanics) -> list[F
 
 
 def suspicions(problem: CoDesignProblem, rigid_modes: int | None = None) -> list[str]:
-    """What may be the cause where no design is found: numbers in another unit, a sign, the loop."""
+    """List likely causes where no design is found: numbers in another unit, a sign, the loop.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    rigid_modes : int, optional
+        Number of rigid-body modes that is expected.
+
+    Returns
+    -------
+    list of str
+    """
     found = diagnose(problem, rigid_modes)[1]
     return [item.words for item in found if item.topic in (Topic.UNITS, Topic.LOOP)]
 
 
 def first_seen(findings: Sequence[Finding]) -> list[Finding]:
-    """The findings at the first θ where their topic comes up, the serious first.
+    """Select the findings at the first θ where their topic occurs.
 
-    What holds at one θ mostly holds, with other numbers, at the others too.
+    A finding at one θ mostly holds, with other numbers, at the others, too.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+
+    Returns
+    -------
+    list of Finding
+        The serious ones first.
     """
     first: dict[tuple[Topic, Severity], int] = {}
     for item in findings:
@@ -178,20 +243,21 @@ def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
     return found
 
 
-def _hidden(modal: ModalPlant, place: str) -> list[Finding]:
+def _hidden(modal: ModalPlant, place: str, options: DiagnosisOptions) -> list[Finding]:
     """Directions of each eigenspace that no input drives, or no output measures (rank of B, C)."""
     D = np.abs(modal.D - np.diag(np.diag(modal.D)))
-    coupled = (COUPLED * np.diag(modal.D).max() < D).any(axis=1)
+    coupled = (options.coupled * np.diag(modal.D).max() < D).any(axis=1)
     w, rigid, found = modal.natural, modal.rigid, []
     # modes of one frequency, whose shapes are one space; the rigid ones are one
-    same = (rigid[1:] & rigid[:-1]) | (~rigid[:-1] & (np.diff(w) <= HIDDEN * w[1:]))
+    same = (rigid[1:] & rigid[:-1]) | (~rigid[:-1] & (np.diff(w) <= options.hidden * w[1:]))
     for group in np.split(np.arange(len(w)), np.flatnonzero(~same) + 1):
         if coupled[group].any():
             continue  # a damper hands its motion on to others
         lacks = [
             name
             for name, gains in (("driven", modal.B), ("measured", modal.C.T))
-            if np.linalg.matrix_rank(gains[group], tol=HIDDEN * np.abs(gains).max()) < len(group)
+            if np.linalg.matrix_rank(gains[group], tol=options.hidden * np.abs(gains).max())
+            < len(group)
         ]
         if not lacks:
             continue

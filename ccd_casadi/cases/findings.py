@@ -20,13 +20,37 @@ from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.text import HZ, spoken
 
-LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
-FAR = 3.0  # how far above the frequencies that [inner] searches effort may end
-TWICE = 2.0  # M_K suits 0.1 to 1.5 times the first resonance on the shipped cases
-SHOWS = 0.1  # of the largest gain: a mode that is driven and measured so much shows in the loop
-LEAST_DELAY = 1e-3  # of a period: a shorter one is none, or was written in seconds
-MOST_DELAY = 100.0  # periods: a longer one was not meant in seconds
-DECIBEL = 3.0  # from here on a peak of S is more likely one in dB
+
+@dataclass(frozen=True)
+class FindingOptions:
+    """Thresholds of the findings.
+
+    Attributes
+    ----------
+    light : float
+        Damping ratio below which a zero is a dip in the frequency response.
+    effort_margin : float
+        Factor above the frequencies that [inner] searches at which effort may end.
+    mismatch : float
+        Factor between two frequencies beyond which a unit may be wrong: M_K suits 0.1 to 1.5
+        times the first resonance on the shipped cases.
+    shown : float
+        Share of the largest gain from which a mode shows in the loop.
+    least_delay, most_delay : float
+        Delays in periods: a shorter one may have been written in seconds, a longer one not.
+    decibel : float
+        From here on a peak of S is more likely one in dB.
+    """
+
+    light: float = 0.3
+    effort_margin: float = 3.0
+    mismatch: float = 2.0
+    shown: float = 0.1
+    least_delay: float = 1e-3
+    most_delay: float = 100.0
+    decibel: float = 3.0
+
+
 # in SI, by how a person writes them
 MASS = {"t": 1e3, "kg": 1.0, "g": 1e-3, "mg": 1e-6}
 STIFFNESS = {"MN/m": 1e6, "kN/mm": 1e6, "N/um": 1e6, "N/µm": 1e6, "kN/m": 1e3, "N/mm": 1e3,
@@ -35,7 +59,7 @@ SI = "all values are in SI (kg, N/m, m; 1 N/um is 1e6 N/m, 1 N/mm is 1e3 N/m)"
 
 
 class Severity(StrEnum):
-    """How much a finding matters."""
+    """The weight of a finding: an error prevents a design, a note only informs."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -43,7 +67,7 @@ class Severity(StrEnum):
 
 
 class Topic(StrEnum):
-    """What a finding is about."""
+    """The subject of a finding."""
 
     MATRICES = "matrices"
     RIGID_MODES = "rigid modes"
@@ -71,14 +95,16 @@ class Finding:
     limit_hz: float = np.inf
 
 
-def zero_findings(facts: PlantFacts, S_max: float, place: str) -> list[Finding]:
+def zero_findings(
+    facts: PlantFacts, S_max: float, place: str, *, options: FindingOptions = FindingOptions()
+) -> list[Finding]:
     """The right half-plane zero that limits most, and the dips; `place` names the θ."""
     found = []
     right = [zero for zero in facts.zeros if zero.damping_ratio < -1e-9]
     if right:
         found.append(_right(min(right, key=lambda z: z.frequency_hz), facts, S_max, place))
     return found + [
-        _dip(zero, place) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < LIGHT
+        _dip(zero, place) for zero in facts.zeros if -1e-9 <= zero.damping_ratio < options.light
     ]
 
 
@@ -112,17 +138,29 @@ def most_limiting(findings: Sequence[Finding]) -> list[Finding]:
     return [f for f in findings if f is worst or f not in severe]
 
 
-def unit_findings(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> list[Finding]:
+def unit_findings(
+    problem: CoDesignProblem,
+    facts: PlantFacts,
+    plant: ScaledPlant,
+    *,
+    options: FindingOptions = FindingOptions(),
+) -> list[Finding]:
     """Warnings about M_K, the resonances and S_max, from the plant at the start."""
     words = [
-        *_effort(problem, facts, plant),
-        *_resonances(problem, facts),
-        *peak_words(problem.inner.S_max),
+        *_effort(problem, facts, plant, options),
+        *_resonances(problem, facts, options),
+        *peak_words(problem.inner.S_max, options=options),
     ]
     return [Finding(Severity.WARNING, Topic.UNITS, item) for item in words]
 
 
-def loop_findings(problem: CoDesignProblem, facts: PlantFacts, modal: ModalPlant) -> list[Finding]:
+def loop_findings(
+    problem: CoDesignProblem,
+    facts: PlantFacts,
+    modal: ModalPlant,
+    *,
+    options: FindingOptions = FindingOptions(),
+) -> list[Finding]:
     """Warnings about the sign of a plant with one input and output, and about the delay and the
     rate of its loop."""
     words = []
@@ -136,21 +174,22 @@ def loop_findings(problem: CoDesignProblem, facts: PlantFacts, modal: ModalPlant
                 "If not, correct the row or the column"
             )
     if (run := problem.sampling) is not None:
-        words += _lag_words(run, facts.effort_hz)
+        words += _lag_words(run, facts.effort_hz, options)
     return [Finding(Severity.WARNING, Topic.LOOP, item) for item in words]
 
 
-def _lag_words(run: Sampling, meant: float) -> list[str]:
+def _lag_words(run: Sampling, meant: float, options: FindingOptions) -> list[str]:
     """Whether delay and rate are in other units, `meant` in Hz being what M_K suits."""
     words, seconds, period = [], run.delay_us, run.period
-    if 0.0 < run.delay < LEAST_DELAY * period and seconds < MOST_DELAY * period:
+    short = 0.0 < run.delay < options.least_delay * period
+    if short and seconds < options.most_delay * period:
         words.append(
             f"loop.delay_us = {run.delay_us:g} is {1e9 * run.delay:.3g} ns: were seconds meant? "
             f"Then write {1e6 * seconds:g}"
         )
     lag = run.delay + 0.5 * period
     limit = 1.0 / (HZ * lag)
-    if meant > TWICE * limit:
+    if meant > options.mismatch * limit:
         why = f"delay_us = {run.delay_us:g} and rate_hz = {run.rate_hz:g}"
         hint = "rate_hz is in Hz" if run.delay < 0.5 * period else "delay_us is in microseconds"
         words.append(
@@ -208,10 +247,12 @@ def _at_a_third(problem: CoDesignProblem, plant: ScaledPlant) -> tuple[float, fl
         np.log(aim * HZ / plant.omega_0), np.log(plant.grid), level)))  # fmt: skip
 
 
-def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> list[str]:
+def _effort(
+    problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant, options: FindingOptions
+) -> list[str]:
     low, high = _searched(problem)
     M_K, effort = problem.weights.M_K, facts.effort_hz
-    if np.isfinite(effort) and low <= effort <= FAR * high:
+    if np.isfinite(effort) and low <= effort <= options.effort_margin * high:
         return []
     aim, gain = _at_a_third(problem, plant)
     where = (
@@ -228,13 +269,14 @@ def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> 
     ]
 
 
-def _resonances(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
+def _resonances(problem: CoDesignProblem, facts: PlantFacts, options: FindingOptions) -> list[str]:
     """The first resonance that shows, against the bandwidth that M_K suits without resonances."""
-    shown = (m for m in facts.modes if not m.rigid and min(m.driven, m.measured) > SHOWS)
+    least = options.shown
+    shown = (m for m in facts.modes if not m.rigid and min(m.driven, m.measured) > least)
     first = next((mode.frequency_hz for mode in shown), np.nan)  # which compares with nothing
     suits = float(np.sqrt(problem.weights.M_K / facts.inertia)) / HZ  # 0: nothing moves freely
     high = _searched(problem)[1]
-    if suits > TWICE * first:
+    if suits > options.mismatch * first:
         moved = spoken(f"{facts.inertia:.3g} kg")
         against = f"M_K suits {suits:.3g} Hz for the {moved} that an actuator moves"
     elif suits > 0.0 and first > 100.0 * high:
@@ -245,9 +287,20 @@ def _resonances(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
     return [f"{words}: is the stiffness in another unit? {SI}"]
 
 
-def peak_words(S_max: float) -> list[str]:
-    """Whether S_max looks like one in dB."""
-    if S_max <= DECIBEL:
+def peak_words(S_max: float, *, options: FindingOptions = FindingOptions()) -> list[str]:
+    """Warn of an S_max that looks like one in dB.
+
+    Parameters
+    ----------
+    S_max : float
+    options : FindingOptions
+
+    Returns
+    -------
+    list of str
+        Empty where it looks right.
+    """
+    if S_max <= options.decibel:
         return []
     factor = 10.0 ** (S_max / 20.0)
     return [

@@ -10,9 +10,16 @@ DRAWING = "ccd_casadi.drawing.paint", "matplotlib.backends.backend_svg"
 
 
 def is_searched(case: Path) -> bool:
-    """Whether its controller is searched for on worker processes.
+    """Report whether the controller of a case is searched for on worker processes.
 
-    A file that is no case is none: whoever reads it whole says what is wrong with it.
+    Parameters
+    ----------
+    case : Path
+        A file that is not a case gives False: its error is reported later.
+
+    Returns
+    -------
+    bool
     """
     try:
         tables = tomllib.loads(case.read_text(encoding="utf-8"))

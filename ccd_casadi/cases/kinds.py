@@ -1,7 +1,7 @@
 """Kinds of inner problem in a case file: which keys go with which, and the structured problem."""
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from ccd_casadi.budget import Kind
@@ -18,9 +18,26 @@ from ccd_casadi.inner_problem.structured_problem import (
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.weights import Weights
 
-SHAPE = 1.1  # of a fixed structure, where the case gives none
-DISTURBANCE = 10.0  # W_d over M_K, where the case gives none
-MOST_PLANTS = 24  # option sets
+
+@dataclass(frozen=True)
+class KindOptions:
+    """What a case has where it gives no number.
+
+    Attributes
+    ----------
+    shape : float
+        Bound of the shape of S with a fixed structure.
+    disturbance : float
+        W_d over M_K.
+    most_plants : int
+        Option sets of the plant that a case may list.
+    """
+
+    shape: float = 1.1
+    disturbance: float = 10.0
+    most_plants: int = 24
+
+
 WITH_DISTURBANCE = "h_infinity_disturbance"
 # Keys that only one kind reads, by table.
 _OF_STRUCTURED = {
@@ -117,12 +134,23 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
         if own.M_K is not None and controller.weighted_level is None:
             words = "has an effect on a bounded KS only; give controller.weighted_level, or drop it"
             raise fail(f"controller.channel.{name}.M_K", words)
-    if len(tables["robust"].plants) > MOST_PLANTS:
-        raise fail("robust.plants", f"names more than {MOST_PLANTS} plants; name the extreme ones")
+    if len(tables["robust"].plants) > (most := KindOptions.most_plants):
+        raise fail("robust.plants", f"names more than {most} plants; name the extreme ones")
 
 
 def with_structure(case: Case, structure: str) -> Case:
-    """The case with another kind of controller; keys without effect on it as if not given."""
+    """Replace the kind of controller of a case; keys without effect on it get their defaults.
+
+    Parameters
+    ----------
+    case : Case
+    structure : str
+        As `controller.structure`.
+
+    Returns
+    -------
+    Case
+    """
     other = _OF_H_INFINITY if structure == "sections" else _OF_STRUCTURED
     tables: dict[str, Any] = {"controller": replace(case.controller, structure=structure)}
     for name, keys in other.items():
@@ -149,7 +177,7 @@ def weights_of(controller: ControllerTable, weights: WeightsTable, inner: InnerT
     if controller.structure != WITH_DISTURBANCE:
         values["disturbance"] = 0.0
     elif weights.disturbance is None:
-        values["disturbance"] = DISTURBANCE * weights.M_K
+        values["disturbance"] = KindOptions.disturbance * weights.M_K
     del values["omega_K_hz"]
     return Weights(**values)
 
@@ -159,7 +187,7 @@ def structured_problem(case: Case, options: tuple[Options, ...]) -> StructuredPr
     controller, loop, robust, inner = case.controller, case.loop, case.robust, case.inner
     return StructuredProblem(
         structure=structure_of(controller),
-        shape=SHAPE if inner.shape is None else inner.shape,
+        shape=KindOptions.shape if inner.shape is None else inner.shape,
         shape_ends=ShapeEnd(inner.shape_ends),
         weighted_level=controller.weighted_level,
         compliance_max=inner.compliance_max,

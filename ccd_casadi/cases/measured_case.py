@@ -18,7 +18,7 @@ from typing import Any
 
 from ccd_casadi.cases.case import read_toml, table_of
 from ccd_casadi.cases.checks import POSITIVE, Fail, count, require_good, short_repr, text
-from ccd_casadi.cases.kinds import SHAPE, check_kind, idle_keys, structure_of, weights_of
+from ccd_casadi.cases.kinds import KindOptions, check_kind, idle_keys, structure_of, weights_of
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
@@ -38,7 +38,21 @@ _PLANT = {
 
 @dataclass(frozen=True)
 class MeasuredCase:
-    """The checked case; `period` in s, None for a continuous controller."""
+    """The checked case of a measured plant.
+
+    Attributes
+    ----------
+    path : Path
+    file : str
+        Of the response.
+    responses : tuple of MeasuredResponse
+    structure : Structure
+    bounds : Bounds
+    period : float or None
+        s; None: a continuous controller.
+    starts : int
+        Starts of the search.
+    """
 
     path: Path
     file: str
@@ -50,7 +64,21 @@ class MeasuredCase:
 
 
 def measured_case(path: Path) -> MeasuredCase | None:
-    """The case of a measured plant; None for any other. Raises CaseError on the first mistake."""
+    """Read the case of a measured plant.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    MeasuredCase, or None for any other case
+
+    Raises
+    ------
+    CaseError
+        On the first mistake.
+    """
     data = read_toml(path)
     plant = data.get("plant")
     if not isinstance(plant, Mapping) or plant.get("model") != MODEL:
@@ -85,7 +113,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
             S_max=inner.S_max,
             S_low=inner.S_low,
             omega_low=HZ * inner.omega_low_hz,
-            shape=SHAPE if inner.shape is None else inner.shape,
+            shape=KindOptions.shape if inner.shape is None else inner.shape,
             shape_ends=ShapeEnd(inner.shape_ends),
             weighted_level=controller.weighted_level,
             weights=weights,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,16 +15,48 @@ from ccd_casadi.plants.facts import PlantFacts
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.text import number, spoken
 
-# ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less where
-# resonances stand in the way.
-WINDOW = (0.4, 1.1)
-SHARES = (0.2, 1.0 / 3.0, 0.5)  # of the first resonance: the rule of thumb, and beyond it
+
+@dataclass(frozen=True)
+class PlantReportOptions:
+    """Rules of thumb of the report.
+
+    Attributes
+    ----------
+    window : tuple of float
+        ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less
+        with resonances nearby.
+    shares : tuple of float
+        Bandwidths over the first resonance, for each of which an M_K is given.
+    """
+
+    window: tuple[float, float] = (0.4, 1.1)
+    shares: tuple[float, ...] = (0.2, 1.0 / 3.0, 0.5)
 
 
 def plant_report(
-    case: Case, problem: CoDesignProblem, facts: Sequence[PlantFacts], findings: Sequence[Finding]
+    case: Case,
+    problem: CoDesignProblem,
+    facts: Sequence[PlantFacts],
+    findings: Sequence[Finding],
+    *,
+    options: PlantReportOptions = PlantReportOptions(),
 ) -> dict[str, Any]:
-    """The diagnosis as plain values; frequencies in Hz, M_K in force over displacement."""
+    """Write the diagnosis of a plant as plain values.
+
+    Parameters
+    ----------
+    case : Case
+    problem : CoDesignProblem
+        Of the case.
+    facts, findings : sequences
+        As `diagnose` returns them.
+    options : PlantReportOptions
+
+    Returns
+    -------
+    dict
+        Frequencies in Hz, M_K in N/m.
+    """
     plant = plant_of(problem)
     start = facts[0]
     values = constraint_values(plant, problem.start)
@@ -42,7 +74,7 @@ def plant_report(
         "varies": {p.name: [p.lower, p.upper] for p in case.fixed if p.varies},
         "units": {parameter.name: parameter.unit for parameter in case.theta},
         "points": len(facts),
-        "size": size_words(start, case),
+        "size": size_words(start, case, options=options),
         "inertia": start.inertia,
         "rigid_modes": sum(mode.rigid for mode in start.modes),
         "modes": [asdict(mode) for mode in start.modes],
@@ -50,9 +82,9 @@ def plant_report(
         "frequency_ranges_hz": np.column_stack([hertz.min(axis=0), hertz.max(axis=0)]).tolist(),
         "zeros": [asdict(zero) for zero in start.zeros],
         "effort_hz": start.effort_hz,
-        "bandwidth_window_hz": [share * start.effort_hz for share in WINDOW],
+        "bandwidth_window_hz": [share * start.effort_hz for share in options.window],
         "M_K": case.weights.M_K,
-        "M_K_for_bandwidth": _suitable(problem, start),
+        "M_K_for_bandwidth": _suitable(problem, start, options.shares),
         "constraints": [
             {"name": name, "value": float(value), "met": bool(value <= 0.0), "open": between}
             for name, value in constraints
@@ -68,25 +100,40 @@ def plant_report(
     }
 
 
-def size_words(facts: PlantFacts, case: Case) -> str:
-    """How large the plant is: what shows at a glance that numbers are not in SI."""
+def size_words(
+    facts: PlantFacts, case: Case, *, options: PlantReportOptions = PlantReportOptions()
+) -> str:
+    """Write how large a plant is, which shows at a glance that numbers are not in SI.
+
+    Parameters
+    ----------
+    facts : PlantFacts
+    case : Case
+    options : PlantReportOptions
+
+    Returns
+    -------
+    str
+    """
     parts = []
     if math.isfinite(facts.inertia):
         parts.append(spoken(f"an actuator moves {facts.inertia:.3g} kg"))
     flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
     parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
     if math.isfinite(facts.effort_hz) and not math.isnan(case.weights.M_K):
-        low, high = (share * facts.effort_hz for share in WINDOW)
+        low, high = (share * facts.effort_hz for share in options.window)
         parts.append(f"M_K suits a bandwidth of {number(low, 2)} to {number(high, 2)} Hz")
     return ", ".join(parts)
 
 
-def _suitable(problem: CoDesignProblem, start: PlantFacts) -> list[dict[str, float]]:
+def _suitable(
+    problem: CoDesignProblem, start: PlantFacts, shares: tuple[float, ...]
+) -> list[dict[str, float]]:
     """M_K that moves `effort_hz` to shares of the first resonance, below which G falls as ω⁻²."""
     first = next((mode.frequency_hz for mode in start.modes if not mode.rigid), math.nan)
     M_K, effort = problem.weights.M_K, start.effort_hz
     return [
         {"bandwidth_hz": share * first, "M_K": M_K * (share * first / effort) ** 2}
-        for share in SHARES
+        for share in shares
         if math.isfinite(first / effort) and start.modes[0].rigid
     ]

@@ -18,7 +18,6 @@ _OPTIONS: dict[str, Check] = {
     "poisson": checks.number(0.0, 0.5, "give a number between 0 and 0.5"),
     "modes": checks.count(1),
 }
-MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
 
 # Every key of a [theta.NAME], what is asked of it, and what it says.
 KEYS: dict[str, tuple[Check, str]] = {
@@ -136,7 +135,7 @@ def theta_tables(
     return free, tuple(p for p in found if p not in free)
 
 
-def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
+def _parameter(name: str, entry: Any, fail: Fail, *, most_values: int = 100) -> Parameter:
     place = f"theta.{name}"
     if not name.isidentifier():
         raise fail(place, "is not an identifier; use letters, digits and _")
@@ -172,12 +171,12 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
         raise fail(f"{place}.start", words)
     if entry.get("integer", False):
         first, last = math.ceil(lower), math.floor(upper)
-        if last - first < 1 or last - first >= MOST_VALUES:
+        if last - first < 1 or last - first >= most_values:
             words = f"{lower:g} to {upper:g} holds {max(0, last - first + 1)} whole numbers"
-            raise fail(f"{place}.integer", f"{words}; give bounds with 2 to {MOST_VALUES}")
+            raise fail(f"{place}.integer", f"{words}; give bounds with 2 to {most_values}")
         values = tuple(float(value) for value in range(first, last + 1))
         lower, upper = values[0], values[-1]
         start = min(max(start, lower), upper)
-    if len(values) > MOST_VALUES:
-        raise fail(f"{place}.values", f"has more than {MOST_VALUES}; give lower and upper instead")
+    if len(values) > most_values:
+        raise fail(f"{place}.values", f"has more than {most_values}; give lower and upper instead")
     return Parameter(name, lower, upper, start, unit, values, entry.get("varies", False))

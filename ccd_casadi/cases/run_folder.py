@@ -46,18 +46,51 @@ from ccd_casadi.synthesis.weights import Weights
 if TYPE_CHECKING:
     import control
 
-REMADE = 1e-3  # relative: what γ of the same synthesis may differ by between two machines
-EXCEEDED = 1e-5  # relative: by how much a bound may be exceeded and count as met
-SHORTFALL = 1e-6  # relative: a stored bound is met when the norm now is no further above it
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Relative tolerances with which a run folder is read.
+
+    Attributes
+    ----------
+    gamma : float
+        Difference of γ between two syntheses of the same problem on two machines.
+    bound : float
+        Excess of a bound of [inner] that counts as met.
+    norm : float
+        Excess of the norm over the stored bound.
+    """
+
+    gamma: float = 1e-3
+    bound: float = 1e-5
+    norm: float = 1e-6
 
 
 @dataclass(frozen=True)
 class FinishedRun(NotebookHtml):
-    """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
+    """The design of a finished run, measured again when its folder was read.
 
-    `figures` are measured when the folder is read, on the plant as the case describes it now;
-    `result` is result.json as it was written. `sampling`: how a controller in discrete time
-    runs, where one is judged in place of the run's own.
+    Attributes
+    ----------
+    folder : Path
+    case : Case
+    problem : CoDesignProblem
+    theta : tuple of float (n,)
+        SI.
+    plant : ScaledPlant
+        As the case describes it now.
+    weights : Weights
+        W_S, W_KS, W_T, SI.
+    controller : StateSpace
+        e to u, SI.
+    figures : DesignFigures
+        Measured on `plant`.
+    result : mapping
+        result.json as it was written.
+    sampling : Sampling, optional
+        How a controller in discrete time runs, where one is checked in place of the run's.
+    kappa : array, optional
+        Parameters of a fixed structure, SI.
     """
 
     folder: Path
@@ -100,13 +133,15 @@ class FinishedRun(NotebookHtml):
         return to_control(plant, "plant"), to_control(controller, "controller")
 
 
-def read_run(folder: str | Path) -> FinishedRun:
+def read_run(folder: str | Path, *, options: RunOptions = RunOptions()) -> FinishedRun:
     """Read a finished run, and certify its controller again.
 
     Parameters
     ----------
     folder : path
         With case.toml, result.json and controller.json.
+    options : RunOptions
+        Tolerances.
 
     Returns
     -------
@@ -129,9 +164,10 @@ def read_run(folder: str | Path) -> FinishedRun:
     case = load_case(folder / "case.toml")
     problem = problem_of(case)
     theta = _theta(folder / "result.json", result, problem)
-    structured = isinstance(problem.controller, StructuredProblem)
-    read = _read_structured if structured else _read_mixed
-    found = read(folder, problem, theta, result)
+    if isinstance(problem.controller, StructuredProblem):
+        found = _read_structured(folder, problem, theta, result)
+    else:
+        found = _read_mixed(folder, problem, theta, result, options)
     problem = found.pop("problem", problem)
     plant = scaled_plant(problem, theta)
     return FinishedRun(folder, case, problem, theta, plant, result=result, **found)
@@ -140,9 +176,25 @@ def read_run(folder: str | Path) -> FinishedRun:
 def problem_at(
     place: Path, theta: str | None
 ) -> tuple[CoDesignProblem, tuple[float, ...] | None, FinishedRun | None]:
-    """Problem, θ and run of a finished run's folder; of a case file with θ in words or without one.
+    """Read the problem, the θ and the run of a place.
 
-    Raises UserError as `read_run` and `load_case` do, and for a run with another θ.
+    Parameters
+    ----------
+    place : Path
+        The folder of a finished run, or a case file.
+    theta : str, optional
+        θ of a case file, as `m1=60,m2=60`.
+
+    Returns
+    -------
+    problem : CoDesignProblem
+    theta : tuple of float, or None of a case file without θ
+    run : FinishedRun, or None of a case file
+
+    Raises
+    ------
+    UserError
+        As `read_run` and `load_case`, and for a run with another θ.
     """
     if place.is_dir():
         run = read_run(place)
@@ -163,7 +215,11 @@ def _damaged(place: str, words: str) -> Iterator[None]:
 
 
 def _read_mixed(
-    folder: Path, problem: CoDesignProblem, theta: tuple[float, ...], result: Mapping[str, Any]
+    folder: Path,
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    result: Mapping[str, Any],
+    options: RunOptions,
 ) -> dict[str, Any]:
     """Weights, controller and figures of a run of mixed sensitivity, certified again at its γ."""
     path = folder / "result.json"
@@ -175,12 +231,12 @@ def _read_mixed(
     bound = max(bound, _number(path, result, "gamma"))
     # What a file says of γ is not relied on: it is at most that of a synthesis made anew.
     made = final_design(problem, theta, (HZ * hz[0], HZ * hz[1])).figures
-    if made.certified and bound > made.certificate.norm_bound * (1.0 + REMADE):
+    if made.certified and bound > made.certificate.norm_bound * (1.0 + options.gamma):
         words = f"is {bound:.6g}, and a synthesis reaches {made.certificate.norm_bound:.6g}"
         raise UserError(f"{path}: certificate.norm_bound: {words}; solve the case again")
     figures = measure(
         plant, controller, weights,
-        gamma=bound * (1.0 + SHORTFALL),
+        gamma=bound * (1.0 + options.norm),
         omega_low=problem.inner.omega_low, gamma_opt=_number(path, result, "gamma_opt"),
         gamma_lower_bound=_number(path, result, "gamma_lower_bound"),
     )  # fmt: skip
@@ -189,7 +245,7 @@ def _read_mixed(
         raise UserError(f"{folder / 'controller.json'}: {words}; solve the case again")
     for name, most in (("sensitivity_peak", "S_max"), ("sensitivity_low", "S_low")):
         found, own = getattr(figures, name), getattr(problem.inner, most)
-        if result.get("status") == "verified" and not found <= own * (1.0 + EXCEEDED):
+        if result.get("status") == "verified" and not found <= own * (1.0 + options.bound):
             words = f"is verified, but {most} = {own:g} of case.toml is exceeded: {found:.6g}"
             raise UserError(f"{path}: status: {words}; solve the case again")
     return {"weights": weights, "controller": controller, "figures": figures}
@@ -223,9 +279,24 @@ def _read_structured(
 def with_function(
     path: Path, problem: CoDesignProblem, result: Mapping[str, Any]
 ) -> CoDesignProblem:
-    """The problem with the warm starts and the plant set that a run ended with: its ω_b*(θ).
+    """Add to a problem the warm starts and the plant set that a run ended with: its ω_b*(θ).
 
-    Raises UserError where result.json holds others.
+    Parameters
+    ----------
+    path : Path
+        result.json, for messages.
+    problem : CoDesignProblem
+    result : mapping
+        Its content.
+
+    Returns
+    -------
+    CoDesignProblem
+
+    Raises
+    ------
+    UserError
+        result.json holds others.
     """
     if "anchors" not in result:
         return problem  # of an earlier version
@@ -247,7 +318,23 @@ def with_function(
 
 
 def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
-    """κ in SI of the controller.json of a folder. Raises UserError where it is of another kind."""
+    """Read the parameters of a fixed structure from the controller.json of a folder.
+
+    Parameters
+    ----------
+    folder : Path
+    structure : Structure or ChannelStructure
+
+    Returns
+    -------
+    tuple of float
+        κ in SI.
+
+    Raises
+    ------
+    UserError
+        It is of another structure.
+    """
     path = folder / "controller.json"
     words = f"is not a list of the {len(structure.names)} parameters of the case's structure"
     with _damaged(f"{path}: sections.kappa", f"{words}; name a run of this case"):
@@ -278,7 +365,21 @@ def _with_directions(
 
 
 def read_json(path: Path) -> Mapping[str, Any]:
-    """A JSON object. Raises UserError where there is none."""
+    """Read a JSON object.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    mapping
+
+    Raises
+    ------
+    UserError
+        There is none.
+    """
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

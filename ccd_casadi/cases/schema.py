@@ -18,9 +18,20 @@ from ccd_casadi.support.text import package_text, template
 
 
 def case_to_toml(case: Case) -> str:
-    """The resolved case, defaults included, as TOML.
+    """Write the resolved case, defaults included, as TOML.
 
-    Raises UserError where its plant is a Python callable.
+    Parameters
+    ----------
+    case : Case
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    UserError
+        Its plant is a Python callable.
     """
     if callable(case.plant.function):
         words = "is a Python callable, which no file can hold"

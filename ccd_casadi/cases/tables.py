@@ -16,7 +16,6 @@ from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.terminal import NotebookHtml
 from ccd_casadi.support.user_code import name_of
 
-EVERY = (1e-3, 1e6)  # Hz: a range that nothing searches
 Spectra = tuple[Mapping[str, Any], ...]
 
 
@@ -39,11 +38,19 @@ class PlantTable:
 
 @dataclass(frozen=True)
 class Parameter:
-    """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter.
+    """[theta.NAME]: one hardware parameter.
 
-    `values`: those that it may have, in rising order, from `lower` to `upper`; none: all between
-    the bounds. With one value it is fixed, and no part of θ. One that `varies` is none either: what
-    is designed holds between its bounds.
+    Attributes
+    ----------
+    name : str
+    lower, upper, start : float
+        Bounds, and where searches start, in `unit`.
+    unit : str
+    values : tuple of float
+        The values that it may have, rising; empty: all between the bounds. With one value it is
+        fixed, and not part of θ.
+    varies : bool
+        It is not part of θ either: the design holds between its bounds.
     """
 
     name: str
@@ -127,12 +134,12 @@ class InnerTable:
     S_low: float = key("bound of |S| at omega_low", check=checks.FRACTION)
     omega_low_hz: float = key("where S_low holds")
     omega_S_hz: tuple[float, float] = key(
-        "searched range of the frequency of W_S", check=checks.interval, idle=EVERY
+        "searched range of the frequency of W_S", check=checks.interval, idle=(1e-3, 1e6)
     )
     omega_T_hz: tuple[float, float] = key(
         "searched range of the frequency of W_T; sections: the lower end is that of W_T",
         check=checks.interval,
-        idle=EVERY,
+        idle=(1e-3, 1e6),
     )
     gamma_backoff: float = key(
         "controllers are synthesised at this multiple of γ_opt",
@@ -314,7 +321,17 @@ class UnitsTable:
 
 @dataclass(frozen=True)
 class Case(NotebookHtml):
-    """A checked case file."""
+    """A checked case file.
+
+    Attributes
+    ----------
+    path : Path
+    plant : PlantTable
+    theta, fixed : tuples of Parameter
+        Searched parameters; fixed ones and those that vary.
+    objective ... units : tables of the same names
+        In units of the file.
+    """
 
     path: Path
     plant: PlantTable

@@ -21,7 +21,7 @@ from typing import Protocol
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
-from ccd_casadi.budget.evaluation import STEP, ErrorVariance
+from ccd_casadi.budget.evaluation import COMPLEX_STEP, ErrorVariance
 from ccd_casadi.budget.loops import run_matrix
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import (
@@ -88,13 +88,14 @@ class RmsError:
 
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
-        steps = 1j * STEP * np.eye(len(kappa) + 1, len(kappa), -1)
+        steps = 1j * COMPLEX_STEP * np.eye(len(kappa) + 1, len(kappa), -1)
         return self._of_mean(np.asarray(kappa, float) + steps, [()] * len(self.plants))
 
     def to_theta(self, kappa: Array) -> Array:
         """∂ ln e/∂θ at a fixed κ."""
+        step = 1j * COMPLEX_STEP
         moved = [
-            [StateSpace(G.A + 1j * STEP * dA, G.B + 1j * STEP * dB, G.C + 1j * STEP * dC, G.D)
+            [StateSpace(G.A + step * dA, G.B + step * dB, G.C + step * dC, G.D)
              for dA, dB, dC in plant.changes_si()]
             for G, plant in ((plant.plant_si(), plant) for plant in self.plants)
         ]  # fmt: skip

@@ -19,7 +19,7 @@ from ccd_casadi.budget import (
     TabulatedSpectrum,
     evaluate_budget,
 )
-from ccd_casadi.budget.evaluation import STEP, ErrorVariance, of_source, variances
+from ccd_casadi.budget.evaluation import COMPLEX_STEP, ErrorVariance, of_source, variances
 from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.loops import (
     Process,
@@ -128,7 +128,7 @@ def test_derivatives_to_controller_and_plant(
 ) -> None:
     made, structure, kappa = built(sampling)
     budget, scaled, n = ErrorBudget(sources), plant(), len(kappa)
-    parts = structure.state_spaces(kappa + 1j * STEP * np.eye(n + 1, n, -1))
+    parts = structure.state_spaces(kappa + 1j * COMPLEX_STEP * np.eye(n + 1, n, -1))
 
     def moved(x: Array) -> StateSpace:
         G = made.plant
@@ -136,7 +136,7 @@ def test_derivatives_to_controller_and_plant(
             *(part + x[0] * first + x[1] * second for part, first, second
               in zip((G.A, G.B, G.C), *scaled.changes_si(), strict=True)), G.D)  # fmt: skip
 
-    plants = [moved(1j * STEP * one) for one in np.eye(2)]
+    plants = [moved(1j * COMPLEX_STEP * one) for one in np.eye(2)]
     variance = ErrorVariance(made.plant, budget, made.sampling, len(made.controller.A))
     found = variance.at(parts, run_matrix(parts, made.period), plants)
     assert found is not None
