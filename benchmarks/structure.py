@@ -35,6 +35,7 @@ EXEMPT: dict[str, tuple[str, ...]] = {
     "ccd_casadi.plants.cad.solid": ("TRIANGLE", "TETRAHEDRON", "MILLIMETRE"),
     "ccd_casadi.plants.rigid_modes": ("EPS",),
     "ccd_casadi.plants.table_columns": ("COMPLIANCE",),
+    "ccd_casadi.studies.backends": ("BISECT", "SUBOPTIMAL"),
     "ccd_casadi.support.text": ("HZ",),
     "ccd_casadi.support.guard": ("DIES_WITH_PARENT",),
 }

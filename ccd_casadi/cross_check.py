@@ -118,14 +118,14 @@ def _table(found: "Sequence[BackendResult]") -> str:
 
 
 def _conclusion(found: "Sequence[BackendResult]") -> str:
-    from ccd_casadi.studies.backends import AGREE, TITLES
+    from ccd_casadi.studies.backends import TITLES, BackendOptions
 
     right = [TITLES[item.backend] for item in found if item.holds]
     wrong = [TITLES[item.backend] for item in found if item.holds is False]
     if not right:
         return "no back end has a certified design"
     if not wrong:
-        return f"agree to {100 * AGREE:g} %: {', '.join(right)}"
+        return f"agree to {100 * BackendOptions.agree:g} %: {', '.join(right)}"
     return f"disagree; the certificate is with {', '.join(right)}, not with {', '.join(wrong)}"
 
 

@@ -16,7 +16,7 @@ NOT_YET = (
     "ccd_casadi.robust.", "ccd_casadi.codesign.", "ccd_casadi.synthesis.", "ccd_casadi.sampling.",
     "ccd_casadi.deployment.", "ccd_casadi.analysis.", "ccd_casadi.limitations.", "surrogates.",
 
-    "ccd_casadi.studies.", "ccd_casadi.kernels.",
+    "ccd_casadi.kernels.",
     "ccd_casadi.case_studies.",
 )  # fmt: skip
 

@@ -37,7 +37,21 @@ PERIODS = 6.0  # of ω_b that the step is shown for
 def deploy_page(
     run: FinishedRun, found: Deployment, moved: OnHardware | None = None, index: str = ""
 ) -> c.Page:
-    """report.html of a deployment; `index`: the page that links all of the run."""
+    """Make report.html of a deployment.
+
+    Parameters
+    ----------
+    run : FinishedRun
+    found : Deployment
+    moved : OnHardware, optional
+        The simulated move on the machine.
+    index : str
+        Address of the page that links all pages of the run.
+
+    Returns
+    -------
+    Page
+    """
     meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
     head = head_of(
         f"Controller of {run_name(run.folder)}, deployed", found.passed,

@@ -35,14 +35,35 @@ def conclusion(result: Mapping[str, Any]) -> str:
 
 
 def run_name(place: Path) -> str:
-    """Of a run by its folder or its case; what `ccd new` makes is named by the folder around it."""
+    """Name a run by its folder or its case; `ccd new` names it by the folder around it.
+
+    Parameters
+    ----------
+    place : Path
+
+    Returns
+    -------
+    str
+    """
     place = place.resolve()
     names = (place.name.removesuffix(".toml"), *(parent.name for parent in place.parents))
     return next((name for name in names if name != "case"), "case")
 
 
 def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:
-    """The hardware cost with its unit, where the case gives one."""
+    """Write the hardware cost with its unit, where the case gives one.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+    """
     return f"{number(result['hardware_cost'], digits)} {result.get('cost_unit', '')}".strip()
 
 
@@ -52,13 +73,33 @@ def cost_axis(problem: CoDesignProblem) -> str:
 
 
 def theta_axes(problem: CoDesignProblem) -> list[tuple[str, str, float]]:
-    """Name, unit for the eye and the factor to it of every parameter."""
+    """List the parameters with their units on axes.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    list of (name, unit, factor)
+        Factor from the SI unit to `unit`.
+    """
     ends = zip(problem.names, problem.units, problem.upper, strict=True)
     return [(name, *display_unit(unit, upper)) for name, unit, upper in ends]
 
 
 def theta_words(result: Mapping[str, Any]) -> str:
-    """`m1 = 55 kg, m2 = 55 kg`."""
+    """Write the hardware of a design, such as `m1 = 55 kg, m2 = 55 kg`.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+
+    Returns
+    -------
+    str
+    """
     units = result.get("units", {})
     words = []
     for name, value in {**result["theta"], **result.get("fixed", {})}.items():
@@ -125,7 +166,19 @@ def _text(part: str, *known: Any, **functions: Any) -> str:
 
 
 def prediction_words(r: Mapping[str, Any], guess: str) -> str:
-    """What was predicted of the design: nothing without a surrogate, or of one of its samples."""
+    """Write what was predicted of the design; empty without a surrogate.
+
+    Parameters
+    ----------
+    r : mapping
+        Of result.json.
+    guess : str
+        The predicted value in words.
+
+    Returns
+    -------
+    str
+    """
     if r["formulation"] == "direct":
         return ""
     if r.get("verdict", {}).get("predicted", {}).get("left_out") is not None:
@@ -134,7 +187,17 @@ def prediction_words(r: Mapping[str, Any], guess: str) -> str:
 
 
 def gain_words(controller: Mapping[str, Any]) -> str:
-    """`470 kN/m`, of several channels `z: 470 kN/m, tip: …`; of `controller` of result.json."""
+    """Write the gain of a controller, such as `470 kN/m`, or `z: 470 kN/m, tip: …`.
+
+    Parameters
+    ----------
+    controller : mapping
+        `controller` of result.json.
+
+    Returns
+    -------
+    str
+    """
     if "gain" in controller:
         return with_unit(controller["gain"], spoken("N/m"), 4)
     return ", ".join(
@@ -143,8 +206,19 @@ def gain_words(controller: Mapping[str, Any]) -> str:
 
 
 def channel_words(own: Mapping[str, Any]) -> str:
-    """A channel's own bounds and how it keeps them, of an entry of `channel_bounds`.
+    """Write the bounds of a channel and how it meets them.
 
+    Parameters
+    ----------
+    own : mapping
+        An entry of `channel_bounds` of result.json.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> own = {"name": "tilt", "sensitivity_peak": 1.5, "sensitivity_peak_hz": 212.0, "S_max": 1.5,
     ...        "bandwidth_hz": 60.2, "bandwidth_ratio": 1.6}
     >>> channel_words(own)
@@ -162,7 +236,17 @@ def channel_words(own: Mapping[str, Any]) -> str:
 
 
 def loop_lines(r: Mapping[str, Any]) -> list[str]:
-    """Margins, steps, what is narrow at the bandwidth, error budget and move, for the terminal."""
+    """Write margins, steps, narrow places at the bandwidth, error budget and move for the terminal.
+
+    Parameters
+    ----------
+    r : mapping
+        Of result.json.
+
+    Returns
+    -------
+    list of str
+    """
     found = [*facts("margins", r), *facts("budget", r), *facts("move", r)]
     return [plain(f"{name.lower():14s}{', '.join(filter(None, rest))}") for name, *rest in found]
 

@@ -32,7 +32,22 @@ MOST = 12  # designs along the front that are drawn
 
 
 def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: str = "") -> c.Page:
-    """insight.html; `index`: the page that it links as that of the whole run."""
+    """Make insight.html.
+
+    Parameters
+    ----------
+    run : FinishedRun
+    front : Front
+        Hardware cost against what J counts.
+    responses : PostOptimal
+        Derivatives of the optimum to the parameters of the case.
+    index : str
+        Address of the page that links all pages of the run.
+
+    Returns
+    -------
+    Page
+    """
     problem = run.problem
     bandwidth_hz = bandwidth_of(run) / HZ
     cost = float(run.result["hardware_cost"])

@@ -138,7 +138,18 @@ class Truths:
 
 
 def read_truths(path: Path, problem: CoDesignProblem) -> Truths:
-    """Everything in the store that belongs to this problem (a folder may have seen others)."""
+    """Read everything in a store that belongs to a problem (a folder may have seen others).
+
+    Parameters
+    ----------
+    path : Path
+        samples.sqlite.
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    Truths
+    """
     designs_hash, inner_hash = hashes_of(problem)
     count = len(problem.names)
     thetas, values = [], []
@@ -158,7 +169,17 @@ def read_truths(path: Path, problem: CoDesignProblem) -> Truths:
 
 
 def bandwidth_process(processes: Sequence[object]) -> GaussianProcess | None:
-    """The surrogate of ω_b*(θ) in rad/s; None where those of a run are of other things."""
+    """Select the surrogate of ω_b*(θ) in rad/s.
+
+    Parameters
+    ----------
+    processes : sequence
+        Of a run.
+
+    Returns
+    -------
+    GaussianProcess, or None where they are of other outputs
+    """
     one = processes[0] if len(processes) == 1 else None
     return one if isinstance(one, GaussianProcess) else None
 
@@ -171,8 +192,25 @@ def landscape_data(
     theta: Sequence[float] = (0.0, 0.0),
     axes: tuple[int, int] = (0, 1),
 ) -> Landscape:
-    """The landscape over two parameters, the others as at θ; `radius` (a share of the box) of the
-    trust region about it."""
+    """Collect the landscape over two parameters, the others as at θ.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    process : GaussianProcess or None
+        Of ω_b*(θ), rad/s.
+    truths : Truths
+    radius : float
+        Of the trust region about θ, as a share of the box.
+    theta : sequence of float (n,)
+        SI.
+    axes : tuple of int
+        Numbers of the two parameters.
+
+    Returns
+    -------
+    Landscape
+    """
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     count = GRID if process is None or len(process.X) <= MANY else COARSER
     first, second = (np.linspace(lower[k], upper[k], count) for k in axes)
@@ -211,7 +249,20 @@ def landscape_data(
 def known_bandwidths(
     problem: CoDesignProblem, process: GaussianProcess | None, truths: Truths
 ) -> dict[tuple[float, ...], float]:
-    """θ -> true ω_b* in Hz; without a surrogate of it the largest of the feasible designs there."""
+    """Collect the known bandwidths over θ.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    process : GaussianProcess or None
+        Without, the largest bandwidth of the feasible designs at each θ is taken.
+    truths : Truths
+
+    Returns
+    -------
+    dict of θ to Hz
+        NaN where the inner problem is infeasible.
+    """
     if process is not None:
         return dict(zip(map(tuple, truths.theta.tolist()), truths.bandwidth_hz, strict=True))
     best: dict[tuple[float, ...], float] = {}

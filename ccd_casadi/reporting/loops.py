@@ -89,9 +89,19 @@ def sensitivity_panel(
 
 
 def gain_panels(views: Sequence[LoopView], *, bounds: bool = True) -> list[Panel]:
-    """S, KS and T: of one design the model's in a band of all plants, with what is forbidden.
+    """Make the panels of S, KS and T over frequency.
 
-    Of several designs the largest on the plants of each, with their bounds if these are asked for.
+    Parameters
+    ----------
+    views : sequence of LoopView
+        Of one design: its model in a band of all plants, with what is forbidden. Of several
+        designs: the largest gain on the plants of each.
+    bounds : bool
+        Whether the bounds of several designs are drawn.
+
+    Returns
+    -------
+    list of Panel
     """
     return [_gain_panel(views, i, bounds) for i in range(len(NAMES))]
 
@@ -153,7 +163,20 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
 def figure_gains(
     views: Sequence[LoopView], *, bounds: bool = True, compliance: bool = False
 ) -> Lines:
-    """S over the full width, KS and T below it; of one design GS where it is bounded, or asked."""
+    """Make the figure of S over the full width, with KS and T below it.
+
+    Parameters
+    ----------
+    views : sequence of LoopView
+    bounds : bool
+        As in `gain_panels`.
+    compliance : bool
+        Draw GS, which one design with a bound of it has in any case.
+
+    Returns
+    -------
+    Lines
+    """
     S, *others = gain_panels(views, bounds=bounds)
     bounded = len(views) == 1 and views[0].bounded.compliance_max is not None
     more = [(compliance_panel(views[0]),)] if bounded or compliance else []

@@ -44,10 +44,18 @@ class Lumped:
 
 
 def lumped(system: Mechanics) -> Lumped | None:
-    """The masses and springs that M and K are of; None where they are of something else.
+    """Find the masses and springs that M and K consist of.
 
-    M is diagonal, K has no positive entry beside its diagonal and no negative row sum, and some
-    spring joins two masses: matrices in modal coordinates have none.
+    M must be diagonal, K without a positive entry beside its diagonal or a negative row sum, and
+    some spring must join two masses: matrices in modal coordinates have none.
+
+    Parameters
+    ----------
+    system : Mechanics
+
+    Returns
+    -------
+    Lumped, or None
     """
     n = len(system.M)
     m, K = np.diag(system.M), system.K
@@ -91,9 +99,19 @@ def lumped_svg(found: Lumped, modal: ModalPlant, reference: float) -> str:
 def lumped_machine(
     system: Mechanics, modal: ModalPlant, reference: float | None = None
 ) -> Picture | Table:
-    """Masses and springs with their modes, or a table of the modes.
+    """Draw masses and springs with their modes, or tabulate the modes.
 
-    `reference`: see `lumped_svg`; the largest mass by itself.
+    Parameters
+    ----------
+    system : Mechanics
+    modal : ModalPlant
+        The same plant.
+    reference : float, optional
+        Mass in kg that is drawn at full size; by default the largest.
+
+    Returns
+    -------
+    Picture or Table
     """
     found = lumped(system)
     if found is None:

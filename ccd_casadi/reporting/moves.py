@@ -199,7 +199,20 @@ def _held(made: Move) -> float:
 
 
 def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
-    """How a move ends, and what is left of its error after `until` s, where a figure ends."""
+    """Write how a move ends, and the error that is left after the end of its figure.
+
+    Parameters
+    ----------
+    name : str
+    made : sequence of Move
+        On each plant.
+    until : float
+        End of the figure, s.
+
+    Returns
+    -------
+    str
+    """
     settled, peak = (max(getattr(m, of) for m in made) for of in ("settled", "peak_error"))
     late = [m for m in made if np.isinf(m.settled)]
     when = "stays within its window" if not settled else f"settled after {with_unit(settled, 's')}"

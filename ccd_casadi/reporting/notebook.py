@@ -32,7 +32,21 @@ _figures = count()  # ids in an SVG are the whole notebook's
 
 @singledispatch
 def html_of(item: object) -> str:
-    """An object as HTML for a notebook's cell, its rules of style confined to that."""
+    """Write an object as HTML for a notebook's cell, with its style confined to the cell.
+
+    Parameters
+    ----------
+    item : object
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    TypeError
+        Its type has no form in a notebook.
+    """
     raise TypeError(f"{type(item).__name__} has no form in a notebook")
 
 

@@ -27,8 +27,25 @@ def nyquist_panel(
     hz: Array, loci: Sequence[np.ndarray], S_max: float, height: float = 3.0,
     names: tuple[str, str] = ("", ""), others: str = GREEN,
 ) -> Panel:  # fmt: skip
-    """Loci (k,) complex over Hz, the first the model's; beside one other panel of this height in
-    inches. `names`: of the first, and of the others. The first has its direction and frequencies.
+    """Make a Nyquist plot; it is half a page wide.
+
+    Parameters
+    ----------
+    hz : array (k,)
+        Frequencies, Hz.
+    loci : sequence of complex arrays (k,)
+        The first is the model's: its direction and frequencies are marked.
+    S_max : float
+    height : float
+        Inches.
+    names : tuple of str
+        Of the first locus, and of the others.
+    others : str
+        Colour of the others.
+
+    Returns
+    -------
+    Panel
     """
     circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
     curves = [
@@ -72,7 +89,19 @@ def _along(hz: Array, locus: np.ndarray, half: float) -> tuple[list[Curve], list
 
 
 def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:
-    """Eigenvalues of L (k, p, p) as p continuous curves (k, p), NaN where |λ| > `far`."""
+    """Sort the eigenvalues of L into continuous curves.
+
+    Parameters
+    ----------
+    L : complex array (k, p, p)
+    far : float
+        |λ| beyond which a locus is not drawn.
+
+    Returns
+    -------
+    complex array (k, p)
+        NaN where |λ| > far.
+    """
     values = np.linalg.eigvals(L)
     if values.shape[1] > 1:
         for i in range(1, len(values)):
@@ -116,8 +145,23 @@ def bode(loop: LoopView, channels: Sequence[LoopChannel] = ()) -> Figure:
 def loop_panels(
     loop: LoopView, parts: Parts | None = None, stable: bool = True
 ) -> tuple[Panel, Panel]:
-    """|L| and its phase: of one channel the model's in a band of all plants, with crossover and
-    least margins drawn in where it is stable; of several every channel, or every eigenvalue."""
+    """Make the panels of |L| and its phase.
+
+    Of one channel they have the model in a band of all plants, with crossover and least margins;
+    of several every channel, or every eigenvalue.
+
+    Parameters
+    ----------
+    loop : LoopView
+    parts : mapping, optional
+        As `scalar_parts` returns it.
+    stable : bool
+        Without, no margins are drawn.
+
+    Returns
+    -------
+    Panel, Panel
+    """
     several = {name: part[2] for name, part in (parts or {}).items()} if not loop.scalar else {}
     L = loop.open[:, :, 0, 0] if loop.scalar else loci_of(loop.open[0], np.inf).T
     sizes, phases = np.abs(L), phase_deg(L.T).T
@@ -179,8 +223,18 @@ def _gap(hz: float, one: float, other: float) -> Curve:
 
 
 def size_panels(loop: LoopView, parts: Parts | None = None) -> tuple[Panel, Panel]:
-    """|G| with its resonances marked, and |K|: every one of several channels, or all singular
-    values."""
+    """Make the panels of |G| with its resonances marked, and of |K|.
+
+    Parameters
+    ----------
+    loop : LoopView
+    parts : mapping, optional
+        Channels as `scalar_parts` returns them; without, all singular values are drawn.
+
+    Returns
+    -------
+    Panel, Panel
+    """
     parts = parts or {}
     G, K = _singular_values(loop.plant), _singular_values(loop.controller)
     at = (bandwidth_level(loop.bandwidth_hz),)

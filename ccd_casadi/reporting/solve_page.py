@@ -64,7 +64,21 @@ def write_report(
     folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution",
     workers: Pool | None = None,
 ) -> Path:  # fmt: skip
-    """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
+    """Write `folder`/report.html, atomically; the folder's samples.sqlite is read.
+
+    Parameters
+    ----------
+    folder : Path
+    case : Case
+    problem : CoDesignProblem
+    solution : Solution
+    workers : Pool, optional
+        They draw a chapter each.
+
+    Returns
+    -------
+    Path
+    """
     path = folder / "report.html"
     publish(folder, path, solve_page(folder, case, problem, solution), workers)
     return path
@@ -82,7 +96,16 @@ def solve_page(folder: Path, case: Case, problem: CoDesignProblem, solution: "So
 
 
 def page_of_run(run: FinishedRun) -> c.Page:
-    """The report of a run that kept none, as far as its folder holds it: the design by itself."""
+    """Make the report of a run that kept none, as far as its folder holds it: the design alone.
+
+    Parameters
+    ----------
+    run : FinishedRun
+
+    Returns
+    -------
+    Page
+    """
     parts = design_parts(run.problem, run.problem, run.theta, run_view(run), run.result)
     chapters = []
     for name in (name for name in ORDER if name in parts):
@@ -186,7 +209,19 @@ def _theta(
 def stage_chapters(
     problem: CoDesignProblem, thetas: Mapping[str, Sequence[float]]
 ) -> list[c.Chapter]:
-    """The plant's drawing and its mode shapes at the last of `thetas`, where it has them."""
+    """Make the chapters of a plant's drawing and of its mode shapes at the last θ.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    thetas : mapping
+        Name of a design -> θ (n,), SI.
+
+    Returns
+    -------
+    list of Chapter
+        Empty where the plant has neither.
+    """
     plant, found = plant_of(problem), []
     if plant.drawing is not None and thetas:
         found.append(c.Chapter("The stage, before and after", (plant.drawing(thetas),)))

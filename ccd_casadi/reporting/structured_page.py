@@ -118,7 +118,20 @@ HEIGHT = 3.0  # inches of a row
 
 
 def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> c.Page:
-    """report.html of a stable design; `answer` is what `inner` prints of it."""
+    """Make report.html of a stable design on a measured response.
+
+    Parameters
+    ----------
+    case : MeasuredCase
+    controller : StateSpace
+        SI.
+    answer : mapping
+        What `inner` prints of it.
+
+    Returns
+    -------
+    Page
+    """
     good = answer["status"] == "verified"
     lines = f"{len(case.responses[0].hz)} lines of {case.file}"
     norms = answer.get("models")

@@ -43,7 +43,17 @@ TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
 
 
 def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
-    """The lines of result.json; none of a run that has no design, or is older than verdicts."""
+    """Read the lines of the verdict of result.json.
+
+    Parameters
+    ----------
+    result : mapping
+
+    Returns
+    -------
+    tuple of VerdictLine
+        Empty for a run without a design, or older than verdicts.
+    """
     verdict = result.get("verdict")
     if not isinstance(verdict, Mapping):
         return ()
@@ -56,7 +66,17 @@ def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
 
 
 def worst_state(result: Mapping[str, Any]) -> State:
-    """Failed before warned before passed; what is unknown counts as neither."""
+    """Find the worst state of a verdict: failed, then warned, then passed.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json; an unknown line counts as none of them.
+
+    Returns
+    -------
+    State
+    """
     states = {line.state for line in lines_of(result)}
     return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
 
@@ -71,7 +91,17 @@ def unproven(result: Mapping[str, Any]) -> str | None:
 
 
 def terminal_lines(result: Mapping[str, Any]) -> list[str]:
-    """`survives      warned   stable for ...`, wrapped under their words."""
+    """Write the verdict for the terminal, wrapped.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+
+    Returns
+    -------
+    list of str
+    """
     lines = [f"{line.name:14s}{line.state:9s}{line.words}" for line in lines_of(result)]
     return [wrapped(line, columns(sys.stdout)) for line in lines]
 
@@ -115,8 +145,17 @@ def with_verdict_of(text: str, result: Mapping[str, Any], *, whole: bool) -> str
 
 
 def advice(result: Mapping[str, Any]) -> str:
-    """The decision: build this or not, and what comes next; without a verdict only what to look at
-    in the loop."""
+    """Write the decision: build this or not, and what comes next.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json. Without a verdict only concerns about the loop are written.
+
+    Returns
+    -------
+    str
+    """
     states = {line.name: line.state for line in lines_of(result)}
     failed = [name for name, state in states.items() if state == State.FAILED]
     looked_at = loop_concerns(result)
@@ -188,7 +227,17 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
 
 
 def head_words(result: Mapping[str, Any]) -> str:
-    """What stands beside the badge of a verified run: never more than its lines say."""
+    """Write what the badge of a verified run stands for, never more than the lines of its verdict.
+
+    Parameters
+    ----------
+    result : mapping
+        Of result.json.
+
+    Returns
+    -------
+    str
+    """
     warned, failed = (
         [line.name for line in lines_of(result) if line.state == state]
         for state in (State.WARNED, State.FAILED)
@@ -219,7 +268,17 @@ FILES = {
 
 
 def index_of(folder: Path) -> str:
-    """What a page in this folder links as the page of all pages of a run, here or one above."""
+    """Find the page that links all pages of a run, in a folder or in the one above.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    str
+        Its address; empty where there is none.
+    """
     for place, link in ((folder, INDEX), (folder.resolve().parent, f"../{INDEX}")):
         if (place / "result.json").exists():
             return link
@@ -227,16 +286,31 @@ def index_of(folder: Path) -> str:
 
 
 def publish(folder: Path, path: Path, page: Page, workers: Pool | None = None) -> None:
-    """Write a page about the run in `folder` with what it shows, and the run's index anew."""
+    """Write a page about a run with what it shows, and update the run's index.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    path : Path
+        Of the page.
+    page : Page
+    workers : Pool, optional
+        They draw a chapter each.
+    """
     write_page(path, page, workers)
     write_index(folder)
 
 
 def write_index(folder: Path) -> None:
-    """Write index.html anew after a page was added; nothing where the folder holds no run.
+    """Write index.html again after a page was added; nothing where the folder holds no run.
 
-    Links are to what the folder holds now. The verdict, to which `deploy` and `robustness` write
-    their lines, is put anew into every page that shows it.
+    It links what the folder holds now. The verdict, to which `deploy` and `robustness` write their
+    lines, is updated in every page that shows it.
+
+    Parameters
+    ----------
+    folder : Path
     """
     try:
         result = json.loads((folder / "result.json").read_text(encoding="utf-8"))

@@ -35,10 +35,23 @@ from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
-STARTS = (1e3, 1e6)  # finite γ to bisect from; the second where the first is too low
 BISECT, SUBOPTIMAL = 1, 4  # SB10AD's jobs
-AGREE = 1e-3  # relative: what an interior-point method is good for
-BELOW = 1e-6  # relative: a claim this far below the bound is wrong
+
+
+@dataclass(frozen=True)
+class BackendOptions:
+    """Relative tolerances in the comparison of back ends.
+
+    Attributes
+    ----------
+    agree : float
+        Distance from the least γ that counts as none: what an interior-point method reaches.
+    below : float
+        Distance below the lower bound from which a claim is wrong.
+    """
+
+    agree: float = 1e-3
+    below: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -106,14 +119,19 @@ class Attempt:
 Solver = Callable[..., Attempt]
 
 
-def solve_slicot(plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt:
-    """Bisection for γ_opt (job 1), then a controller at gamma_backoff·γ_opt (job 4)."""
+def solve_slicot(
+    plant: StandardPlant, *, gamma_backoff: float = 1.02, starts: tuple[float, ...] = (1e3, 1e6)
+) -> Attempt:
+    """Bisection for γ_opt (job 1), then a controller at gamma_backoff·γ_opt (job 4).
+
+    It bisects from the first γ of `starts`; from the next where that is too low.
+    """
     whole = balance(plant).whole()
     p, m = plant.C2.shape[0], plant.B2.shape[1]
     size = (len(whole.A), whole.B.shape[1], whole.C.shape[0], m, p)
     parts = (whole.A, whole.B, whole.C, whole.D)
     reason = ""
-    for start in STARTS:
+    for start in starts:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # ill-conditioning is for the certificate to judge
@@ -135,10 +153,20 @@ TITLES = {RICCATI: "one Riccati (ours)", SLICOT: "SB10AD (slycot)"}
 
 @dataclass(frozen=True)
 class BackendResult:
-    """γ_opt as the back end claims it, and its design, measured; None where it made none.
+    """The claim of a back end, and its design, measured.
 
-    `words` say why there is no design, or how the certificate judged the one there is; `holds`
-    (`verdicts`) whether claim and design do: None where there is no claim.
+    Attributes
+    ----------
+    backend : str
+    gamma_opt : float
+        As the back end claims it.
+    design : Design or None
+        None where it made none.
+    words : str
+        Why there is no design, or the result of the certificate.
+    seconds : float
+    holds : bool or None
+        Whether claim and design hold (`verdicts`); None where there is no claim.
     """
 
     backend: str
@@ -164,9 +192,27 @@ def synthesise_with(
     runner: Runner | None = None,
     limit: float = 60.0,
 ) -> BackendResult:
-    """One synthesis by "riccati" or one of `SOLVERS`, certified; ω_low in rad/s.
+    """Synthesise with one back end and certify the result.
 
-    With a `runner` those run in its process and are killed after `limit` seconds.
+    Parameters
+    ----------
+    backend : str
+        "riccati" or one of `SOLVERS`.
+    plant : ScaledPlant
+    weights : Weights
+        SI.
+    omega_low : float
+        Frequency of `S_low`, rad/s.
+    gamma_backoff : float
+        The controller is synthesised at this multiple of γ_opt.
+    runner : Runner, optional
+        Process for one of `SOLVERS`, killed after `limit`.
+    limit : float
+        s.
+
+    Returns
+    -------
+    BackendResult
     """
     began = time.perf_counter()
     if backend == RICCATI:
@@ -199,22 +245,36 @@ def _timed(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[A
     return attempt, time.perf_counter() - began
 
 
-def verdicts(results: Sequence[BackendResult]) -> list[BackendResult]:
-    """Each claim judged by the certificates and by γ_jω of the package's own design."""
+def verdicts(
+    results: Sequence[BackendResult], *, options: BackendOptions = BackendOptions()
+) -> list[BackendResult]:
+    """Check each claim by the certificates and by γ_jω of the package's design.
+
+    Parameters
+    ----------
+    results : sequence of BackendResult
+        That of "riccati" among them.
+    options : BackendOptions
+
+    Returns
+    -------
+    list of BackendResult
+        With `holds` and `words`.
+    """
     ours = next(item for item in results if item.backend == RICCATI)
     bound = ours.design.figures.gamma_lower_bound if ours.design is not None else math.nan
     proven = [item.gamma_opt for item in results if item.certified and item.gamma_opt > 0.0]
-    lowest = min((g for g in proven if not g < bound * (1.0 - BELOW)), default=math.nan)
+    lowest = min((g for g in proven if not g < bound * (1.0 - options.below)), default=math.nan)
 
     def judged(item: BackendResult) -> BackendResult:
         if item.design is None:
             return item
-        if item.gamma_opt < bound * (1.0 - BELOW):
+        if item.gamma_opt < bound * (1.0 - options.below):
             short = 100.0 * (1.0 - item.gamma_opt / bound)
             words = f"wrong: claims {short:.2g} % less than any controller reaches ({bound:.6g})"
         elif not item.certified:
             words = f"not certified: {item.words}"
-        elif item.gamma_opt > lowest * (1.0 + AGREE):
+        elif item.gamma_opt > lowest * (1.0 + options.agree):
             over = 100.0 * (item.gamma_opt / lowest - 1.0)
             words = f"certified, but {over:.2g} % above the least"
         else:

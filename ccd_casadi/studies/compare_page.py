@@ -24,7 +24,19 @@ from ccd_casadi.support.text import HZ, number
 
 
 def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> c.Page:
-    """report.html of a comparison; reads the folder's samples."""
+    """Make report.html of a comparison; the folder's samples are read.
+
+    Parameters
+    ----------
+    folder : Path
+    comparison : Comparison
+    answer : dict
+        compare.json.
+
+    Returns
+    -------
+    Page
+    """
     problem, found = comparison.problem, answer["conclusions"]
     best = found["best"]
     chapters = [c.Chapter("The methods", _methods(problem, answer))]

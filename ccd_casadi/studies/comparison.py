@@ -41,7 +41,6 @@ from surrogates import latin_hypercube
 PUBLISHED: dict[str, dict[str, Any]] = json.loads(package_text("studies/published.json"))
 
 
-EQUAL = 1e-6  # relative difference of J that counts as none
 LABELS = {
     "nested": "nested",
     "lifted": "lifted",
@@ -53,14 +52,19 @@ LABELS = {
 }
 
 
-def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Figures and sentences; entries without a feasible design are left out of the ranking."""
+def conclusions(
+    problem: CoDesignProblem, methods: dict[str, dict[str, Any]], *, equal: float = 1e-6
+) -> dict[str, Any]:
+    """Figures and sentences; entries without a feasible design are left out of the ranking.
+
+    Two J are equal where they differ by less than `equal` (relative).
+    """
     solved = {name: f for name, f in methods.items() if f.get("objective") is not None}
     if not solved:
         return {"best": None, "sentences": ["No method found a feasible design."]}
     ranked = sorted(solved, key=lambda name: solved[name]["objective"])
     best = solved[ranked[0]]["objective"]
-    near = [n for n in ranked if solved[n]["objective"] <= best + EQUAL * abs(best)]
+    near = [n for n in ranked if solved[n]["objective"] <= best + equal * abs(best)]
     cheapest = min(near, key=lambda name: solved[name]["syntheses_to_optimum"])
     answer: dict[str, Any] = {"best": cheapest, "best_objective": best, "equally_good": near}
     sentences = [
@@ -70,7 +74,7 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     ]
     for name in ("steepest_descent", "steepest_descent_total"):
         if name in solved:
-            found, words = _descent(problem, solved[name], solved[cheapest], name)
+            found, words = _descent(problem, solved[name], solved[cheapest], name, equal)
             answer[name] = found
             sentences += words
     against = [name for name in ranked if name in ("sequential", "sequential_global")]
@@ -103,7 +107,7 @@ def _beside(figures: dict[str, Any]) -> str:
 
 
 def _descent(
-    problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str
+    problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str, equal: float
 ) -> tuple[dict[str, Any], list[str]]:
     """How far a descent ends from the best, and what stopped it."""
     gap = run["objective"] - best["objective"]
@@ -122,7 +126,7 @@ def _descent(
         f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, "
         f"{ratio:.0f} times as many; all its runs together took {run['syntheses_of_all_runs']}."
     ]
-    if gap > EQUAL * abs(best["objective"]):
+    if gap > equal * abs(best["objective"]):
         words.append(
             f"It stopped: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
             "from the best one."
@@ -176,7 +180,17 @@ class _Setting:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All methods on one case, and the descents behind the best of each gradient."""
+    """All methods on one case.
+
+    Attributes
+    ----------
+    case : Case
+    problem : CoDesignProblem
+    methods : tuple of Method
+    descents : tuple of Descent
+        Of which the best of each gradient is among the methods.
+    seconds : float
+    """
 
     case: Case
     problem: CoDesignProblem
@@ -360,7 +374,18 @@ def _resonance(problem: CoDesignProblem, theta: tuple[float, ...]) -> float:
 
 
 def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
-    """compare.json."""
+    """Make the content of compare.json.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    seed : int
+
+    Returns
+    -------
+    dict
+        Plain JSON values.
+    """
     problem, methods = comparison.problem, comparison.methods
     entries = {method.name: method.figures for method in methods}
     descents = [

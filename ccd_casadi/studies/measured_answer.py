@@ -18,7 +18,20 @@ from ccd_casadi.support.text import HZ
 def measured_answer(
     case: MeasuredCase, *, seed: int, tell: Tell = silent
 ) -> tuple[InnerAnswer, MeasuredDesign]:
-    """The structure of the case on its measured lines, and the design behind the answer."""
+    """Design the structure of a case on its measured lines.
+
+    Parameters
+    ----------
+    case : MeasuredCase
+    seed : int
+        Of the multi-start search.
+    tell : callable
+        Takes lines of progress.
+
+    Returns
+    -------
+    InnerAnswer, MeasuredDesign
+    """
     made = design_on_data(
         case.responses, case.structure, case.bounds, period=case.period, starts=case.starts,
         seed=seed, progress=tell,
@@ -27,7 +40,17 @@ def measured_answer(
 
 
 def answer_of(case: MeasuredCase, design: MeasuredDesign) -> InnerAnswer:
-    """What a design on the lines of a case says of itself."""
+    """Describe a design on the lines of a case under the keys of `inner`.
+
+    Parameters
+    ----------
+    case : MeasuredCase
+    design : MeasuredDesign
+
+    Returns
+    -------
+    InnerAnswer
+    """
     hz = case.responses[0].hz
     plant = {"file": case.file, "lines": len(hz), "first_hz": hz[0], "last_hz": hz[-1]}
     figures: dict[str, Any] = {"plant": plant, "theta": {}, "words": design.words, "syntheses": 1}

@@ -35,8 +35,6 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 
-LOCAL_POINTS = (7, 7)
-LOCAL_FACTOR = 1.25  # the small range reaches from ω/1.25 to 1.25 ω
 STATUS = {True: "verified", False: "not_verified"}
 AnyDesign = Any  # Sensitivities or SectionsDesign: what a baseline gives and takes back
 
@@ -160,9 +158,22 @@ class StructuredBaseline(Baseline):
 
 
 def case_to_compare(path: Path, command: str) -> tuple[Case, CoDesignProblem]:
-    """A case whose methods can be compared: it counts the bandwidth, and lists no values.
+    """Read a case whose methods can be compared: it counts the bandwidth, and lists no values.
 
-    Raises UserError of one line that names the `command` where it is another.
+    Parameters
+    ----------
+    path : Path
+    command : str
+        Named in the message.
+
+    Returns
+    -------
+    Case, CoDesignProblem
+
+    Raises
+    ------
+    UserError
+        It is another case.
     """
     case = load_case(path)
     problem = problem_of(case)
@@ -186,17 +197,25 @@ BASELINES: dict[type[ControllerProblem], type[Baseline]] = {
 
 
 def _sweep(
-    problem: CoDesignProblem, theta: Array, around: tuple[float, float] | None
+    problem: CoDesignProblem,
+    theta: Array,
+    around: tuple[float, float] | None,
+    *,
+    points: tuple[int, int] = (7, 7),
+    factor: float = 1.25,
 ) -> tuple[Sensitivities | None, int]:
-    """The best feasible design of a sweep, wide or small; and the syntheses that it took."""
+    """The best feasible design of a sweep, and the syntheses that it took.
+
+    Around (ω_S, ω_T) the sweep has `points` from ω/factor to factor ω.
+    """
     inner = problem.inner
     local = inner
     if around is not None:
         ranges = [
-            (max(low, centre / LOCAL_FACTOR), min(high, centre * LOCAL_FACTOR))
+            (max(low, centre / factor), min(high, centre * factor))
             for (low, high), centre in zip((inner.omega_S, inner.omega_T), around, strict=True)
         ]
-        local = replace(inner, omega_S=ranges[0], omega_T=ranges[1], sweep_points=LOCAL_POINTS)
+        local = replace(inner, omega_S=ranges[0], omega_T=ranges[1], sweep_points=points)
     plant = scaled_plant(problem, tuple(theta))
     rows = sweep(plant, problem.weights, *local.axes(), **inner.synthesis_options)
     feasible: list[DesignFigures] = [row for row in rows if inner.feasible(row)]

@@ -1,6 +1,6 @@
 """What `tune` is given: files, responses and models, each as lines that a search can run on."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +22,39 @@ from ccd_casadi.support.terminal import Tell
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis import interchange
 
-PER_DECADE = 60
-BELOW, ABOVE = 3e-3, 0.98  # first line over the slowest root, last line over half the rate
-ON_AXIS = 1e-8  # |Re p| over |p| up to which a pole has no damping
-BESIDE = 1e-3  # half width that it is taken to have for its lines
-HIDDEN = 1e-12  # relative: how near a mode is to one that is not driven or not seen
-NEARBY = np.linspace(0.98, 1.02, 9)
-APART = 1e-6  # relative, of lines
-AT_REST = 1e-7  # of the largest root: below, it lies at 0
-
 Plant = MeasuredResponse | StateSpace
+
+
+@dataclass(frozen=True)
+class LineOptions:
+    """Numbers of the lines on which a model is tuned.
+
+    Attributes
+    ----------
+    per_decade : int
+        Lines a decade, besides those around roots.
+    lowest, highest : float
+        First line over the slowest root, last line over half the rate.
+    on_axis : float
+        |Re p|/|p| up to which a pole has no damping.
+    half_width : float
+        Relative half width that such a pole is given for its lines.
+    hidden : float
+        Relative singular value below which a mode is not driven, or not measured.
+    apart : float
+        Least relative distance of two lines.
+    at_rest : float
+        Share of the largest root below which a root lies at 0.
+    """
+
+    per_decade: int = 60
+    lowest: float = 3e-3
+    highest: float = 0.98
+    on_axis: float = 1e-8
+    half_width: float = 1e-3
+    hidden: float = 1e-12
+    apart: float = 1e-6
+    at_rest: float = 1e-7
 
 
 def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
@@ -49,7 +72,7 @@ def read_plant(item: Any, delay: float, tell: Tell) -> tuple[Plant, float]:
 
 
 def as_lines(
-    item: Plant, rate_hz: float | None, delay: float
+    item: Plant, rate_hz: float | None, delay: float, *, options: LineOptions = LineOptions()
 ) -> tuple[MeasuredResponse, StateSpace | None]:
     """The response as the controller sees it; of a model also itself in discrete time."""
     if isinstance(item, MeasuredResponse):
@@ -75,23 +98,24 @@ def as_lines(
     else:
         whole = delay_parts(T, delay)[0]
         model = delayed(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)
-    _require_seen(system)
+    _require_seen(system, options)
     top, rates = np.pi / T, system.rates
-    rest = np.abs(rates) <= AT_REST * np.abs(rates).max(initial=0.0)
+    rest = np.abs(rates) <= options.at_rest * np.abs(rates).max(initial=0.0)
     zeros = system.rates_of(system.zeros(1.0 if own else top))
-    if (np.abs(zeros) <= AT_REST * top).any():
+    if (np.abs(zeros) <= options.at_rest * top).any():
         raise UserError("the plant has a zero at 0: no controller holds its output at rest")
     roots = np.concatenate([rates[~rest], zeros, [top]])
-    low = BELOW * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
+    low = options.lowest * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
     roots = _folded(roots, T)
-    undamped = np.abs(rates.real) <= ON_AXIS * np.abs(rates)
+    undamped = np.abs(rates.real) <= options.on_axis * np.abs(rates)
     axis = _folded(rates[undamped & ~rest & (rates.imag > 0.0)], T).imag
-    narrow = np.abs(roots.real) <= ON_AXIS * np.abs(roots)
-    widened = BESIDE * np.abs(roots[narrow]) + 1j * roots[narrow].imag
+    narrow = np.abs(roots.real) <= options.on_axis * np.abs(roots)
+    widened = options.half_width * np.abs(roots[narrow]) + 1j * roots[narrow].imag
     beside = root_flanks(widened, [x for x in RootOptions.flanks if x])
-    omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),
-                           root_flanks(roots[~narrow]), beside, apart=APART)  # fmt: skip
-    close = np.abs(omega[:, None] - axis) <= 0.1 * BESIDE * axis
+    count = int(options.per_decade * np.log10(top / low))
+    omega = frequency_grid(low, options.highest * top, count, root_flanks(roots[~narrow]), beside,
+                           apart=options.apart)  # fmt: skip
+    close = np.abs(omega[:, None] - axis) <= 0.1 * options.half_width * axis
     omega = omega[~close.any(axis=1)]
     unstable = int((rates[~rest & ~undamped].real > 0.0).sum())
     G = model.response(omega)
@@ -109,7 +133,7 @@ def _folded(rates: np.ndarray, T: float) -> np.ndarray:
     )
 
 
-def _require_seen(system: StateSpace) -> None:
+def _require_seen(system: StateSpace, options: LineOptions) -> None:
     """Raises UserError where a mode that is not stable is not driven or not measured: Hautus."""
     if not system.B.any() or not system.C.any():
         raise UserError("the plant is 0: no input moves what is measured")
@@ -119,11 +143,11 @@ def _require_seen(system: StateSpace) -> None:
              "seen at no output": (C * (size / np.linalg.norm(C, 2)), 0)}  # fmt: skip
     rates = np.log(system.poles.astype(complex) + 0j) if system.period else system.poles
     for root, rate in zip(system.poles, rates, strict=True):
-        if not rate.real >= -ON_AXIS * max(abs(rate), AT_REST * size):
+        if not rate.real >= -options.on_axis * max(abs(rate), options.at_rest * size):
             continue
         for words, (beside, axis) in parts.items():
             joined = np.concatenate([root * np.eye(len(A)) - A, beside], axis=axis)
-            if np.linalg.svd(joined, compute_uv=False)[-1] <= HIDDEN * size:
+            if np.linalg.svd(joined, compute_uv=False)[-1] <= options.hidden * size:
                 at = f"{abs(rate) / (system.period or 1.0) / HZ:.4g} Hz"
                 raise UserError(f"a mode of the plant at {at} is not stable and {words}: no "
                                 "controller changes it; leave it out")  # fmt: skip
@@ -147,12 +171,17 @@ def _of_file(path: Path) -> MeasuredResponse | interchange.NamedSystem:
 
 
 def with_lines_near(
-    response: MeasuredResponse, G: StateSpace, omega: list[float]
+    response: MeasuredResponse,
+    G: StateSpace,
+    omega: list[float],
+    *,
+    options: LineOptions = LineOptions(),
 ) -> MeasuredResponse:
     """With lines where |S| was too large between two, or the bandwidth ends, and nearby."""
-    more = (np.array(omega)[:, None] * NEARBY).ravel() / HZ
+    nearby = np.linspace(0.98, 1.02, 9)  # nine lines within 2 %
+    more = (np.array(omega)[:, None] * nearby).ravel() / HZ
     known = response.hz
-    hz = frequency_grid(float(known[0]), float(known[-1]), 2, known, more, apart=APART)
+    hz = frequency_grid(float(known[0]), float(known[-1]), 2, known, more, apart=options.apart)
     axis = np.array(response.undamped_hz)
-    hz = hz[~(np.abs(hz[:, None] - axis) <= 0.1 * BESIDE * axis).any(axis=1)]
+    hz = hz[~(np.abs(hz[:, None] - axis) <= 0.1 * options.half_width * axis).any(axis=1)]
     return replace(response, hz=hz, G=G.response(HZ * hz).reshape(len(hz), *response.G.shape[1:]))

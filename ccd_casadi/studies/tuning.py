@@ -32,21 +32,49 @@ from ccd_casadi.lti.state_space import (
     zoomed,
 )
 from ccd_casadi.plants.measured import MeasuredResponse
-from ccd_casadi.studies.tuned_plants import Plant, as_lines, read_plant, with_lines_near
+from ccd_casadi.studies.tuned_plants import (
+    LineOptions,
+    Plant,
+    as_lines,
+    read_plant,
+    with_lines_near,
+)
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
 
-NOTCHES = 3  # at most, where none are asked for
-INSIDE = 2e-3  # of S_max - 1: so far inside it the lines of a model are kept
-BELOW, ABOVE = 3e-3, 0.98  # first line over the slowest root, last line over half the rate
-GIVEN_UP = 0.03  # of the bandwidth, for integral gain
-ROUNDS = 5  # of adding lines where the loop on the model is worse than on the lines
-SLOWER = 1e-3  # relative: of the bandwidth between the lines of a model, then more are added there
-FINE, CLOSER = 200, 41  # frequencies a decade, and about a crossing, of a loop on a model
-APART = 1e-6  # relative, of lines
+
+@dataclass(frozen=True)
+class TuningOptions:
+    """Numbers of `tune`.
+
+    Attributes
+    ----------
+    most_notches : int
+        Biquads where no structure is given.
+    inside : float
+        Share of S_max - 1 by which S_max is reduced on the lines of a model.
+    given_up : float
+        Share of the bandwidth that is given up for integral gain.
+    rounds : int
+        Rounds of adding lines where the loop on the model is worse than on the lines.
+    slower : float
+        Relative loss of bandwidth between the lines of a model from which lines are added.
+    per_decade : int
+        Frequencies a decade of a loop on a model.
+    about_crossing : int
+        Frequencies about its crossing.
+    """
+
+    most_notches: int = 3
+    inside: float = 2e-3
+    given_up: float = 0.03
+    rounds: int = 5
+    slower: float = 1e-3
+    per_decade: int = 200
+    about_crossing: int = 41
 
 
 NOT_JUDGED = Judgement(0, {}, None, "no usable controller was found to judge")
@@ -100,6 +128,7 @@ def tune(
     seed: int = 0,
     progress: Tell | None = None,
     workers: Pool | None = None,
+    options: TuningOptions = TuningOptions(),
 ) -> Tuned:
     """The largest bandwidth of integrator, lead, notches and a second-order roll-off.
 
@@ -124,6 +153,8 @@ def tune(
         Of the multi-start search.
     progress, workers
         As for `synthesise_sections`; a pool of processes.
+    options : TuningOptions
+        Numbers of the method.
 
     Returns
     -------
@@ -163,25 +194,26 @@ def tune(
         for one, G in read
     )  # fmt: skip
     if structure is None:
-        biquads = min(NOTCHES, len(responses[0].resonances))
+        biquads = min(options.most_notches, len(responses[0].resonances))
         structure = Structure(biquads=biquads, least_damping=0.1)
     periods = [model.period for model in models if model is not None]
     period = 1.0 / rate_hz if rate_hz else periods[0] if periods else None
     bounds = Bounds(S_max, S_max, HZ * max(one.hz[0] for one in responses), shape)
     names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
     name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
-    inside, initial = INSIDE * (S_max - 1.0) if periods else 0.0, None
-    for _ in range(ROUNDS):
+    inside, initial = options.inside * (S_max - 1.0) if periods else 0.0, None
+    for _ in range(options.rounds):
         aim = replace(bounds, S_max=S_max - inside)
         design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
-                                effort=effort, given_up=GIVEN_UP, initial=initial, progress=tell,
-                                workers=workers)  # fmt: skip
+                                effort=effort, given_up=options.given_up, initial=initial,
+                                progress=tell, workers=workers)  # fmt: skip
         if not design.usable or not periods:
             break
-        loops = _loops_on(models, design.controller, bounds, structure.integrator)
+        loops = _loops_on(models, design.controller, bounds, structure.integrator, options)
         found = [loop for loop in loops if loop is not None]
         worse = [loop for loop in found if not loop.norm <= S_max]
-        slower = [loop for loop in found if loop.bandwidth < (1.0 - SLOWER) * design.bandwidth]
+        least = (1.0 - options.slower) * design.bandwidth
+        slower = [loop for loop in found if loop.bandwidth < least]
         if not worse and not slower:
             break
         inside, initial = inside * (2.0 if worse else 1.0), design.kappa
@@ -190,7 +222,7 @@ def tune(
                           for one, G in zip(responses, models, strict=True))  # fmt: skip
     norms: tuple[float | None, ...] = tuple(None for _ in models)
     if periods and design.controller is not None:
-        loops = _loops_on(models, design.controller, bounds, structure.integrator)
+        loops = _loops_on(models, design.controller, bounds, structure.integrator, options)
         design = _on_models(design, loops, S_max)
         norms = tuple(None if loop is None else loop.norm for loop in loops)
     case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
@@ -230,13 +262,22 @@ class LoopOnModel:
 
 
 def _loops_on(
-    models: Sequence[StateSpace | None], K: StateSpace | None, bounds: Bounds, integrator: bool
+    models: Sequence[StateSpace | None],
+    K: StateSpace | None,
+    bounds: Bounds,
+    integrator: bool,
+    options: TuningOptions,
 ) -> list[LoopOnModel | None]:
     """The loop with each model; None with a response, or without a controller."""
-    return [None if G is None or K is None else _loop_on(G, K, bounds, integrator) for G in models]
+    return [
+        None if G is None or K is None else _loop_on(G, K, bounds, integrator, options)
+        for G in models
+    ]
 
 
-def _loop_on(G: StateSpace, K: StateSpace, bounds: Bounds, integrator: bool) -> LoopOnModel:
+def _loop_on(
+    G: StateSpace, K: StateSpace, bounds: Bounds, integrator: bool, options: TuningOptions
+) -> LoopOnModel:
     """The loop with a model in discrete time; infinite and 0 where it is not stable."""
     S = closed_loop(G, tustin(K, G.period)).S
     norm, peak = hinf_norm(S)
@@ -244,10 +285,9 @@ def _loop_on(G: StateSpace, K: StateSpace, bounds: Bounds, integrator: bool) -> 
         return LoopOnModel(norm, peak, 0.0, ())
     top = np.pi / G.period
     roots = S.rates
-    low = BELOW * float(np.abs(roots).min())
-    omega = frequency_grid(
-        low, top, int(FINE * np.log10(top / low)), root_flanks(roots), apart=APART
-    )
+    low = LineOptions.lowest * float(np.abs(roots).min())
+    count = int(options.per_decade * np.log10(top / low))
+    omega = frequency_grid(low, top, count, root_flanks(roots), apart=LineOptions.apart)
 
     def level(omega: np.ndarray) -> np.ndarray:
         return np.log(sigma_max(S.swept(omega.ravel()))).reshape(omega.shape)
@@ -265,7 +305,7 @@ def _loop_on(G: StateSpace, K: StateSpace, bounds: Bounds, integrator: bool) -> 
     found = bandwidth_within(omega, level(omega), bounds, integrator)
     for _ in range(2):  # it lies at a crossing, or by the shape at a maximum that is there already
         i = int(np.clip(np.searchsorted(omega, found), 1, len(omega) - 1))
-        omega = np.union1d(omega, np.linspace(omega[i - 1], omega[i], CLOSER))
+        omega = np.union1d(omega, np.linspace(omega[i - 1], omega[i], options.about_crossing))
         found = bandwidth_within(omega, level(omega), bounds, integrator)
     return LoopOnModel(norm, peak, found, (found, float(omega[np.argmax(held(omega))])))
 

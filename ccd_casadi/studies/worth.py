@@ -44,11 +44,24 @@ from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.text import HZ, number
 from surrogates import design, to_casadi
 
-MOST_ROUNDS, AGREED, KNOWN = (
-    8,
-    1e-6,
-    3,
-)  # of a solve on what is known; relative in ω_1; θ that are known
+
+@dataclass(frozen=True)
+class HardwareOptions:
+    """Numbers of the sequential hardware design on cheap models of the plant.
+
+    Attributes
+    ----------
+    rounds : int
+        Solves at most, each on a model that is made of the θ known so far.
+    agreed : float
+        Relative difference of ω_1 between model and plant that ends them.
+    known : int
+        θ that a model is made of.
+    """
+
+    rounds: int = 8
+    agreed: float = 1e-6
+    known: int = 3
 
 
 @dataclass(frozen=True)
@@ -83,6 +96,7 @@ def design_hardware(
     starts: int = 8,
     seed: int = 0,
     workers: Pool | None = None,
+    options: HardwareOptions = HardwareOptions(),
 ) -> HardwareDesign:
     """The least hardware cost with ω_1 >= `resonance` (rad/s), by IPOPT.
 
@@ -92,7 +106,7 @@ def design_hardware(
     points = [problem.start]
     if starts > 0:
         points += map(tuple, design("sobol", *box(problem), starts, seed).tolist())
-    tasks = {start: (problem, resonance, start) for start in points}
+    tasks = {start: (problem, resonance, start, options) for start in points}
     found = [design for _, design in sorted(results(workers, _from_start, tasks))]
     nearest = max(found, key=lambda item: item.first_resonance)
     meeting = (item for item in found if item.met)
@@ -100,19 +114,19 @@ def design_hardware(
 
 
 def _from_start(
-    problem: CoDesignProblem, resonance: float, start: tuple[float, ...]
+    problem: CoDesignProblem, resonance: float, start: tuple[float, ...], options: HardwareOptions
 ) -> HardwareDesign:
     plant = plant_of(problem)
     known: tuple[tuple[float, ...], ...] = (start,)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(options.rounds):
         evaluate = None if plant.nearby is None else plant.nearby(known)
         point, predicted = _least_cost(problem, resonance, known[-1], evaluate)
         omega = predicted if evaluate is None else first_resonance(problem, point)[0]
         theta = tuple(float(v) for v in point)
-        if abs(predicted / omega - 1.0) <= AGREED or np.isnan(omega):
+        if abs(predicted / omega - 1.0) <= options.agreed or np.isnan(omega):
             break
-        known = (*known[1 - KNOWN :], theta)
-    met = bool(omega >= resonance * (1.0 - AGREED)) and not violated(problem, point)
+        known = (*known[1 - options.known :], theta)
+    met = bool(omega >= resonance * (1.0 - options.agreed)) and not violated(problem, point)
     return HardwareDesign(theta, hardware_cost(plant, point), omega, met)
 
 
@@ -143,14 +157,44 @@ def _least_cost(
     return point, at(tuple(point))[0]
 
 
-SLOW = 0.3  # seconds of processor time of a plant at a θ: finite elements
-LOOKS, LOOKS_SLOW = 8, 1  # true inner problems over the box for each parameter
-BESIDE = 0.05  # of the box: a slow start so near the sequential hardware says little besides
-ROUNDS = 12  # of surrogate, IPOPT and truth, at most
-SETTLED, SETTLED_SLOW = 1e-4, 1.5e-3  # of the bandwidth: δ below which no round is needed
-APART = 1e-3  # of the box: designs closer than this are one
-CLOUD, REACHES = 256, (1.0, 0.3, 0.1, 0.03)  # points in boxes of these sizes around the best θ
-LITTLE = 1.0  # % of the bandwidth: a gain below it is hardly worth a co-design
+@dataclass(frozen=True)
+class WorthOptions:
+    """Numbers of the estimate of what co-design gains.
+
+    Attributes
+    ----------
+    slow : float
+        Processor time in s of a plant at a θ from which it is slow (finite elements).
+    points, points_slow : int
+        True inner problems over the box for each parameter; of a slow plant.
+    same_start : float
+        Share of the box within which the start of a slow plant is left out, as it is near the
+        sequential hardware.
+    rounds : int
+        Rounds of surrogate, IPOPT and truth at most.
+    settled, settled_slow : float
+        δ as a share of the bandwidth below which no further round is needed; of a slow plant.
+    same_design : float
+        Share of the box within which two designs are one.
+    cloud : int
+        Points in each box around the best θ.
+    boxes : tuple of float
+        Sizes of these boxes, as shares of the box of θ.
+    hardly : float
+        Gain in % of the bandwidth below which co-design is hardly worth it.
+    """
+
+    slow: float = 0.3
+    points: int = 8
+    points_slow: int = 1
+    same_start: float = 0.05
+    rounds: int = 12
+    settled: float = 1e-4
+    settled_slow: float = 1.5e-3
+    same_design: float = 1e-3
+    cloud: int = 256
+    boxes: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03)
+    hardly: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -170,32 +214,56 @@ class Outlook:
     values: Array
 
 
-def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
-    """The sequential design, then rounds of surrogate and truth; the figures of worth.json.
+def worth(
+    case: Case, sampler: Sampler, seed: int = 0, *, options: WorthOptions = WorthOptions()
+) -> dict[str, Any]:
+    """Estimate what co-design gains over the sequential design.
 
-    No clock ends it: the rounds do, when the next one is expected to gain little.
-    Raises UserError where too few designs are certified to learn from, or none is feasible.
+    The sequential design is followed by rounds of surrogate and truth, until the next one is
+    expected to gain little. No clock ends them.
+
+    Parameters
+    ----------
+    case : Case
+    sampler : Sampler
+        Of its problem.
+    seed : int
+    options : WorthOptions
+
+    Returns
+    -------
+    dict
+        The content of worth.json.
+
+    Raises
+    ------
+    UserError
+        Too few designs are certified to learn from, or none is feasible.
     """
     began, rule = perf_counter(), HZ * case.baseline.first_resonance_hz
     lower, upper = box(sampler.problem)
-    looks = design("sobol", lower, upper, LOOKS * len(lower), seed)
+    looks = design("sobol", lower, upper, options.points * len(lower), seed)
     spent = process_time()
     first_resonance(sampler.problem, looks[0])  # the plant keeps it for the global check
-    slow = process_time() - spent > SLOW
+    slow = process_time() - spent > options.slow
     hardware = design_hardware(
         sampler.problem, rule, starts=0 if slow else 8, seed=seed, workers=sampler.workers
     )
     outer = outer_of(sampler).prepared(seed)
     sampler, problem = outer.sampler, outer.problem
     apart = np.abs(np.subtract(hardware.theta, problem.start) / (upper - lower)).max()
-    first = [hardware.theta] if slow and apart < BESIDE else [hardware.theta, problem.start]
+    first = (
+        [hardware.theta] if slow and apart < options.same_start else [hardware.theta, problem.start]
+    )
     known = sampler.values(np.array(first), "first designs")
-    known += sampler.values(looks[: LOOKS_SLOW * len(lower)] if slow else looks, "global check")
+    few = looks[: options.points_slow * len(lower)]
+    known += sampler.values(few if slow else looks, "global check")
     missed, searched = 0.0, set[tuple[float, ...]]()
-    for rounds_left in reversed(range(ROUNDS + 1)):
+    for rounds_left in reversed(range(options.rounds + 1)):
         known = sampler.latest(known)
-        ahead = outlook(problem, known, missed, seed)
-        settled = ahead.left <= (SETTLED_SLOW if slow else SETTLED) * ahead.best.bandwidth
+        ahead = outlook(problem, known, missed, seed, options=options)
+        share = options.settled_slow if slow else options.settled
+        settled = ahead.left <= share * ahead.best.bandwidth
         if settled or not rounds_left:
             ends = {end.theta: end for end in (known[0], ahead.best) if end.kappa}
             found = {at: multistart_at(sampler, ends[at]) for at in ends if at not in searched}
@@ -204,7 +272,7 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
                 sampler.value_from(at, found[at].design.kappa.tolist())
             if not (better and rounds_left):
                 if unsure := search_error(sampler, ahead.best):
-                    ahead = outlook(problem, known, missed + unsure, seed)
+                    ahead = outlook(problem, known, missed + unsure, seed, options=options)
                 break
             missed, searched = 0.0, searched | ends.keys()
             continue
@@ -247,7 +315,12 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
 
 
 def outlook(
-    problem: CoDesignProblem, known: list[InnerSample], missed: float, seed: int
+    problem: CoDesignProblem,
+    known: list[InnerSample],
+    missed: float,
+    seed: int,
+    *,
+    options: WorthOptions = WorthOptions(),
 ) -> Outlook:
     """By the surrogate of all that is known, which `missed` the last true design (rad/s)."""
     learnt = [each for each in known if each.feasible]
@@ -262,13 +335,13 @@ def outlook(
         expected = solve_program(program, starts).best.x
     except OuterFailure:  # the surrogate expects a feasible design nowhere
         expected = np.array(best.theta)
-    spread = design("sobol", lower - upper, upper - lower, CLOUD, seed)
-    cloud = best.theta + np.vstack([reach * spread for reach in REACHES])
+    spread = design("sobol", lower - upper, upper - lower, options.cloud, seed)
+    cloud = best.theta + np.vstack([reach * spread for reach in options.boxes])
     cloud = np.clip(np.vstack([expected, best.theta, cloud]), lower, upper)
     costs, constraints = (np.array(value) for value in plant_of(problem).hardware(cloud.T))
     allowed = (constraints <= MET * constraint_sizes(problem)[:, None]).all(axis=0)
     steps = (cloud[:, None] - [each.theta for each in known]) / (upper - lower)
-    new = np.abs(steps).max(axis=2).min(axis=1) > APART
+    new = np.abs(steps).max(axis=2).min(axis=1) > options.same_design
     mean, deviation = process.predict(cloud, return_std=True)
     J = problem.w1 * costs[0] + problem.w2 * mean
     s, gap = abs(problem.w2) * deviation, objective_of(problem, best) - J
@@ -301,11 +374,23 @@ def search_error(sampler: Sampler, best: InnerSample) -> float:
     return apart
 
 
-def worth_words(found: Mapping[str, Any]) -> list[str]:
-    """The decision first, then what a full solve may add, both designs and what it has cost."""
+def worth_words(found: Mapping[str, Any], *, options: WorthOptions = WorthOptions()) -> list[str]:
+    """Write the decision, what a full solve may add, both designs and their cost.
+
+    Parameters
+    ----------
+    found : mapping
+        The content of worth.json.
+    options : WorthOptions
+
+    Returns
+    -------
+    list of str
+        Lines; the decision first.
+    """
     lines = ["answer        Co-design is needed: the sequential hardware has no controller."]
     if np.isfinite(found["bandwidth_percent"]):
-        hardly = found["gain_percent"] + found["uncertainty_percent"] < LITTLE
+        hardly = found["gain_percent"] + found["uncertainty_percent"] < options.hardly
         cost, bandwidth = (
             " to ".join(dict.fromkeys(f"{v:+z.1f}" for v in found[f"full_solve_{key}_percent"]))
             for key in ("hardware_cost", "bandwidth")
@@ -314,7 +399,7 @@ def worth_words(found: Mapping[str, Any]) -> list[str]:
         answer = f"Co-design is {'hardly ' * hardly}worth it"
         if weak["state"] != State.PASSED:
             answer += f", but its design is not to be built as it is (survives {weak['state']})"
-        settled = "" if found["settled"] else f"; {ROUNDS} rounds did not settle it"
+        settled = "" if found["settled"] else f"; {options.rounds} rounds did not settle it"
         lines = [
             f"answer        {answer}: "
             f"hardware cost {found['hardware_cost_percent']:+z.1f} %, "

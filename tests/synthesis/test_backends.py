@@ -19,8 +19,8 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space
 from ccd_casadi.studies.backends import (
-    AGREE,
     SOLVERS,
+    BackendOptions,
     BackendResult,
     StandardPlant,
     mixed_sensitivity,
@@ -88,7 +88,7 @@ def test_three_back_ends_agree_on_two_masses(
     # an upper bound, and the interior-point method's last steps decide how close: with the kernels
     # of Sandybridge it stops 1.6e-3 above at (100, 400) Hz; the verdict has to tell
     assert ours * (1.0 - 1e-6) <= third_gamma <= ours * (1.0 + 5e-3)
-    assert third.holds == (third_gamma <= min(ours, slicot) * (1.0 + AGREE))
+    assert third.holds == (third_gamma <= min(ours, slicot) * (1.0 + BackendOptions.agree))
 
 
 def test_claim_below_the_bound_is_called_wrong() -> None:
