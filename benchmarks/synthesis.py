@@ -27,7 +27,7 @@ from ccd_casadi.kernels.design import design, judge, sweep
 from ccd_casadi.kernels.gamma import optimal_gamma
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.linear_algebra import stable_subspace
-from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian
+from ccd_casadi.kernels.riccati import RiccatiOptions, level_hamiltonian, lqr_hamiltonian
 from ccd_casadi.kernels.sensitivity import Code, Column
 
 RESULTS = Path(__file__).with_name("results.json")
@@ -118,7 +118,7 @@ def floor(problem: Problem) -> float:
     gp = generalized_plant(plant.A, plant.B, plant.C, problem.weights.scaled(plant.omega_0))
     _, B1, _, C1, _, d1, _ = gp
     H0 = lqr_hamiltonian(gp)
-    found = optimal_gamma(H0, B1, C1, d1, 0.5 * d1, 10.0, 1e-8, NOISE)[0]
+    found = optimal_gamma(H0, B1, C1, d1, 0.5 * d1, 10.0, 1e-8, RiccatiOptions.noise)[0]
     H = level_hamiltonian(H0, B1, C1, d1, (BACKOFF * found) ** 2 - d1**2)
     count = 20 if len(plant.A) < 100 else 1
     return best(lambda: [stable_subspace(H) for _ in range(count)], 2.0) / count

@@ -1,6 +1,8 @@
 """The certificate of a design: its closed loop, poles, norm over frequency, and a Hamiltonian
 level test."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
@@ -122,8 +124,22 @@ def reachable_loop(loop, n, N):
     return (Ar, Bz[n : n + N].copy(), Cr, Dz), True
 
 
-REFINED_FROM = 0.95  # of the largest gain on the grid: a peak this high is refined in any case
-REFINEMENTS = 40  # trials a peak; some six are used
+class StackNormOptions(NamedTuple):
+    """Numbers of the norm over frequency.
+
+    Attributes
+    ----------
+    refined_from : float
+        Share of the largest gain on the grid from which a peak is refined in any case.
+    refinements : int
+        Trials a peak at most; some six are used.
+    """
+
+    refined_from: float = 0.95
+    refinements: int = 40
+
+
+OPTIONS = StackNormOptions()
 
 
 @compiled
@@ -198,11 +214,11 @@ def stack_norm(G, K, Dk, w, delta, grid):
             continue
         a, x, b = np.log(grid[i - 1]), np.log(grid[i]), np.log(grid[i + 1])
         fa, fx, fb = left, values[i], right
-        for trial in range(REFINEMENTS):
+        for trial in range(OPTIONS.refinements):
             # The parabola's promise is trusted to half, and not at all while the points stand
             # wide: between two of the grid a peak was 1.2 % higher where it promised 0.06 %.
             promise = fx + 2.0 * promised(a, fa, x, fx, b, fb)
-            if promise < 0.9999 * top and (trial > 1 or fx < REFINED_FROM * top):
+            if promise < 0.9999 * top and (trial > 1 or fx < OPTIONS.refined_from * top):
                 break
             new, room = next_trial(a, fa, x, fx, b, fb, 1e-9)
             if room == 0.0:

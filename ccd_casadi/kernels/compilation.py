@@ -35,7 +35,6 @@ from surrogates.files import write_whole
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate", "rows", "curvature")
 WORKER = "CCD_CASADI_COMPILES"  # set in the processes that compile
-SECONDS = 60.0  # of one core, to compile all; measured, said before anything else is known
 
 
 def compile_part(part: str) -> None:
@@ -111,10 +110,11 @@ def is_compiled() -> bool:
     return _read(_folder(_kernels()) / "compiled.stamp") == _state()
 
 
-def ensure_compiled() -> None:
+def ensure_compiled(*, seconds: float = 60.0) -> None:
     """Compile all kernels on two processes unless the stamp says that they are; words on stderr.
 
-    What a process leaves undone is compiled where it is needed, in silence.
+    `seconds` of one core, as measured, are announced. What a process leaves undone is compiled
+    where it is needed, in silence.
     """
     if is_compiled():
         return
@@ -127,7 +127,7 @@ def ensure_compiled() -> None:
         count = min(len(PARTS), usable_cores())
         _say(
             "ccd_casadi: compiling its numerical kernels, once for this installation and processor:"
-            f" about {SECONDS / count:.0f} s on {count} core{'s' if count > 1 else ''}"
+            f" about {seconds / count:.0f} s on {count} core{'s' if count > 1 else ''}"
         )
         try:
             done = _compile(kernels, count)

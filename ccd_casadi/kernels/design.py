@@ -1,5 +1,6 @@
 """One design from end to end: γ_opt, controller, certificate, closed-loop figures; and sweeps."""
 
+from dataclasses import dataclass
 from math import exp, isnan, log, nan
 
 import numpy as np
@@ -22,8 +23,22 @@ from ccd_casadi.kernels.synthesis import central_controller, synthesise
 
 _COUNT, _CODE, _GAMMA_OPT = int(Column.COUNT), int(Column.CODE), int(Column.GAMMA_OPT)
 _BALANCED = int(Column.BALANCED)
-FREED = 0.01  # relative: what free bodies in the place of suspended ones may add to the norm
-LEVEL = 1e-6  # relative: how far above the largest gain found a norm is certified
+
+
+@dataclass(frozen=True)
+class DesignOptions:
+    """Relative tolerances of the certificate.
+
+    Attributes
+    ----------
+    freed : float
+        What free bodies in the place of suspended ones may add to the norm.
+    level : float
+        How far above the largest gain found a norm is certified.
+    """
+
+    freed: float = 0.01
+    level: float = 1e-6
 
 
 @inlined
@@ -117,7 +132,19 @@ def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
 def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     """Certify a controller against `gamma` and fill in its closed-loop figures as far as it comes.
 
-    With δ > 0 the norm is that of the four blocks [W1 I; W2 K; W3 K] S [I δG].
+    Parameters
+    ----------
+    A, B, C, Ak, Bk, Ck, Dk : arrays
+        Scaled plant and controller.
+    w : array (8,)
+        Scaled weights.
+    delta : float
+        Above 0 the norm is that of the four blocks [W1 I; W2 K; W3 K] S [I δG].
+    gamma : float
+    omega_low : float
+        Frequency of `Column.LOW`, over ω₀.
+    row : array (Column.COUNT,)
+        Filled in place.
     """
     row[Column.CODE] = _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
 
@@ -127,17 +154,41 @@ def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
 
 
 def design(
-    A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0, judged_on=()
-):
-    """Synthesise at backoff·γ_opt, certify and measure. Returns the row, A_K, B_K, C_K.
+    A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0, judged_on=(),
+    options=DesignOptions(),
+):  # fmt: skip
+    """Synthesise at backoff·γ_opt, certify and measure.
 
-    `judged_on`: A, B and C of the plant that the loop is closed on, where it is another one: with
-    free bodies in the place of suspended ones. Its norm may be above γ by `FREED`; where it is by
-    more it is certified at what it is.
+    With `channels` the synthesis is done on these blocks; the certificate is the whole loop's. A
+    synthesis that fails is repeated in balanced coordinates, whole, and then counts if it passes.
 
-    With `channels` the synthesis is done on these blocks; the certificate is the whole loop's.
-    δ > 0 makes it the four-block problem of `disturbance`, which is solved whole. What fails is
-    tried once more in balanced coordinates, whole, and then counts if it passes.
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+        Scaled plant.
+    w : array (8,)
+        Scaled weights.
+    grid, sigma : arrays (g,)
+        Frequencies over ω₀, and the least gain of the plant there.
+    backoff : float
+        γ/γ_opt.
+    omega_low : float
+        Frequency of `Column.LOW`, over ω₀.
+    guess : float
+        Of γ_opt; 0: none.
+    channels : sequence of ScaledChannel
+    delta : float
+        Above 0 it is the four-block problem with a disturbance, which is solved whole.
+    judged_on : A, B, C
+        Of the plant on which the loop is closed, with free bodies in the place of suspended ones.
+        Its norm may be above γ by `freed`; above that it is certified at its value.
+    options : DesignOptions
+
+    Returns
+    -------
+    row : array (Column.COUNT,)
+    A_K, B_K, C_K : arrays
+        Scaled controller.
     """
     first = None
     for balanced in (False, True):
@@ -150,11 +201,11 @@ def design(
             row[_BALANCED] = balanced
             if row[_CODE] == 0.0:
                 Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
-                gamma = backoff * row[_GAMMA_OPT] * (1.0 + FREED if judged_on else 1.0)
+                gamma = backoff * row[_GAMMA_OPT] * (1.0 + options.freed if judged_on else 1.0)
                 loop = (*(judged_on or (A, B, C)), Ak, Bk, Ck, Dk, w, delta)
                 judge(*loop, gamma, omega_low, row)
                 if judged_on and row[_CODE] == Code.NORM_EXCEEDED:
-                    judge(*loop, (1.0 + LEVEL) * row[Column.NORM], omega_low, row)
+                    judge(*loop, (1.0 + options.level) * row[Column.NORM], omega_low, row)
         except np.linalg.LinAlgError:  # an infinite or undefined number on the way
             made = failed_row(), *[np.full((1, 1), nan)] * 3
         if made[0][_CODE] in _PASSED:
@@ -167,7 +218,12 @@ _PASSED = (Code.CERTIFIED, Code.NO_BANDWIDTH)  # the certificate holds; no cross
 
 
 def failed_row():
-    """The row of a design whose linear algebra met an infinite or undefined number."""
+    """Make the row of a design whose linear algebra met an infinite or undefined number.
+
+    Returns
+    -------
+    array (Column.COUNT,)
+    """
     row = np.full(_COUNT, nan)
     row[_CODE], row[Column.LIMITED_BY_BOUND], row[_BALANCED] = float(Code.NOT_FINITE), 0.0, 0.0
     return row
@@ -208,9 +264,20 @@ def sweep(
     A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channels=(), delta=0.0,
     judged_on=(),
 ):  # fmt: skip
-    """Rows (n_S, n_T, figures) over the frequencies of W1 and W3, each warm-started.
+    """Design over a grid of the frequencies of W1 and W3, each warm-started.
 
-    Boustrophedon order: γ_opt is guessed from the certified neighbours already done.
+    In boustrophedon order: γ_opt is guessed from the certified neighbours.
+
+    Parameters
+    ----------
+    A, B, C, w, grid, sigma, backoff, omega_low, channels, delta, judged_on
+        As in `design`.
+    omega_S, omega_T : arrays (n_S,), (n_T,)
+        Over ω₀.
+
+    Returns
+    -------
+    array (n_S, n_T, Column.COUNT)
     """
     rows = np.empty((omega_S.size, omega_T.size, _COUNT))
     found = np.zeros(rows.shape[:2])  # ln γ_opt; NaN where not certified

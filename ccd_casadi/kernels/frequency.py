@@ -5,19 +5,43 @@ With D⁻¹AD = Q T Qᵀ, D diagonal and T quasi upper triangular, C (jω - A)�
 whole grid runs through it in vector instructions.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
 from ccd_casadi.kernels.linear_algebra import balanced, schur
 
-CHUNK = 32  # frequencies at a time: the working rows stay in the first-level cache
+
+class ResponseGridOptions(NamedTuple):
+    """How responses over a grid are computed.
+
+    Attributes
+    ----------
+    chunk : int
+        Frequencies at a time: the working rows stay in the first-level cache.
+    """
+
+    chunk: int = 32
+
+
+OPTIONS = ResponseGridOptions()
 
 
 @compiled
 def prepare(A, B, C):
-    """(T, QᵀD⁻¹B, CDQ) with D⁻¹AD = Q T Qᵀ: each frequency then costs O(n²).
+    """Transform a system by its real Schur form: each frequency then costs O(n²).
 
     T is off by eps ‖D⁻¹AD‖, and a controller's A is up to 3000 times as large as that.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+
+    Returns
+    -------
+    T, QᵀD⁻¹B, CDQ : arrays
+        With D⁻¹AD = Q T Qᵀ.
     """
     A, scale = balanced(A)
     T, Q, _, _, _ = schur(A)
@@ -53,7 +77,7 @@ def _solve(T, X, ω):
 
 @inlined
 def _solve_chunk(T, b, ω, x, y):
-    """x + jy = (jω - T)⁻¹ b at every ω of a chunk; x, y are (n, CHUNK)."""
+    """x + jy = (jω - T)⁻¹ b at every ω of a chunk; x, y are (n, chunk)."""
     n, count = b.size, ω.size
     i = n - 1
     while i >= 0:
@@ -95,15 +119,27 @@ def _solve_chunk(T, b, ω, x, y):
 
 @compiled
 def responses(system, ω):
-    """C (jω - A)⁻¹ B at every ω of an array, complex (count, p, m)."""
+    """Evaluate C (jω - A)⁻¹ B.
+
+    Parameters
+    ----------
+    system : tuple
+        As `prepare` returns it.
+    ω : array (k,)
+
+    Returns
+    -------
+    complex array (k, p, m)
+    """
     T, B, C = system
     n, m = B.shape
     p = C.shape[0]
     out = np.empty((ω.size, p, m), np.complex128)
-    x, y = np.empty((n, CHUNK)), np.empty((n, CHUNK))
-    re, im = np.empty(CHUNK), np.empty(CHUNK)
-    for start in range(0, ω.size, CHUNK):
-        part = ω[start : start + CHUNK]
+    chunk = OPTIONS.chunk
+    x, y = np.empty((n, chunk)), np.empty((n, chunk))
+    re, im = np.empty(chunk), np.empty(chunk)
+    for start in range(0, ω.size, chunk):
+        part = ω[start : start + chunk]
         count = part.size
         for j in range(m):
             _solve_chunk(T, B[:, j].copy(), part, x, y)

@@ -27,7 +27,18 @@ def lower_bound_squared(w, gain, ω):
 
 
 def plant_gain(A, B, C, ω):
-    """σ_p(G(jω)), the least gain over output directions (0 where m < p), at every ω of an array."""
+    """Compute the least gain of a plant over output directions, σ_p(G(jω)).
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+    ω : array (k,)
+
+    Returns
+    -------
+    array (k,)
+        0 where m < p.
+    """
     if B.shape[1] < C.shape[0]:
         return np.zeros(ω.size)
     gains = np.linalg.svd(responses(prepare(A, B, C), ω), compute_uv=False)

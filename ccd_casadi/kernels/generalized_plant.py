@@ -102,7 +102,19 @@ def first_order_weights(w):
 
 
 def generalized_plant(A, B, C, w):
-    """That of A (n, n), B (n, m), C (p, n), of the order N = n + 2p + m."""
+    """Make the generalized plant of mixed sensitivity, of order N = n + 2p + m.
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+        Scaled plant.
+    w : array (8,)
+        Scaled weights.
+
+    Returns
+    -------
+    MixedPlant
+    """
     return MixedPlant(*plant_matrices(A, B, C, w))
 
 

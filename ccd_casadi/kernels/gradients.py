@@ -38,16 +38,28 @@ from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, stable_subspace
-from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
+from ccd_casadi.kernels.riccati import (
+    RiccatiOptions,
+    level_hamiltonian,
+    lqr_hamiltonian,
+    riccati_level,
+)
 from ccd_casadi.kernels.sensitivity import Code, Column
 from ccd_casadi.kernels.synthesis import disturbance_bound, filter_solution, innovations_plant
 from ccd_casadi.support.arrays import Array
 
 
 class LoopAt(NamedTuple):
-    """A plant's A, B, C and dA, dB, dC to θ, and the frequency at which σ_max is differentiated.
+    """A loop at the frequency where a gain is differentiated.
 
-    Of S, or with `compliance` of S G; those stand last among several.
+    Attributes
+    ----------
+    plant
+        With A, B, C and dA, dB, dC to θ.
+    omega : float
+        Over ω₀.
+    compliance : bool
+        The gain of S G, else of S; those of S G are the last among several.
     """
 
     plant: Any
@@ -56,7 +68,18 @@ class LoopAt(NamedTuple):
 
 
 class MadeFor(NamedTuple):
-    """The plant that a controller is made for, as that of `LoopAt`, scaled weights, γ/γ_opt, δ."""
+    """What a controller is synthesised for.
+
+    Attributes
+    ----------
+    plant
+        As that of `LoopAt`.
+    w : array (8,)
+        Scaled weights.
+    backoff : float
+        γ/γ_opt.
+    delta : float
+    """
 
     plant: Any
     w: Array
@@ -96,7 +119,9 @@ def gamma_gradient(posed, gamma_opt):
     gp, H0, back = posed
     _, B1, _, C1, _, d1, _ = gp
     t = gamma_opt**2 - d1**2
-    _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t, NOISE)
+    _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(
+        H0, B1, C1, d1, t, RiccatiOptions.noise
+    )
     Lq = lyapunov_triangular(T11, -np.outer(q, q), False)
     terms, level = _riccati_terms(T11, U1, U2, Lq[None], gp, t)
     # γ moves so that f stays zero
@@ -215,15 +240,35 @@ def _contract(cotangents, changes):
 def figure_gradients(
     made_for: MadeFor, row: Array, grid: Array, sigma: Array, loops: Sequence[LoopAt]
 ) -> tuple[Array, Array, Array, Array, bool]:
-    """Gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt), of ω_b with K held, and σ's gaps.
+    """Differentiate (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt); the controller moves with its plant.
 
-    The first (4, n_θ + n_w), to θ, then to the scaled weights with δ behind them where δ > 0;
-    `row` is the synthesis on the design plant, `grid` and `sigma` its frequencies and gains. In
-    `loops` ω_b, the peak and ω_low are taken, on that plant or others; a fourth loop's ln σ stands
-    before γ_opt. The fixed-K gradient (n_θ) is the paper's. After the gaps comes γ_opt's own
-    gradient, and whether the Hamiltonian splits. NaN where it does not, where the design is not
-    certified or there are no loops, and where it needed balanced coordinates: gradients are taken
-    in the plant's own.
+    Gradients are NaN where the Hamiltonian does not split, where the design is not certified or
+    needed balanced coordinates, and without loops.
+
+    Parameters
+    ----------
+    made_for : MadeFor
+        The design plant.
+    row : array
+        The synthesis on it.
+    grid, sigma : arrays
+        Its frequencies and gains.
+    loops : sequence of LoopAt
+        Where ω_b, the peak and ω_low are taken, on that plant or others; ln σ of a fourth one is
+        before γ_opt in the result.
+
+    Returns
+    -------
+    gradients : array (4, n_θ + n_w)
+        To θ, then to the scaled weights, with δ at the end where δ > 0.
+    held : array (n_θ,)
+        Of ω_b with K held, which is the paper's.
+    gaps : array
+        Of the largest singular values.
+    to_gamma : array (n_θ + n_w,)
+        Of γ_opt.
+    splits : bool
+        Whether the Hamiltonian splits.
     """
     count = made_for.plant.dA.shape[0]
     total = count + made_for.w.size + (made_for.delta > 0.0)
@@ -257,9 +302,19 @@ def figure_gradients(
 def peak_gradients(
     made_for: MadeFor, row: Array, gamma_slope: Array, loops: Sequence[LoopAt]
 ) -> Array:
-    """Gradients (k, n_θ + n_w) of ln σ_max(S(jω)) at local maxima over ω; NaN where there are none.
+    """Differentiate ln σ_max(S(jω)) at local maxima over ω, whose frequencies drop out (envelope).
 
-    The frequency of a maximum drops out (envelope). `row` and `gamma_slope` as above.
+    Parameters
+    ----------
+    made_for, row, loops
+        As in `figure_gradients`.
+    gamma_slope : array
+        Its `to_gamma`.
+
+    Returns
+    -------
+    array (k, n_θ + n_w)
+        NaN where there are none.
     """
     with np.errstate(all="ignore"):
         found, _, _, gains, _, ok = loop_gradients(

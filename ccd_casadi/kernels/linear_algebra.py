@@ -167,9 +167,6 @@ def eigenvalues(A):
     return wr, wi, info[0]
 
 
-ALIGNED = 1e-28  # square of the cosine between two columns below which they count as orthogonal
-
-
 @compiled
 def multiply(A, B):
     """A B."""
@@ -242,7 +239,7 @@ def singular(M, rows, columns, V, sigma, vectors):
                     b += y.real * y.real + y.imag * y.imag
                     h += x.conjugate() * y
                 square = h.real * h.real + h.imag * h.imag
-                if not square > ALIGNED * a * b:
+                if not square > 1e-28 * a * b:  # their cosine is below 1e-14
                     continue
                 turned = True
                 size = np.sqrt(square)

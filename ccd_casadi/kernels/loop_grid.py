@@ -28,10 +28,14 @@ from ccd_casadi.kernels.sections import LoopCurve, gains_and_slopes, second_slop
 
 
 class Answers(NamedTuple):
-    """Of most frequencies only the controller changes during a search: what plants answer there.
+    """Responses of plants at fixed frequencies: during a search only the controller changes.
 
-    G and G without hold and delay (P, F, p, m), and the `place` (P, k) of each frequency among
-    them, -1 where it is none. Without places (0, 0) nothing is known.
+    Attributes
+    ----------
+    place : int array (P, k)
+        Of each frequency among them, -1 where it is not one; (0, 0): nothing is known.
+    held, free : complex arrays (P, F, p, m)
+        G with and without hold and delay.
     """
 
     place: Any
@@ -44,12 +48,32 @@ NONE = Answers(np.zeros((0, 0), np.int64), *np.zeros((2, 0, 0, 1, 1), complex))
 
 @compiled
 def merged(fixed, roots, poles, flanks, ends, apart, far):
-    """Frequencies v (P, k), ascending, and the place of each in `fixed` (P, F), or -1.
+    """Merge frequencies: fixed ones, and those around roots of controller and loops.
 
-    `fixed`, the flanks and sizes of the `roots` (R,) of the controller and of the `poles` (P, n) of
-    the loops, from the first of `ends` on, and one `far` past the last root and the other end.
     Points nearer than `apart` (relative) would hide a peak between them, and count once. Below the
-    first are spares: one, or as many as a plant has fewer points than another.
+    first are spares: one, or more where a plant has fewer points than another.
+
+    Parameters
+    ----------
+    fixed : array (P, F)
+        v of each plant.
+    roots, poles : complex arrays (R,), (P, n)
+        Of the controller, and of the loops.
+    flanks : array
+        In half widths of a root.
+    ends : tuple of float
+        First and last v.
+    apart : float
+        Least relative distance.
+    far : float
+        One point is this factor past the last root and the other end.
+
+    Returns
+    -------
+    v : array (P, k)
+        Ascending.
+    place : int array (P, k)
+        Of each in `fixed`, or -1.
     """
     (count, F), (bottom, top), each = fixed.shape, ends, 1 + flanks.size
     size = F + (roots.size + poles.shape[1]) * each + 1
@@ -83,8 +107,25 @@ def merged(fixed, roots, poles, flanks, ends, apart, far):
 
 @compiled
 def maxima(value, v, end, depth):
-    """Local maxima above `depth` of levels (P, k, C, numbers) at v (P, k), which stop at `end` (C,
-    numbers): their indices (N, 4), and v at their neighbours (N, 2)."""
+    """Find local maxima of levels over the grid.
+
+    Parameters
+    ----------
+    value : array (P, k, C, numbers)
+        ln of gains over bounds.
+    v : array (P, k)
+    end : array (C, numbers)
+        Last v of each curve.
+    depth : float
+        Only maxima above it.
+
+    Returns
+    -------
+    found : int array (N, 4)
+        Indices in `value`.
+    beside : array (N, 2)
+        v at their neighbours.
+    """
     P, count, C, numbers = value.shape
     most = P * C * numbers * (count // 2 + 1)
     found, beside, size = np.empty((most, 4), np.int64), np.empty((most, 2)), 0
@@ -105,10 +146,24 @@ def maxima(value, v, end, depth):
 
 @compiled
 def unseen(value, v, least):
-    """Steps of the grid near a bound (above `least`) in which a flat maximum may lie that no point
-    shows: plant, curve and number (N, 3), and the ends in v (N, 2).
+    """Find steps of the grid in which a flat maximum near a bound may lie that no point shows.
 
     A parabola through a step and the point before it ends with a slope of the other sign.
+
+    Parameters
+    ----------
+    value : array (P, k, C, numbers)
+        ln of gains over bounds.
+    v : array (P, k)
+    least : float
+        Only steps with a level above it.
+
+    Returns
+    -------
+    found : int array (N, 3)
+        Plant, curve and number.
+    ends : array (N, 2)
+        v.
     """
     P, count, C, numbers = value.shape
     found, ends, size = np.empty((value.size, 3), np.int64), np.empty((value.size, 2)), 0
@@ -130,12 +185,21 @@ def unseen(value, v, least):
     return found[:size], ends[:size]
 
 
-LEAST_GAP = 1e-2  # of two singular values, relative, that the model counts with
-
-
 @compiled
 def second(curve, number, which, v, loop):
-    """∂²ln σ/∂κ² (M, n, n) of M rows at their v."""
+    """Compute ∂²ln σ/∂κ² of M rows.
+
+    Parameters
+    ----------
+    curve, number, which : int arrays (M,)
+        Curve, its number, plant.
+    v : array (M,)
+    loop : LoopArrays
+
+    Returns
+    -------
+    array (M, n, n)
+    """
     at, of, g, sigma = room(loop)
     factors, values, channel, into, out, terms, residues, T, delay, _, own = loop
     (m, c), p, n = into.shape, out.shape[1], g.size
@@ -176,7 +240,7 @@ def second(curve, number, which, v, loop):
 @inlined
 def _over_gap(σ, other):
     """1/(λ (λ - λ_m)), σ's gap to σ_m kept from zero."""
-    gap, least = σ - other, LEAST_GAP * σ
+    gap, least = σ - other, 1e-2 * σ  # closer ones count as 1 % apart
     if abs(gap) < least:
         gap = -least if gap < 0.0 else least
     return 1.0 / (σ * σ * gap * (σ + other))

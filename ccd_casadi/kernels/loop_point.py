@@ -15,9 +15,22 @@ K, RATE, U, W, LEFT, RIGHT, SHARE, X, Y = range(9)  # K_i, ∂ln K_i/∂ln v; U 
 
 
 class LoopArrays(NamedTuple):
-    """`factors` and `values` of the controller (`sections`), `channel` (n,) of each value; V (m, c)
-    and Uᵀ (c, p); the plants (`modes`); the limits (`limits`), and the rows that channels bound for
-    themselves, u and w in the plants' coordinates, `rows` (2, channels, m).
+    """A controller of fixed structure and the plants that it runs on, as arrays.
+
+    Attributes
+    ----------
+    factors, values : arrays
+        Of the controller (`sections`).
+    channel : int array (n,)
+        Of each value.
+    into, out : arrays (m, c), (c, p)
+        V and Uᵀ.
+    terms, residues, period, delay
+        The plants (`modes.Plants`).
+    limits : array
+        Rows of `sections.LoopCurve` and `sections.Limit`.
+    rows : array (2, channels, m)
+        Rows of T and KS that channels bound for themselves, in the plants' coordinates.
     """
 
     factors: Any
@@ -176,10 +189,25 @@ def gain_of(curve, number, into, out, own, at, of, sigma):
 
 @compiled
 def levels(curves, which, v, loop, least, answers):
-    """ln of the gains over their bounds, (N, k, curves, numbers), of the curves (N, C) of each of N
-    plants `which` at v (N, k); -inf where none can be above `least`, and where nothing bounds one.
+    """Evaluate ln of gains over their bounds.
 
-    What the plants answer is looked up in `answers` (`loop_grid`) where it is known.
+    Parameters
+    ----------
+    curves : int array (N, C)
+        Curves of each of N plants.
+    which : int array (N,)
+        The plants.
+    v : array (N, k)
+    loop : LoopArrays
+    least : float
+        A level that cannot exceed it is not computed.
+    answers : Answers
+        Responses of plants that are known.
+
+    Returns
+    -------
+    array (N, k, C, numbers)
+        -inf where none can be above `least`, and where there is no bound.
     """
     count, most = v.shape
     at, of, _, sigma = room(loop)
@@ -242,9 +270,24 @@ def levels(curves, which, v, loop, least, answers):
 
 @compiled
 def rows(curve, number, which, v, loop):
-    """M rows: value, slope to ln v, ∂c/∂κ (M, n); x (M, p), y and v (M, m) for those to the plant.
+    """Evaluate M rows and their derivatives.
 
     Rows at the same frequency of the same plant that follow each other share their loop.
+
+    Parameters
+    ----------
+    curve, number, which : int arrays (M,)
+        Curve, its number, plant.
+    v : array (M,)
+    loop : LoopArrays
+
+    Returns
+    -------
+    value, slope : arrays (M,)
+        ln of gain over bound, and its slope to ln v.
+    to_kappa : array (M, n)
+    x, y, w : complex arrays (M, p), (M, m), (M, m)
+        Vectors of the slopes to the plant.
     """
     at, of, g, sigma = room(loop)
     # Unpacked once: to hand all of them to a function costs as much as a row.
@@ -283,11 +326,27 @@ def rows(curve, number, which, v, loop):
 
 @compiled
 def close(curve, number, which, start, low, high, loop, tolerances):
-    """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
+    """Refine local maxima by Illinois false position on the slope.
 
     A bracket that two steps do not halve is cut in the middle: where the slope is tiny at one end
-    and large at the other, as with two maxima about to part, false position alone creeps. Where a
-    bracket's slopes do not change sign (an end) the start stays; second: where they do.
+    and large at the other, as with two maxima close to each other, false position alone is slow.
+
+    Parameters
+    ----------
+    curve, number, which : int arrays (M,)
+        Curve, its number, plant.
+    start, low, high : arrays (M,)
+        v, and brackets around it.
+    loop : LoopArrays
+    tolerances : tuple
+        Slope that is flat, relative width of a bracket, steps.
+
+    Returns
+    -------
+    top : array (M,)
+        v; the start where the slopes of a bracket have one sign.
+    closed_in : bool array (M,)
+        Where they change sign.
     """
     flat, narrowest, most = tolerances
     top, closed_in = start.copy(), np.zeros(start.size, np.bool_)

@@ -7,7 +7,20 @@ import numpy as np
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.sections import inverse, warped
 
-CANCELLING = 1e-4  # |z - e^{pT}| below which the difference loses digits, and expm1 does not
+
+class CancellationOptions(NamedTuple):
+    """When a difference is computed by expm1.
+
+    Attributes
+    ----------
+    gap : float
+        |z - e^{pT}| below which the difference loses digits, and expm1 does not.
+    """
+
+    gap: float = 1e-4
+
+
+OPTIONS = CancellationOptions()
 
 
 class Plants(NamedTuple):
@@ -84,7 +97,7 @@ def response(terms, residues, T, d, i, ω, chain, sloped, at, place):
 def _held(s, z, p, late, early, grown, T, d):
     """z^d f, and what -sT∂ln ω/∂ln v times it is its slope."""
     gap = z - grown
-    if gap.real * gap.real + gap.imag * gap.imag < CANCELLING * CANCELLING:
+    if gap.real * gap.real + gap.imag * gap.imag < OPTIONS.gap * OPTIONS.gap:
         gap = grown * _expm1((s - p) * T)
     under, back = inverse(gap), z.conjugate()
     value = (late + early * back) * under
@@ -99,7 +112,7 @@ def _free(s, z, h, T, d):
         return f, f * f, f * f, 2.0 * f * f * f
     f, df = _held(s, z, complex(0.0, 0.0), complex(h, 0.0), complex(T - h, 0.0), 1.0 + 0.0j, T, d)
     gap, back = z - 1.0, z.conjugate()
-    if gap.real * gap.real + gap.imag * gap.imag < CANCELLING * CANCELLING:
+    if gap.real * gap.real + gap.imag * gap.imag < OPTIONS.gap * OPTIONS.gap:
         gap = _expm1(s * T)
     under = inverse(gap)
     first, rest = 0.5 * h * h + 0.5 * (T * T - h * h) * back, 0.5 * (T * T - h * h) * back
@@ -120,7 +133,19 @@ def _expm1(x):
 
 @compiled
 def responses(plants, which, v):
-    """G (N, p, m) of the plants `which` at jv and ∂G/∂ln v."""
+    """Evaluate the responses of plants and their slopes.
+
+    Parameters
+    ----------
+    plants : Plants
+    which : int array (N,)
+    v : array (N,)
+
+    Returns
+    -------
+    complex array (N, 2, p, m)
+        G at jv and ∂G/∂ln v.
+    """
     out = np.empty((v.size, 2, plants.residues.shape[3], plants.residues.shape[4]), np.complex128)
     for j in range(v.size):
         ω, chain = warped(plants.period, v[j])
@@ -135,10 +160,23 @@ SIMPLE, POSITION, VELOCITY = range(3)  # a pole of its own, or q and v of a free
 
 
 class PlantSlopes(NamedTuple):
-    """`terms` (P, n, 6): p, late, early, e^{pT}, ∂late/∂p and ∂early/∂p; C (P, p, n), B (P, n, m);
-    1/(p_i - p_j), 0 where these are one, (P, n, n); ∂A (P, n, n, 2, t), real and imaginary, ∂B
-    (P, n, m, t) and ∂C (P, p, n, t) to t parameters; the period T (0: continuous) and d; `kinds`
-    (P, n) of the states. Of a free body C has 0 at q and s c at v, B has s b at q.
+    """Plants with their derivatives to t parameters.
+
+    Of a free body C has 0 at q and s c at v, B has s b at q.
+
+    Attributes
+    ----------
+    terms : array (P, n, 6)
+        p, late, early, e^{pT}, ∂late/∂p and ∂early/∂p.
+    C, B : arrays (P, p, n), (P, n, m)
+    gaps : array (P, n, n)
+        1/(p_i - p_j), 0 where these are one.
+    dA, dB, dC : arrays (P, n, n, 2, t), (P, n, m, t), (P, p, n, t)
+        ∂A real and imaginary, ∂B, ∂C.
+    period, delay : float
+        T in s (0: continuous), and d.
+    kinds : int array (P, n)
+        Of the states.
     """
 
     terms: Any
@@ -155,9 +193,21 @@ class PlantSlopes(NamedTuple):
 
 @compiled
 def form_slopes(slopes, which, v, x, y, free):
-    """Re ∂(x G y) (N, t) of the plants `which` at jv with rows x (N, p) and columns y (N, m).
+    """Evaluate Re ∂(x G y) to the parameters.
 
-    `free` of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d so.
+    Parameters
+    ----------
+    slopes : PlantSlopes
+    which : int array (N,)
+        Plants.
+    v : array (N,)
+    x, y : complex arrays (N, p), (N, m)
+    free : bool
+        Free of hold and delay: the response to a disturbing force is G(jω) itself.
+
+    Returns
+    -------
+    array (N, t)
     """
     terms, C, B, gaps, dA, dB, dC, period, d, kinds = slopes
     n, (m, count) = terms.shape[1], dB.shape[2:]
@@ -177,7 +227,7 @@ def form_slopes(slopes, which, v, x, y, free):
                 slope[a] = own[a]
             elif T > 0.0:
                 gap, grown, back = z - terms[i, a, 3], terms[i, a, 3], z.conjugate()
-                if gap.real * gap.real + gap.imag * gap.imag < CANCELLING * CANCELLING:
+                if gap.real * gap.real + gap.imag * gap.imag < OPTIONS.gap * OPTIONS.gap:
                     gap = grown * _expm1((s - pole) * T)
                 under = inverse(gap)
                 f[a] = (terms[i, a, 1] + terms[i, a, 2] * back) * under

@@ -1,5 +1,7 @@
 """The Riccati equation of the synthesis, in balanced coordinates where its own lose digits."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled, inlined
@@ -14,7 +16,18 @@ from ccd_casadi.kernels.generalized_plant import (
 )
 from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, solve, stable_subspace
 
-NOISE = 1e-7  # |λ(X)| below which its sign may be rounding: see `riccati_level`
+
+@dataclass(frozen=True)
+class RiccatiOptions:
+    """Numbers of the Riccati level.
+
+    Attributes
+    ----------
+    noise : float
+        |λ(X)| below which its sign may be rounding: see `riccati_level`.
+    """
+
+    noise: float = 1e-7
 
 
 @compiled
@@ -209,7 +222,8 @@ def in_coordinates(gp, τ):
 def rounding_noise(H0):
     """What rounding alone makes of a projection that is zero: X(γ = ∞) is positive semidefinite.
 
-    Four times the most negative one there, at least `NOISE`.
+    Four times the most negative one there, at least `RiccatiOptions.noise`.
     """
     _, U1, U2, _, ok = stable_subspace(H0)
-    return max(NOISE, -4.0 * projected(U1, U2)[3].min()) if ok else NOISE
+    least = RiccatiOptions.noise
+    return max(least, -4.0 * projected(U1, U2)[3].min()) if ok else least

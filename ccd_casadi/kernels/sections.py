@@ -10,7 +10,7 @@ HALF_POWER = 0.5 * np.log(2.0)
 
 
 class LoopCurve(IntEnum):
-    """What is bounded; the row of its limit."""
+    """The bounded curve of a loop, and the row of its limit."""
 
     S_MAX = 0
     SHAPE = 1  # of shape/√2, on the line through ω_i
@@ -23,7 +23,7 @@ class LoopCurve(IntEnum):
 
 
 class Limit(IntEnum):
-    """The other rows: roots of the weights over ω₀."""
+    """The other rows of the limits: roots of the weights over ω₀."""
 
     LEAST = 8  # ω that the shape counts at least
     KS_ZERO = 9

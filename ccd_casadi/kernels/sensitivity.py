@@ -11,7 +11,7 @@ from ccd_casadi.kernels.linear_algebra import eigenvalues, invert, largest_singu
 
 
 class Code(IntEnum):
-    """How a design ended; 0 is the only one that may be used."""
+    """The end of a design; only CERTIFIED may be used."""
 
     CERTIFIED = 0
     GAMMA_NOT_CONVERGED = 1
@@ -27,7 +27,7 @@ class Code(IntEnum):
 
 
 class Column(IntEnum):
-    """Columns of a row of figures; frequencies over ω₀, poles over ω₀."""
+    """Columns of a row of figures; frequencies and poles over ω₀."""
 
     CODE = 0
     GAMMA_OPT = 1
@@ -52,10 +52,22 @@ HALF_POWER = 1.0 / np.sqrt(2.0)
 
 @compiled
 def axis_frequencies(A, B, C, D, level):
-    """Sorted ω > 0 where σ(C(jω-A)⁻¹B + D) = level may hold: |Re λ| <= 1e-3 |λ|, info.
+    """Find ω > 0 where σ(C(jω-A)⁻¹B + D) = level may hold: |Re λ| <= 1e-3 |λ|.
 
     The tolerance is generous on purpose: a spurious candidate costs one evaluation, a missed
     one a wrong answer.
+
+    Parameters
+    ----------
+    A, B, C, D : arrays (n, n), (n, m), (p, n), (p, m)
+    level : float
+
+    Returns
+    -------
+    omega : array
+        Sorted.
+    info : int
+        Of LAPACK; 0: success.
     """
     n, m = B.shape
     Dt = transposed(D)
@@ -104,13 +116,37 @@ def _gain(g, k, Dk):
 
 @compiled
 def sensitivity_gain(G, K, Dk, ω):
-    """σ_max(S(jω))."""
+    """Evaluate σ_max(S(jω)).
+
+    Parameters
+    ----------
+    G, K : tuples
+        Plant and controller as `prepare` returns them.
+    Dk : array (m, p)
+        Feedthrough of the controller.
+    ω : float
+
+    Returns
+    -------
+    float
+    """
     return _gain(response(G, ω), response(K, ω), Dk)
 
 
 @compiled
 def sensitivity_gains(G, K, Dk, ω):
-    """σ_max(S(jω)) at every ω of an array."""
+    """Evaluate σ_max(S(jω)) over an array.
+
+    Parameters
+    ----------
+    G, K, Dk
+        As in `sensitivity_gain`.
+    ω : array (k,)
+
+    Returns
+    -------
+    array (k,)
+    """
     g, k = responses(G, ω), responses(K, ω)
     out = np.empty(ω.size)
     for i in range(ω.size):

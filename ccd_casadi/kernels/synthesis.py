@@ -1,5 +1,7 @@
 """One synthesis of a controller, with or without a disturbance at the plant's input."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ccd_casadi.kernels.adjoint import bound_terms
@@ -17,7 +19,7 @@ from ccd_casadi.kernels.generalized_plant import (
 )
 from ccd_casadi.kernels.linear_algebra import solve, stable_subspace
 from ccd_casadi.kernels.riccati import (
-    NOISE,
+    RiccatiOptions,
     balancing,
     in_coordinates,
     level_hamiltonian,
@@ -26,9 +28,30 @@ from ccd_casadi.kernels.riccati import (
 )
 from ccd_casadi.kernels.sensitivity import Code, Column
 
-EDGE = 0.95  # squared: a peak of the bound below this share of the highest is not refined
-AT_REST = np.concatenate([[0.0], np.geomspace(1e-9, 5e-6, 8)])  # over ω₀: where W1 is largest
-ZOOMS, POINTS = 4, 17  # each narrows the bracket of a peak to an eighth
+
+class SynthesisOptions(NamedTuple):
+    """Numbers of a synthesis.
+
+    Attributes
+    ----------
+    gamma_tolerance : float
+        Relative, of γ_opt.
+    error_accepted : float
+        Relative error of γ_opt above which it is searched for in balanced coordinates, too.
+    refined_from : float
+        Share of the highest peak of the bound, squared, from which a peak is refined.
+    zooms, zoom_points : int
+        Refinements of a peak, each of which narrows its bracket to an eighth by this many points.
+    """
+
+    gamma_tolerance: float = 1e-11
+    error_accepted: float = 1e-8
+    refined_from: float = 0.95
+    zooms: int = 4
+    zoom_points: int = 17
+
+
+OPTIONS = SynthesisOptions()
 
 
 def filter_solution(A, B, C, delta):
@@ -42,7 +65,22 @@ def filter_solution(A, B, C, delta):
 
 
 def four_block_plant(A, B, C, w, delta):
-    """A, B1, B2, C1, C2, D11, D12 of (r, d) to [W1 e; W2 u; W3 u]; states [plant; W1; W2; W3]."""
+    """Make the standard plant of (r, d) to [W1 e; W2 u; W3 u].
+
+    Parameters
+    ----------
+    A, B, C : arrays (n, n), (n, m), (p, n)
+        Scaled plant.
+    w : array (8,)
+        Scaled weights.
+    delta : float
+        Size of the disturbance at the plant's input.
+
+    Returns
+    -------
+    A, B1, B2, C1, C2, D11, D12 : arrays
+        States [plant; W1; W2; W3].
+    """
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     f, channels = first_order_weights(w), [p, m, m]
     N = n + p + 2 * m
@@ -90,18 +128,21 @@ def _bounds(G, w, delta, omega):
 def disturbance_bound(A, B, C, w, delta, grid):
     """γ_jω, the ω over ω₀ where it is attained, and whether along the least gain (else largest)."""
     G = prepare(A, B, C)
-    grid = np.concatenate([AT_REST, grid])
+    # from rest on, where W1 is largest
+    grid = np.concatenate([[0.0], np.geomspace(1e-9, 5e-6, 8), grid])
     values = np.nan_to_num(_bounds(G, w, delta, grid), nan=0.0)  # a pole at 0
     top, at = values.max(), np.unravel_index(int(values.argmax()), values.shape)
     best = float(top), float(grid[at[1]]), bool(at[0])
     inner = values[:, 1:-1]
-    peaks = (inner >= values[:, :-2]) & (inner > values[:, 2:]) & (inner > EDGE * top)
+    peaks = (
+        (inner >= values[:, :-2]) & (inner > values[:, 2:]) & (inner > OPTIONS.refined_from * top)
+    )
     for branch, i in zip(*np.nonzero(peaks), strict=True):
         low, high = grid[i], grid[i + 2]
-        for _ in range(ZOOMS):
-            trial = np.linspace(low, high, POINTS)
+        for _ in range(OPTIONS.zooms):
+            trial = np.linspace(low, high, OPTIONS.zoom_points)
             found = _bounds(G, w, delta, trial)[branch]
-            k = int(np.clip(found.argmax(), 1, POINTS - 2))
+            k = int(np.clip(found.argmax(), 1, OPTIONS.zoom_points - 2))
             low, high = trial[k - 1], trial[k + 1]
             if found[k] > best[0]:
                 best = float(found[k]), float(trial[k]), bool(branch)
@@ -109,8 +150,6 @@ def disturbance_bound(A, B, C, w, delta, grid):
 
 
 _COUNT = int(Column.COUNT)
-GAMMA_TOLERANCE = 1e-11
-ENOUGH = 1e-8  # relative error of γ_opt above which it is looked for in balanced coordinates too
 
 
 @compiled
@@ -139,7 +178,7 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
     """γ_opt, never below `bound`, and the central controller at backoff·γ_opt: the row, K."""
     row = np.full(_COUNT, np.nan)
     gamma_opt, limited, forms, converged, error = optimal_gamma(
-        H0, gp.B1, gp.C1, gp.d1, bound, guess, GAMMA_TOLERANCE, noise
+        H0, gp.B1, gp.C1, gp.d1, bound, guess, OPTIONS.gamma_tolerance, noise
     )
     row[Column.GAMMA_OPT], row[Column.GAMMA_LOWER_BOUND] = gamma_opt, bound
     row[Column.LIMITED_BY_BOUND], row[Column.SCHUR_FORMS] = limited, forms
@@ -164,11 +203,23 @@ def _mixed(A, B, C, w, grid, sigma):
 
 
 def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
-    """γ_opt and the central controller at backoff·γ_opt. Returns the row, A_K, B_K, C_K.
+    """Compute γ_opt and the central controller at backoff·γ_opt.
 
-    The row's code is CERTIFIED where the controller may go on to be assessed. `balanced` solves
-    in balanced coordinates, with the noise of rounding measured; the controller is in the
-    plant's own ones always. δ > 0 is the four-block problem of `disturbance`.
+    Parameters
+    ----------
+    A, B, C, w, grid, sigma, backoff, guess
+        As in `design.design`.
+    balanced : bool
+        Solve in balanced coordinates, with the noise of rounding measured; the controller is in the
+        plant's coordinates in any case.
+    delta : float
+        Above 0 it is the four-block problem with a disturbance.
+
+    Returns
+    -------
+    row : array (Column.COUNT,)
+        Its code is CERTIFIED where the controller may go on to be certified.
+    A_K, B_K, C_K : arrays
     """
     if delta == 0.0:
         matrices, bound = _mixed(A, B, C, w, grid, sigma)
@@ -185,9 +236,10 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
         with np.errstate(all="ignore"):  # an undefined number is seen in the result
             row, *K = _search_and_control(gp, H0, bound, backoff, guess, rounding_noise(H0))
             return row, *_in_own_coordinates(*K, τ)
-    row, *K = _search_and_control(gp, lqr_hamiltonian(gp), bound, backoff, guess, NOISE)
+    noise = RiccatiOptions.noise
+    row, *K = _search_and_control(gp, lqr_hamiltonian(gp), bound, backoff, guess, noise)
     closed = row[Column.CODE] != Code.GAMMA_NOT_CONVERGED
-    if closed and ENOUGH < row[Column.GAMMA_ERROR] < np.inf:
+    if closed and OPTIONS.error_accepted < row[Column.GAMMA_ERROR] < np.inf:
         return _with_a_better_optimum(row, K, gp, bound, backoff)
     return row, *K
 
@@ -212,7 +264,7 @@ def _with_a_better_optimum(row, K, gp, bound, backoff):
     gp, H0, τ = _balanced(gp, bound)
     gamma_opt, error = float(row[Column.GAMMA_OPT]), float(row[Column.GAMMA_ERROR])
     again, at_bound, more, closed, left = optimal_gamma(
-        H0, gp.B1, gp.C1, gp.d1, bound, gamma_opt, GAMMA_TOLERANCE, NOISE
+        H0, gp.B1, gp.C1, gp.d1, bound, gamma_opt, OPTIONS.gamma_tolerance, RiccatiOptions.noise
     )
     row[Column.SCHUR_FORMS] += more
     # only what both agree on within their errors is the same optimum

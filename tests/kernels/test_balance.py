@@ -15,7 +15,7 @@ from ccd_casadi.kernels import design as module
 from ccd_casadi.kernels.design import design
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.riccati import NOISE, balancing, lqr_hamiltonian, rounding_noise
+from ccd_casadi.kernels.riccati import RiccatiOptions, balancing, lqr_hamiltonian, rounding_noise
 from ccd_casadi.kernels.sensitivity import Code, Column
 from ccd_casadi.kernels.synthesis import synthesise
 from ccd_casadi.lti.state_space import StateSpace
@@ -170,4 +170,4 @@ def test_noise_is_what_rounding_leaves_of_a_positive_matrix() -> None:
         A, B, C, w, *_ = arguments(item)
         gp = generalized_plant(A, B, C, w)
         noise = rounding_noise(lqr_hamiltonian(gp))
-        assert NOISE <= noise < 1e-2
+        assert RiccatiOptions.noise <= noise < 1e-2

@@ -7,9 +7,11 @@ from oracles.kernel_draws import WEIGHTS
 
 from ccd_casadi.kernels import design, gamma, riccati
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.synthesis import ENOUGH
+from ccd_casadi.kernels.synthesis import SynthesisOptions
 from ccd_casadi.kernels.synthesis import synthesise as kernel
 from ccd_casadi.synthesis.synthesis import synthesise
+
+NOISE = riccati.RiccatiOptions.noise
 
 
 def test_the_guess_is_exact_where_gamma_is_a_product_of_powers() -> None:
@@ -87,7 +89,7 @@ def level():  # type: ignore[no-untyped-def]
     gamma = synthesise(plant, WEIGHTS, omega_low=OMEGA_LOW).figures.gamma_opt
 
     def at(t: float):  # type: ignore[no-untyped-def]
-        return riccati.riccati_level(H0, B1, C1, d1, t, riccati.NOISE)
+        return riccati.riccati_level(H0, B1, C1, d1, t, NOISE)
 
     return at, gamma**2 - d1**2, (B1, C1, d1)
 
@@ -133,7 +135,7 @@ def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> 
     top = gamma**2 - gp[5] ** 2
     for off in (-0.1, -0.03, 0.03, 0.1):
         t = (1.0 + off) * top
-        f, slope, _, frame = riccati.riccati_level(H0, gp[1], gp[3], gp[5], t, riccati.NOISE)
+        f, slope, _, frame = riccati.riccati_level(H0, gp[1], gp[3], gp[5], t, NOISE)
         step, estimate = riccati.root_nearby(gp[1], gp[3], gp[5], frame, f / (slope * t * t))
         assert abs(t / (1.0 + step * t) - top) < top * estimate * top
 
@@ -149,7 +151,7 @@ def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
     t = level**2 - d1**2
 
     def root(H: np.ndarray) -> tuple[float, float]:
-        f, slope, ok, frame = riccati.riccati_level(H, B1, C1, d1, t, riccati.NOISE)
+        f, slope, ok, frame = riccati.riccati_level(H, B1, C1, d1, t, NOISE)
         assert ok
         step = riccati.root_nearby(B1, C1, d1, frame, f / (slope * t * t))[0]
         return np.sqrt(t / (1.0 + step * t) + d1**2), gamma.rounding_error(frame, t, d1)
@@ -176,9 +178,9 @@ def test_gamma_that_rounding_would_spoil_is_found_in_balanced_coordinates(seed: 
     data = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain, 1.02)
     row = kernel(*data, 0.0, False)[0]
     bound, tolerance = row[design.Column.GAMMA_LOWER_BOUND], 1e-11
-    own = gamma.optimal_gamma(H0, gp[1], gp[3], gp[5], bound, 0.0, tolerance, riccati.NOISE)
+    own = gamma.optimal_gamma(H0, gp[1], gp[3], gp[5], bound, 0.0, tolerance, NOISE)
     assert own[3]
-    assert own[4] > ENOUGH
+    assert own[4] > SynthesisOptions().error_accepted
     assert row[design.Column.GAMMA_ERROR] < 0.1 * own[4]
     assert row[design.Column.GAMMA_OPT] == pytest.approx(own[0], rel=own[4])
     for guess in (0.98, 1.01, 1.03):  # other levels on the way, other rounding

@@ -40,7 +40,8 @@ def test_the_largest_singular_value_of_a_diagonal_matrix_wherever_it_stands() ->
 def test_schur_responses_and_slopes_are_those_of_dense_solves(seed, n, m, p) -> None:
     system = random_system(seed, n, m, p)
     prepared = frequency.prepare(system.A, system.B, system.C)
-    omega = np.geomspace(1e-2, 1e2, 2 * frequency.CHUNK + 3)  # whole chunks and a part of one
+    # whole chunks and a part of one
+    omega = np.geomspace(1e-2, 1e2, 2 * frequency.OPTIONS.chunk + 3)
     expected = state_response(system, omega)
     size = np.linalg.norm(system.C) * np.linalg.norm(system.B)
     inverse = np.linalg.inv(1j * omega[:, None, None] * np.eye(n) - system.A)
