@@ -15,9 +15,6 @@ NOT_YET = (
     "ccd_casadi.fixed_structure.", "ccd_casadi.optim.", "ccd_casadi.inner_problem.",
     "ccd_casadi.robust.", "ccd_casadi.codesign.", "ccd_casadi.synthesis.", "ccd_casadi.sampling.",
     "ccd_casadi.deployment.", "ccd_casadi.analysis.", "ccd_casadi.limitations.", "surrogates.",
-
-    "ccd_casadi.kernels.",
-    "ccd_casadi.case_studies.",
 )  # fmt: skip
 
 

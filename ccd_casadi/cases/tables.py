@@ -329,8 +329,9 @@ class Case(NotebookHtml):
     plant : PlantTable
     theta, fixed : tuples of Parameter
         Searched parameters; fixed ones and those that vary.
-    objective ... units : tables of the same names
-        In units of the file.
+    objective, weights, inner, suspension, places, robust, controller, loop, budget : tables
+    sampling, outer, baseline, limits, motor, move, units : tables
+        Of the same names, in units of the file.
     """
 
     path: Path

@@ -20,9 +20,19 @@ LEAST_POINTS = 8  # of a curve that values are read off
 
 @dataclass(frozen=True)
 class Curve:
-    """y over x; `line` and `marker` as in matplotlib, either may be empty.
+    """y over x.
 
-    hz: of each point, where the curve is a locus over frequency and not y of x.
+    Attributes
+    ----------
+    x, y : arrays (k,)
+        In the units of the panel's labels.
+    label, colour : str
+    line, marker : str
+        As in matplotlib, either may be empty.
+    width : float
+        pt.
+    hz : array (k,), optional
+        Frequencies in Hz of the points, where the curve is a locus and not y of x.
     """
 
     x: Array
@@ -43,7 +53,13 @@ class Curve:
 
 @dataclass(frozen=True)
 class Band:
-    """The area between low and high over x."""
+    """The area between low and high over x.
+
+    Attributes
+    ----------
+    x, low, high : arrays (k,)
+    label, colour : str
+    """
 
     x: Array
     low: Array
@@ -54,7 +70,15 @@ class Band:
 
 @dataclass(frozen=True)
 class Mark:
-    """A marked point and its words, beside it in points (dx, dy)."""
+    """A marked point and its words.
+
+    Attributes
+    ----------
+    x, y : float
+    text, marker, colour : str
+    offset : tuple of float
+        Of the words, pt.
+    """
 
     x: float
     y: float
@@ -66,7 +90,15 @@ class Mark:
 
 @dataclass(frozen=True)
 class Level:
-    """A thin line across the panel at `value`, with its words at the end."""
+    """A thin line across the panel, with its words at the end.
+
+    Attributes
+    ----------
+    value : float
+    text : str
+    vertical : bool
+    colour : str
+    """
 
     value: float
     text: str
@@ -76,7 +108,14 @@ class Level:
 
 @dataclass(frozen=True)
 class Area:
-    """A shaded area with its corners at (x, y): where a curve may not be."""
+    """A shaded area, where a curve may not be.
+
+    Attributes
+    ----------
+    x, y : arrays (k,)
+        Its corners.
+    colour : str
+    """
 
     x: Array
     y: Array
@@ -85,7 +124,24 @@ class Area:
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes; `equal`: of one scale. Labels have units; ranges default to the data."""
+    """One pair of axes.
+
+    Attributes
+    ----------
+    x_label, y_label : str
+        With units.
+    curves, bands, marks, levels, forbidden : tuples
+        Of Curve, Band, Mark, Level, Area.
+    log_x, log_y : bool
+    x_range, y_range : tuple of float, optional
+        By default those of the data.
+    y_step : float, optional
+        Between ticks.
+    legend : "best" or None
+    title : str
+    equal : bool
+        Both axes have one scale.
+    """
 
     x_label: str
     y_label: str
@@ -109,6 +165,11 @@ class Table:
     """Column heads and rows of texts or numbers; numbers are rounded and set to the right.
 
     A number that is not finite is None, and shows as a dash.
+
+    Attributes
+    ----------
+    head : tuple of str
+    rows : tuple of tuples
     """
 
     head: tuple[str, ...]
@@ -132,10 +193,17 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """An <svg> element that a plant or a machine has drawn of itself.
+    """An <svg> element that a plant or a machine has drawn.
 
-    Raises ValueError where it holds more than shapes and words: it goes into a page as it is, and a
-    report.json may come from a stranger.
+    Attributes
+    ----------
+    svg : str
+
+    Raises
+    ------
+    ValueError
+        It holds more than shapes and words: it goes into a page unchanged, and a report.json may
+        come from a stranger.
     """
 
     svg: str
@@ -146,7 +214,14 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Mode shapes on a plant's surface: to be turned, with a scale, or small ones that stand."""
+    """Mode shapes on a plant's surface.
+
+    Attributes
+    ----------
+    shapes : ModeShapes
+    turning : bool
+        To be turned, with a scale; else small and fixed.
+    """
 
     shapes: ModeShapes
     turning: bool = False
@@ -157,7 +232,16 @@ Place = Panel | Picture | Modes | Table | None  # None: an empty one
 
 @dataclass(frozen=True)
 class Lines:
-    """Rows of panels, read out as `title`; heights in inches, 2.9 by default."""
+    """Rows of panels.
+
+    Attributes
+    ----------
+    rows : tuple of tuples of Place
+    title : str
+        Read out in place of the figure.
+    heights : tuple of float
+        Of the rows in inches, 2.9 by default.
+    """
 
     rows: tuple[tuple[Place, ...], ...]
     title: str
@@ -175,11 +259,28 @@ class ThetaPath:
 
 @dataclass(frozen=True)
 class Landscape:
-    """ω_b*(θ) in Hz on a grid of two parameters (NaN: infeasible), and what is known of it.
+    """ω_b*(θ) on a grid of two parameters, and what is known of it.
 
-    `bandwidth_hz` (len(first), len(second)), empty where there is no surrogate. `truths` are
-    rows (θ₁, θ₂, Hz), `designs` rows (θ₁, θ₂). `forbidden` is where some λ(θ) > 0. `region` is
-    a trust region (low₁, high₁, low₂, high₂), `optimum` the verified one.
+    Attributes
+    ----------
+    names, units : tuples of str
+        Of the parameters.
+    first, second : arrays
+        Their grids, SI.
+    bandwidth_hz : array (len(first), len(second))
+        NaN: infeasible; empty where there is no surrogate.
+    truths : array (k, 3)
+        Rows (θ₁, θ₂, Hz).
+    designs : array (k, 2)
+        Rows (θ₁, θ₂).
+    truth_label : str
+    forbidden : bool array, optional
+        Where some λ(θ) > 0.
+    region : tuple of float, optional
+        Trust region (low₁, high₁, low₂, high₂).
+    paths : tuple of ThetaPath
+    optimum : tuple of float, optional
+        The verified θ.
     """
 
     names: tuple[str, str]
@@ -211,8 +312,15 @@ Drawing = Lines | Landscape | Modes | Picture
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure with its caption, and the numbers behind it, which a page folds away: by default
-    those of its curves (`numbers`)."""
+    """A figure with its caption.
+
+    Attributes
+    ----------
+    drawing : Lines, Landscape, Modes or Picture
+    caption : str
+    tables : tuple of Table
+        The numbers behind it, which a page folds away; by default those of its curves.
+    """
 
     drawing: Drawing
     caption: str
@@ -221,14 +329,24 @@ class Figure:
 
 @dataclass(frozen=True)
 class Words:
-    """A paragraph."""
+    """A paragraph.
+
+    Attributes
+    ----------
+    text : str
+    """
 
     text: str
 
 
 @dataclass(frozen=True)
 class Heading:
-    """Of a part of a chapter."""
+    """The heading of a part of a chapter.
+
+    Attributes
+    ----------
+    text : str
+    """
 
     text: str
 
@@ -242,7 +360,12 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Links:
-    """Pages beside this one: address, title, and what is on it."""
+    """Pages beside this one.
+
+    Attributes
+    ----------
+    items : tuple of (address, title, words)
+    """
 
     items: tuple[tuple[str, str, str], ...]
 
@@ -256,7 +379,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Facts:
-    """Quantity, value and remark in three columns."""
+    """Quantity, value and remark in three columns.
+
+    Attributes
+    ----------
+    rows : tuple of Fact
+    """
 
     rows: tuple[Fact, ...]
 
@@ -272,7 +400,15 @@ class Steps:
 
 @dataclass(frozen=True)
 class VerdictLine:
-    """A line of a run's verdict: its name, `passed`, `warned`, `failed` or `unknown`, and why."""
+    """A line of a run's verdict.
+
+    Attributes
+    ----------
+    name : str
+    state : str
+        `passed`, `warned`, `failed` or `unknown`.
+    words : str
+    """
 
     name: str
     state: str
@@ -288,9 +424,21 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Head:
-    """Title, status with its reason, a line of circumstances, the conclusion, the verdict.
+    """The head of a page.
 
-    `badge`: "good", "warn" or "bad". `decision`: what to do, or the answer, in a sentence or two.
+    Attributes
+    ----------
+    title : str
+    badge : str
+        "good", "warn" or "bad".
+    status, reason : str
+    meta : str
+        Circumstances.
+    lead : str
+        The conclusion.
+    verdict : tuple of VerdictLine
+    decision : str
+        What to do, or the answer, in a sentence or two.
     """
 
     title: str
@@ -309,7 +457,15 @@ Block = Text | Table | Figure | Picture | Steps
 
 @dataclass(frozen=True)
 class Chapter:
-    """A heading and what stands under it; `own_page` starts a page in print."""
+    """A heading and the blocks below it.
+
+    Attributes
+    ----------
+    heading : str
+    body : tuple of Block
+    own_page : bool
+        It starts a page in print.
+    """
 
     heading: str
     body: tuple[Block, ...]
@@ -318,7 +474,15 @@ class Chapter:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole page; `index`: the one that links all of the run, empty where there is none."""
+    """A whole page.
+
+    Attributes
+    ----------
+    head : Head
+    chapters : tuple of Chapter
+    index : str
+        Address of the page that links all of the run; empty where there is none.
+    """
 
     head: Head
     chapters: tuple[Chapter, ...]

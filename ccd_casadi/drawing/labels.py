@@ -85,12 +85,21 @@ def in_points(axes: "Axes", x: Any, y: Any) -> np.ndarray:
 
 
 class Labels:
-    """Where the words of one panel go, whose axes take a box in pt; `points` gives places of its
-    data (k, 2) in pt, `ranges` are the ends of both axes.
+    """The places of the words of one panel.
 
     A label takes a place off the curves where there is one. Without a place that hides no other
-    label it is left out: the data of every figure stand in the table below it. Widths are those of
-    DejaVu Sans by a rule of thumb, as the browser sets a font of its own.
+    label it is left out: the data of every figure are in the table below it. Widths are those of
+    DejaVu Sans by a rule of thumb, as the browser chooses the font.
+
+    Parameters
+    ----------
+    panel : Panel
+    box : tuple of float
+        Of its axes, pt.
+    points : callable
+        (x, y) of the data -> places (k, 2), pt.
+    ranges : sequence of (low, high)
+        Of both axes.
     """
 
     def __init__(

@@ -170,7 +170,16 @@ def _ranges(axes: "Axes", panel: Panel) -> None:
 
 
 def positive_range(arrays: Iterable[Any]) -> tuple[float, float]:
-    """A range for a logarithmic axis around all positive finite values, a little wider."""
+    """Find a range for a logarithmic axis around all positive finite values, a little wider.
+
+    Parameters
+    ----------
+    arrays : iterable of arrays
+
+    Returns
+    -------
+    low, high : float
+    """
     values = np.concatenate([np.ravel(np.asarray(a, float)) for a in arrays])
     values = values[np.isfinite(values) & (values > 0.0)]
     if not values.size:

@@ -34,8 +34,19 @@ Column = tuple[str, str, Array, Array, bool]  # its axis, its name, x, y, whethe
 
 
 def tables_of(drawing: Drawing) -> tuple[Table, ...]:
-    """One for each axis, whose panels share it, with a column for each curve; of dots by themselves
-    all. Of a landscape its grid, thinned, and the true samples; nothing of a picture."""
+    """Tabulate the numbers of a drawing.
+
+    Panels that share an axis have one table, with a column for each curve. Of a landscape there are
+    its grid, thinned, and the true samples; a picture has none.
+
+    Parameters
+    ----------
+    drawing : Drawing
+
+    Returns
+    -------
+    tuple of Table
+    """
     if isinstance(drawing, Landscape):
         return _of_landscape(drawing)
     rows = drawing.rows if isinstance(drawing, Lines) else ()
@@ -112,7 +123,17 @@ STYLED = ("steps", "turntable")
 
 
 def theme(which: int) -> str:
-    """The colours of figures as variables of CSS: 0 light, 1 dark."""
+    """Write the colours of figures as variables of CSS.
+
+    Parameters
+    ----------
+    which : int
+        0 light, 1 dark.
+
+    Returns
+    -------
+    str
+    """
     return "; ".join(f"--{name}: {colours[which]}" for name, colours in THEME.items())
 
 
@@ -123,7 +144,16 @@ CSS = (
 
 
 def escape(text: object) -> str:
-    """Text for HTML, quotes included; control characters show as a replacement sign."""
+    """Escape text for HTML, quotes included; control characters become a replacement sign.
+
+    Parameters
+    ----------
+    text : object
+
+    Returns
+    -------
+    str
+    """
     return str(escaped(printable(str(text))))
 
 
@@ -152,9 +182,19 @@ def _power(found: re.Match[str]) -> str:
 
 
 def page_html(page: c.Page, workers: Pool | None = None) -> str:
-    """The whole document; `workers` draw a chapter each.
+    """Write a whole document.
 
     Its policy forbids any request; a script that the body needs is allowed by its hash alone.
+
+    Parameters
+    ----------
+    page : Page
+    workers : Pool, optional
+        They draw a chapter each.
+
+    Returns
+    -------
+    str
     """
     chapters = {i: (chapter, str(i)) for i, chapter in enumerate(page.chapters, 1)}
     drawn = dict(results(workers, block_html, chapters))
@@ -170,7 +210,18 @@ def page_html(page: c.Page, workers: Pool | None = None) -> str:
 
 
 def block_html(block: c.Block | c.Drawing | c.Chapter | c.Head, key: str = "") -> Markup:
-    """One part of a page; `key` is unique in it."""
+    """Write one part of a page.
+
+    Parameters
+    ----------
+    block : Block, Drawing, Chapter or Head
+    key : str
+        Unique in the page.
+
+    Returns
+    -------
+    Markup
+    """
     made: Any = getattr(_blocks().module, type(block).__name__)
     return Markup(made(block, key))
 
@@ -189,7 +240,15 @@ FORMAT = 1
 
 
 def write_page(path: Path, page: Page, workers: Pool | None = None) -> None:
-    """Draw a page and keep what it shows in report.json beside it, each atomically."""
+    """Draw a page and keep what it shows in report.json beside it, each atomically.
+
+    Parameters
+    ----------
+    path : Path
+    page : Page
+    workers : Pool, optional
+        They draw a chapter each.
+    """
     try:
         pages = read_pages(path.parent)
     except UserError:  # what cannot be read is written anew
@@ -212,9 +271,21 @@ def draw(path: Path, stored: Any, workers: Pool | None = None) -> None:
 
 
 def read_pages(folder: Path) -> dict[str, Any]:
-    """The entries of a folder's report.json; none where there is no such file.
+    """Read the entries of a folder's report.json.
 
-    Raises UserError where it is damaged, or of a later version.
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    dict of str to dict
+        Name of the page -> what it shows; empty where there is no such file.
+
+    Raises
+    ------
+    UserError
+        The file is damaged, or of a later version.
     """
     path = folder / NAME
     if not path.exists():

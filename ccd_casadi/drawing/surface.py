@@ -156,7 +156,21 @@ def sharp_edges(points: Array, faces: np.ndarray) -> Array:
 
 
 def surface_figure(surfaces: Mapping[str, Array], faces: np.ndarray, masses: list[float]) -> Figure:
-    """Machines by name, points (n, 3) in m of the same faces, and their masses in kg in a table."""
+    """Draw machines by the edges of their surfaces, from above and from the side, at one scale.
+
+    Parameters
+    ----------
+    surfaces : mapping
+        Name -> points (n, 3), m.
+    faces : int array (q, 4)
+        Numbers of points, the same for all.
+    masses : list of float
+        kg.
+
+    Returns
+    -------
+    Figure
+    """
     mm = [1e3 * points for points in surfaces.values()]
     low, high = (f([f(points, axis=0) for points in mm], axis=0) for f in (np.min, np.max))
     margin = ROOM * float((high - low).max())

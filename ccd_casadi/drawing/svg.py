@@ -23,10 +23,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ModeShape:
-    """Displacements (n, 3) of the surface's points in 1/√kg at a frequency in Hz.
+    """A mode on a surface.
 
-    words: its name, if it has one. numbers: its places among the flexible modes, from 1; two where
-    it stands for a pair of equal frequency. more: further figures of it, by what they are.
+    Attributes
+    ----------
+    displacement : array (n, 3)
+        Of the surface's points, 1/√kg.
+    frequency : float
+        Hz.
+    numbers : tuple of int
+        Its places among the flexible modes, from 1; two for a pair of equal frequency.
+    words : str
+        Its name, if it has one.
+    more : mapping
+        Further figures by their names.
     """
 
     displacement: Array
@@ -50,10 +60,17 @@ class ModeShape:
 
 @dataclass(frozen=True, eq=False)
 class ModeShapes:
-    """Modes, lowest first, of a surface: points (n, 3) in m, faces (q, 4) of their numbers.
+    """Modes of a surface, lowest first.
 
-    Faces are counter-clockwise from outside; a triangle names its last corner twice. `view`: from
-    where pictures see it.
+    Attributes
+    ----------
+    points : array (n, 3)
+        m.
+    faces : int array (q, 4)
+        Numbers of points, counter-clockwise from outside; a triangle names its last corner twice.
+    modes : tuple of ModeShape
+    view : str
+        From where pictures see it.
     """
 
     points: Array
@@ -63,7 +80,17 @@ class ModeShapes:
 
 
 def outer_faces(faces: np.ndarray) -> np.ndarray:
-    """Of the faces (f, k) of all elements those that no second element has: the surface."""
+    """Find the surface of a mesh: faces that only one element has.
+
+    Parameters
+    ----------
+    faces : int array (f, k)
+        Of all elements.
+
+    Returns
+    -------
+    int array (q, k)
+    """
     _, first, times = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
     )
@@ -184,12 +211,30 @@ def require_shapes(svg: str) -> None:
 
 
 def axis_label(name: str, unit: str) -> str:
-    """`name (unit)`, on one line and not longer than an axis; no unit shows as a dash."""
+    """Write `name (unit)` on one line, not longer than an axis; no unit shows as a dash.
+
+    Parameters
+    ----------
+    name, unit : str
+
+    Returns
+    -------
+    str
+    """
     return f"{short_label(name)} ({short_label(unit) or '–'})"
 
 
 def short_label(text: str) -> str:
-    """A name on one line, not longer than an axis."""
+    """Shorten a name to one line that is not longer than an axis.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+    """
     words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return words if len(words) <= LONGEST_LABEL else words[: LONGEST_LABEL - 1] + "…"
 

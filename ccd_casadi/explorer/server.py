@@ -41,7 +41,21 @@ def _require_event_loop() -> None:
 
 
 class Explorer:
-    """Serves a session until `stop`; `url` has the token, without which every path is refused."""
+    """The server of a session, until `stop`.
+
+    Parameters
+    ----------
+    session : Session
+    workers, seed : int
+        Of the solves that are started from the page.
+    user_code : bool
+        Whether plant functions of users may run.
+
+    Attributes
+    ----------
+    url : str
+        With a token, without which every path is refused.
+    """
 
     def __init__(
         self, session: Session, *, workers: int, seed: int = 0, user_code: bool = True

@@ -41,7 +41,15 @@ SLOW = 0.1  # s that the model may take at a θ before it is solved in the backg
 
 
 class Session:
-    """One case, one folder; `live` answers at once, `full` takes what the inner search takes."""
+    """One case in one folder: `live` answers at once, `full` takes the time of the inner search.
+
+    Parameters
+    ----------
+    case : Case
+    folder : Path
+    run : FinishedRun, optional
+        Where the session starts.
+    """
 
     def __init__(self, case: Case, folder: Path, run: FinishedRun | None = None) -> None:
         self.case, self.folder, self.run = case, folder, run

@@ -63,6 +63,7 @@ def natural_modes(
         Stiffness and mass, symmetric, M positive definite, SI.
     stated : int, optional
         How many rigid-body modes the case states: where K leaves it open the lowest ones are.
+    options : RigidModeOptions
 
     Returns
     -------
@@ -129,6 +130,7 @@ def driven_and_measured(
     ----------
     B, C : arrays (k, m), (p, k)
         Relative to those of the whole plant.
+    options : RigidModeOptions
 
     Returns
     -------

@@ -36,9 +36,21 @@ LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without bei
 def robustness_page(
     run: FinishedRun, found: Study, seed: int, index: str = "", *, own: bool = True
 ) -> Page:
-    """robustness.html; `index`: the page that links all of the run.
+    """Make robustness.html.
 
-    `own`: of the run's own controller, so that the run's decision and verdict stand on it.
+    Parameters
+    ----------
+    run : FinishedRun
+    found : Study
+    seed : int
+    index : str
+        Address of the page that links all pages of the run.
+    own : bool
+        The controller is the run's, so that the run's decision and verdict are shown.
+
+    Returns
+    -------
+    Page
     """
     lead, *others = conclusion(run, found)
     given = "This controller is stable on every plant that was tried."
@@ -64,7 +76,17 @@ def robustness_page(
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
-    """The findings in sentences, the most important first."""
+    """Write the findings in sentences, the most important first.
+
+    Parameters
+    ----------
+    run : FinishedRun
+    found : Study
+
+    Returns
+    -------
+    list of str
+    """
     throughout = np.allclose(found.damping.stable, found.demands.damping, rtol=1e-9)
     S_max, lost = run.problem.inner.S_max, _bandwidth_lost(run, found)
     return _words("findings", found, S_max, run.sampling, throughout, lost)

@@ -113,7 +113,6 @@ def mirror_signs(symmetry: Symmetry, left: bool, below: bool) -> tuple[int, int,
 # exponents of (l_x, l_y, l_z) in the coefficients: the six of K, then that of M
 EXPONENTS = np.array([[1 - (d == p) - (d == q) for d in range(3)] for p, q in PAIRS] + [[1, 1, 1]])
 COPIES = 4  # quarters in the stage
-AT_ONCE = 500_000  # data of a matrix that are summed: the signs of all as floats are 100 MB
 
 
 @dataclass(frozen=True)
@@ -132,12 +131,15 @@ class Pattern:
     boxes: np.ndarray
     counts: np.ndarray
 
-    def fill(self, values: Array) -> sparse.csr_matrix:
-        """The symmetric matrix with these entries of the boxes, concatenated."""
+    def fill(self, values: Array, *, at_once: int = 500_000) -> sparse.csr_matrix:
+        """The symmetric matrix with these entries of the boxes, concatenated.
+
+        `at_once` data are summed: the signs of all as floats are 100 MB.
+        """
         size, data = len(self.indptr) - 1, np.empty(len(self.counts))
         first = np.append(0, np.cumsum(self.counts, dtype=np.int32))
-        for low in range(0, len(data), AT_ONCE):
-            own = first[low : low + AT_ONCE + 1]
+        for low in range(0, len(data), at_once):
+            own = first[low : low + at_once + 1]
             part, count = slice(own[0], own[-1]), len(own) - 1
             entries = self.signs[part], self.boxes[part], own - own[0]
             terms = sparse.csr_matrix(entries, shape=(count, len(values)))

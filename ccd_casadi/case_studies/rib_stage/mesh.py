@@ -123,7 +123,7 @@ FINE = MeshOrder(((0.03, 2), (0.94, 6), (0.03, 2)), ((1.0, 4),), ((0.06, 2), (0.
 
 
 @dataclass(frozen=True)
-class Axis:
+class MeshAxis:
     """One direction: cell lengths l₀ + S θ, orders, the first node of each cell and rib cells."""
 
     offset: Array
@@ -184,8 +184,8 @@ class Block:
 class Mesh:
     """Axes along x (and y, which is alike) and z, boxes, and node (i, j, k) -> number or -1."""
 
-    plan: Axis
-    height: Axis
+    plan: MeshAxis
+    height: MeshAxis
     blocks: tuple[Block, ...]
     number: np.ndarray
     grid: np.ndarray  # (nodes, 3): i, j, k of each node
@@ -211,14 +211,14 @@ class Mesh:
         return values, slopes
 
 
-def _axis(offset: Array, slope: Array, cells: list[Cells], rib: tuple[bool, ...]) -> Axis:
+def _axis(offset: Array, slope: Array, cells: list[Cells], rib: tuple[bool, ...]) -> MeshAxis:
     parts = [(interval, *cell) for interval, group in enumerate(cells) for cell in group]
     index = np.array([part[0] for part in parts])
     share = np.array([part[1] for part in parts])
     orders = tuple(part[2] for part in parts)
     starts = (0, *np.cumsum(orders)[:-1].tolist())
     ribs = tuple(rib[part[0]] for part in parts)
-    return Axis(offset[index] * share, slope[index] * share[:, None], orders, starts, ribs)
+    return MeshAxis(offset[index] * share, slope[index] * share[:, None], orders, starts, ribs)
 
 
 @lru_cache(maxsize=8)

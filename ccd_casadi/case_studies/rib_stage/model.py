@@ -29,7 +29,6 @@ from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 
-APART = 1e-9  # relative: a mode with less of z is not moved by it
 OUTPUTS = ("corners", "rigid", "modal4", "z")
 ROWS = {"z": 1, "rigid": 3, "modal4": 4}  # directions of those that are not the corners
 
@@ -198,7 +197,7 @@ def assembled(
         B, dB, C, dC = B @ drive, dB @ drive, read @ C, read @ dC
     K = np.diag([0.0, 0.0, 0.0, *lam])
     if stage.outputs == "z":
-        moved = np.abs(B[:, 0]) > APART * np.abs(B).max()
+        moved = np.abs(B[:, 0]) > 1e-9 * np.abs(B).max()  # modes with less of z are not moved
         if moved[1:3].any():
             raise StageError("z moves tip or tilt of this stage; choose other outputs")
         K, dK, n = K[moved][:, moved], dK[:, moved][:, :, moved], int(moved.sum())

@@ -41,9 +41,24 @@ from ccd_casadi.plants.eigenpairs import (
 )
 from ccd_casadi.support.arrays import Array
 
-SHIFT = (2.0 * np.pi * 100.0) ** 2
-CLUSTER = 1e-7  # eigenvalues closer than this, relative, are differentiated as a pair
-EXTRA = 2  # modes solved beyond those kept: the resolvent converges the faster
+
+@dataclass(frozen=True)
+class StageModeOptions:
+    """Numbers of the stage's eigenproblems.
+
+    Attributes
+    ----------
+    shift : float
+        rad²/s²: K + shift M is factored.
+    cluster : float
+        Relative distance below which two eigenvalues are differentiated as a pair.
+    extra : int
+        Modes solved beyond those kept, with which the resolvent converges faster.
+    """
+
+    shift: float = (2.0 * np.pi * 100.0) ** 2
+    cluster: float = 1e-7
+    extra: int = 2
 
 
 @dataclass(frozen=True)
@@ -129,17 +144,20 @@ def spectrum(
     group: Group,
     count: int,
     boxes: tuple[Array, Array] | None = None,
+    *,
+    options: StageModeOptions = StageModeOptions(),
 ) -> Spectrum:
     """The `count` lowest flexible modes of a group, signed by `sign_functional`.
 
-    `boxes`: `Assembler.box_matrices` at θ and SHIFT, which all groups share, where they are known.
+    `boxes`: `Assembler.box_matrices` at θ and `shift`, which all groups share, if known.
     """
-    stiff, body = disc.assembler.box_matrices(theta, SHIFT) if boxes is None else boxes
+    shift = options.shift
+    stiff, body = disc.assembler.box_matrices(theta, shift) if boxes is None else boxes
     sectors = [sector_of(disc, symmetry) for symmetry in group.solved]
     G, masses, _ = _point_masses(disc, group, theta, geometry.point_masses)
     shifted = (sector.stiffness.fill(stiff) for sector in sectors)  # one at a time: they are large
     bodies = [sector.mass.fill(body) for sector in sectors]
-    pencil = build_pencil(shifted, bodies, SHIFT, G, masses)
+    pencil = build_pencil(shifted, bodies, shift, G, masses)
     rigid = orthonormal(pencil, rigid_vectors(disc, group, theta))
     values, vectors = flexible_modes(pencil, rigid, count)
     vectors = vectors * np.where(sign_functional(disc, group, theta) @ vectors < 0.0, -1.0, 1.0)
@@ -191,7 +209,7 @@ def slopes(
     rigid, kept = found.rigid, V[:, :keep]
     Q, R = compressed(F)
     resolvent = build_resolvent(found.pencil, np.hstack([rigid, V]), Q, lam[keep - 1])
-    close = np.abs(lam[:keep, None] - lam[None, :]) <= CLUSTER * lam[None, :]
+    close = np.abs(lam[:keep, None] - lam[None, :]) <= StageModeOptions.cluster * lam[None, :]
     adjoint = []
     for i in range(keep):
         gap = np.where(close[i], np.inf, lam - lam[i])

@@ -21,7 +21,6 @@ from ccd_casadi.plants.registry import Model
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
 MODES = {10: ModeCount(), 20: TWENTY, 44: FORTY_FOUR}
-MOST_FADING = 8
 Points = Sequence[Sequence[float]]
 
 
@@ -55,8 +54,8 @@ def rib_stage(
         raise StageError(f"mesh is {mesh!r}; choose one of {', '.join(MESHES)}")
     if modes not in MODES:
         raise StageError(f"modes is {modes!r}; choose 10, 20 or 44")
-    if fading not in range(MOST_FADING + 1):
-        raise StageError(f"fading is {fading!r}; give a whole number from 0 to {MOST_FADING}")
+    if fading not in range((most := 8) + 1):
+        raise StageError(f"fading is {fading!r}; give a whole number from 0 to {most}")
     geometry = Geometry(
         side=side,
         material=Material(young, poisson, density),

@@ -38,11 +38,10 @@ from ccd_casadi.case_studies.rib_stage.model import (
     rigid_part,
 )
 from ccd_casadi.case_studies.rib_stage.modes import (
-    CLUSTER,
-    SHIFT,
     SQUARE_GROUPS,
     Discretisation,
     Group,
+    StageModeOptions,
     compressed,
     discretise,
     functionals,
@@ -56,19 +55,40 @@ from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.worker_process import side_by_side
 
-KNOWN = 1e-4  # of its length: what of a mode's move is beside the basis and not worth a vector
-ROUNDING = 1e-8  # the same of a mode
-BEYOND = 4  # modes of a symmetry beyond those kept: shapes move by them
-LEVELS = 2  # of what forces bend, as of a Krylov space
-COUPLED = 24  # lowest modes of each symmetry that point masses couple
 RIGID = {"A1": 1, "A2": 1, "SA": 2, "AS": 2}  # rigid motions of a symmetry
+
+
+@dataclass(frozen=True)
+class ReducedBasisOptions:
+    """Numbers of the reduced basis.
+
+    Attributes
+    ----------
+    known_slope : float
+        Share of its length up to which a mode's derivative may lie beside the basis.
+    known_mode : float
+        The same of a mode: rounding.
+    beyond : int
+        Modes of a symmetry beyond those kept, by which shapes change.
+    levels : int
+        Static responses to forces, as levels of a Krylov space.
+    coupled : int
+        Lowest modes of each symmetry that point masses couple.
+    """
+
+    known_slope: float = 1e-4
+    known_mode: float = 1e-8
+    beyond: int = 4
+    levels: int = 2
+    coupled: int = 24
+
 
 Theta = tuple[float, ...]
 Terms = tuple[np.ndarray, sparse.csr_matrix]
 
 
 @dataclass(frozen=True)
-class Basis:
+class ReducedBasis:
     """Of a group: V (n, r); the forms of K and of M to each coefficient, their lower triangles row
     by row (terms, r(r + 1)/2); u on the nodes of the lower face (nodes, 3, r) of every image."""
 
@@ -83,7 +103,7 @@ class Bases:
     """Those of the groups of the square, of so many θ."""
 
     known: tuple[Theta, ...] = ()
-    of: tuple[Basis, ...] = ()
+    of: tuple[ReducedBasis, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -159,7 +179,9 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> Bases:
     for theta in map(np.array, known[len(have) :]):
         before = made or [_of_rigid(stage, disc, group, theta) for group in SQUARE_GROUPS]
 
-        def grown(index: int, here: Array = theta, before: Sequence[Basis] = before) -> Basis:
+        def grown(
+            index: int, here: Array = theta, before: Sequence[ReducedBasis] = before
+        ) -> ReducedBasis:
             return _grown(stage, disc, SQUARE_GROUPS[index], before[index], here)
 
         # That of the tilts takes longest.
@@ -168,40 +190,46 @@ def bases(stage: RibStage, known: tuple[Theta, ...]) -> Bases:
     return found
 
 
-def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array) -> Basis:
+def _of_rigid(stage: RibStage, disc: Discretisation, group: Group, theta: Array) -> ReducedBasis:
     """Rigid motions at every θ, in which they are affine."""
     step = 0.1 * (np.array(UPPER) - np.array(LOWER))
     motions = [rigid_vectors(disc, group, place) for place in (theta, *(theta + np.diag(step)))]
     of_K, of_M = _terms(stage.order, disc.side, stage.geometry.material)
     empty = np.zeros((len(of_K[0]), 0)), np.zeros((len(of_M[0]), 0))
-    nothing = Basis(np.zeros((len(motions[0]), 0)), *empty, ())
-    return _wider(stage, disc, group, nothing, np.hstack(motions), ROUNDING)
+    nothing = ReducedBasis(np.zeros((len(motions[0]), 0)), *empty, ())
+    return _wider(stage, disc, group, nothing, np.hstack(motions), ReducedBasisOptions.known_mode)
 
 
 def _grown(
-    stage: RibStage, disc: Discretisation, group: Group, basis: Basis, theta: Array
-) -> Basis:
+    stage: RibStage,
+    disc: Discretisation,
+    group: Group,
+    basis: ReducedBasis,
+    theta: Array,
+    *,
+    options: ReducedBasisOptions = ReducedBasisOptions(),
+) -> ReducedBasis:
     """With the modes at θ, what they move by, and what forces at the points bend."""
     masses = stage.geometry.point_masses
-    count = max(TWENTY.of(group), stage.modes.of(group)) + BEYOND
+    count = max(TWENTY.of(group), stage.modes.of(group)) + options.beyond
     body, sector = replace(stage.geometry, point_masses=()), sector_of(disc, group.solved[0])
     found = spectrum(disc, body, theta, group, count)
     vectors, inverse = found.vectors, found.pencil.inverse
     acting = [*points_of(stage), *((p.x, p.y) for p in masses)]
     for image in group.images:
         bent = compressed(functionals(disc, image, theta, acting)[0].reshape(len(vectors), -1))[0]
-        for _ in range(LEVELS):
+        for _ in range(options.levels):
             bent = inverse(bent)
             vectors = np.hstack([vectors, bent])
             bent = found.pencil.mass(bent)
-    basis = _wider(stage, disc, group, basis, vectors, ROUNDING)
+    basis = _wider(stage, disc, group, basis, vectors, options.known_mode)
     moved = disc.assembler.moved(sector, theta, found.values, found.vectors)
-    return _wider(stage, disc, group, basis, inverse(moved), KNOWN)
+    return _wider(stage, disc, group, basis, inverse(moved), options.known_slope)
 
 
 def _wider(
-    stage: RibStage, disc: Discretisation, group: Group, basis: Basis, X: Array, known: float
-) -> Basis:
+    stage: RibStage, disc: Discretisation, group: Group, basis: ReducedBasis, X: Array, known: float
+) -> ReducedBasis:
     """With what of the columns of X the basis lacks by more than so much of their length."""
     V, r = basis.vectors, basis.vectors.shape[1]
     X = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
@@ -224,8 +252,8 @@ def _wider(
     rows = (3 * mesh.number[:, :, 0].reshape(-1, 1) + np.arange(3)).ravel()
     images = [swap_displacements(mesh)[rows] if image == (AS,) else rows for image in group.images]
     faces = tuple((sector.fold.matrix[own] @ V).reshape(len(own) // 3, 3, n) for own in images)
-    return Basis(V, forms(basis.stiff, fresh[:, :6], of_K), forms(basis.mass, fresh[:, 6:], of_M),
-                 faces)  # fmt: skip
+    stiff = forms(basis.stiff, fresh[:, :6], of_K)
+    return ReducedBasis(V, stiff, forms(basis.mass, fresh[:, 6:], of_M), faces)
 
 
 @lru_cache(maxsize=4)
@@ -250,7 +278,7 @@ def _terms(order: MeshOrder, side: float, material: Material) -> tuple[Terms, Te
 def _modes(
     stage: RibStage,
     group: Group,
-    basis: Basis,
+    basis: ReducedBasis,
     c: Array,
     seen: Sequence[Point],
     weights: Mapping[Point, Array],
@@ -291,13 +319,15 @@ def _whole(triangles: Array) -> Array:
     return out
 
 
-def _lowest(values: Array, G: Array) -> tuple[Array, Array]:
+def _lowest(
+    values: Array, G: Array, *, coupled: int = ReducedBasisOptions.coupled
+) -> tuple[Array, Array]:
     """λ (k,) and directions (m, k) of the lowest modes and what forces at points bend of the others
     (m,), G (m, 3, p) being the displacements there."""
-    few = min(COUPLED, len(values))
+    few, shift = min(coupled, len(values)), StageModeOptions.shift
     high = values[few:]
-    bent = G[few:].reshape(len(high), G.shape[1] * G.shape[2]) / (high + SHIFT)[:, None]
-    Q = compressed(np.hstack([bent, bent / (high + SHIFT)[:, None] * SHIFT]))[0]
+    bent = G[few:].reshape(len(high), G.shape[1] * G.shape[2]) / (high + shift)[:, None]
+    Q = compressed(np.hstack([bent, bent / (high + shift)[:, None] * shift]))[0]
     own, turn = np.linalg.eigh(Q.T @ (high[:, None] * Q))
     return np.append(values[:few], own), block_diag(np.eye(few), Q @ turn)
 
@@ -330,7 +360,7 @@ def _slopes(one: Small, rigid: int, count: int, points: int) -> tuple[Array, Arr
     kept = slice(rigid, rigid + count)
     lam, (dK, dM) = one.values[kept], (part[:, :, kept] for part in (one.dK, one.dM))
     gap = lam - one.values[:, None]
-    close = np.abs(gap) <= CLUSTER * np.maximum(lam, one.values[:, None])
+    close = np.abs(gap) <= StageModeOptions.cluster * np.maximum(lam, one.values[:, None])
     turn = np.where(close, -0.5 * dM, (dK - dM * lam) / np.where(close, 1.0, gap))
     u, du = one.u[:, 2, :points], one.du[:, kept, 2, :points]
     own_K, own_M = dK[:, kept], dM[:, kept]

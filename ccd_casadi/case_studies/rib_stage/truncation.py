@@ -8,11 +8,10 @@ import numpy as np
 from ccd_casadi.case_studies.rib_stage.assembly import AS, SA
 from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point, has_square_symmetry
 from ccd_casadi.case_studies.rib_stage.modes import (
-    EXTRA,
-    SHIFT,
     Discretisation,
     Group,
     GroupModes,
+    StageModeOptions,
     group_modes,
     groups_of,
     spectrum,
@@ -117,11 +116,11 @@ def solve_modes(
             number = max(count.total // 2, 1) if square else count.total
         if number:
             wanted[group] = number
-    boxes = disc.assembler.box_matrices(theta, SHIFT)
+    boxes = disc.assembler.box_matrices(theta, StageModeOptions.shift)
 
     def solved(group: Group) -> GroupModes:
         keep = wanted[group] + fading
-        found = spectrum(disc, geometry, theta, group, keep + EXTRA, boxes)
+        found = spectrum(disc, geometry, theta, group, keep + StageModeOptions.extra, boxes)
         return group_modes(disc, geometry, found, keep + bool(fading), points)
 
     largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
