@@ -46,7 +46,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     verified = [point for point in front.points if point.verified]
     inform(f"front         {len(verified)} of {len(front.points)} points verified, "
            f"{front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
-    from ccd_casadi.reporting.insight import insight_page
+    from ccd_casadi.reporting.insight_page import insight_page
     from ccd_casadi.reporting.verdict import index_of, publish
 
     page = insight_page(done, front, responses, index_of(folder))

@@ -12,14 +12,14 @@ from ccd_casadi.support.terminal import inform
 
 @command(
     "ccd_casadi.worth", "Estimate what co-design gains over the sequential way.",
-    needs=["ccd_casadi.studies.worth"],
+    needs=["ccd_casadi.studies.worth_estimate"],
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.studies.steepest_descent import case_to_compare
-    from ccd_casadi.studies.worth import worth, worth_words
+    from ccd_casadi.studies.worth_estimate import worth, worth_words
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.text import versions
 

@@ -4,7 +4,7 @@ from ccd_casadi.budget.evaluation import BudgetFigures as BudgetFigures
 from ccd_casadi.budget.evaluation import SourceFigures as SourceFigures
 from ccd_casadi.budget.evaluation import evaluate_budget as evaluate_budget
 from ccd_casadi.budget.sources import ErrorBudget as ErrorBudget
-from ccd_casadi.budget.sources import Kind as Kind
+from ccd_casadi.budget.sources import ErrorSource as ErrorSource
 from ccd_casadi.budget.sources import ShapedSpectrum as ShapedSpectrum
-from ccd_casadi.budget.sources import Source as Source
+from ccd_casadi.budget.sources import SourceKind as SourceKind
 from ccd_casadi.budget.sources import TabulatedSpectrum as TabulatedSpectrum

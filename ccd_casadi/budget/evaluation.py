@@ -7,8 +7,8 @@ from functools import cached_property, partial
 import numpy as np
 from scipy.linalg.lapack import dgees, dtrsyl
 
-from ccd_casadi.budget.frequency import integrated, responses
-from ccd_casadi.budget.loops import (
+from ccd_casadi.budget.error_density import integrated, responses
+from ccd_casadi.budget.noise_process import (
     FORCES,
     Matrix,
     Process,
@@ -17,7 +17,7 @@ from ccd_casadi.budget.loops import (
     disturbed,
     process,
 )
-from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
+from ccd_casadi.budget.sources import ErrorBudget, ErrorSource, SourceKind
 from ccd_casadi.lti.loop import Loop, Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -48,7 +48,7 @@ def variances(loop: Loop, budget: ErrorBudget) -> Array | None:
     )
 
 
-def of_source(loop: Loop, source: Source, window: float | None) -> Array:
+def of_source(loop: Loop, source: ErrorSource, window: float | None) -> Array:
     """As `variances`, of one source in a stable loop."""
     average = np.nan
     if source.shaped:
@@ -88,7 +88,7 @@ class ErrorVariance:
     order: int
 
     @cached_property
-    def filters(self) -> tuple[Source, ...]:
+    def filters(self) -> tuple[ErrorSource, ...]:
         """The sources with a state space."""
         return tuple(source for source in self.budget.sources if source.shaped)
 
@@ -129,7 +129,7 @@ class ErrorVariance:
         return value, gradient
 
     def _of_table(
-        self, source: Source, parts: Sequence[Matrix], plants: Sequence[StateSpace]
+        self, source: ErrorSource, parts: Sequence[Matrix], plants: Sequence[StateSpace]
     ) -> tuple[float, Array]:
         K, *stepped = (StateSpace(*own) for own in zip(*parts, strict=True))
         K = StateSpace(*(np.real(part) for part in (K.A, K.B, K.C, K.D)))
@@ -145,7 +145,7 @@ class ErrorVariance:
             d = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
             if source.kind in FORCES:
                 d = -d @ at.free - at.S @ dfree
-            elif source.kind is not Kind.SETPOINT:
+            elif source.kind is not SourceKind.SETPOINT:
                 d = -d
             gradient.append(density @ (2.0 * (H.conj() * d).real.sum((1, 2))))
         return float(value), np.array(gradient)
@@ -236,7 +236,7 @@ class SourceFigures:
     the error up to each frequency. Infinite where white noise passes undamped.
     """
 
-    source: Source
+    source: ErrorSource
     error: float
     average: float
     deviation: float
@@ -270,12 +270,12 @@ def evaluate_budget(loop: Loop, budget: ErrorBudget) -> BudgetFigures | None:
     stable, which has no stationary error. Raises UserError for a plant with a feedthrough.
 
     >>> import numpy as np
-    >>> from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
+    >>> from ccd_casadi.budget import ErrorBudget, SourceKind, ShapedSpectrum, ErrorSource
     >>> from ccd_casadi.lti.state_space import StateSpace
     >>> mass = StateSpace(np.array([[0.0, 1.0], [-1.0, -2.0]]), np.eye(2, 1, -1), np.eye(1, 2),
     ...                   np.zeros((1, 1)))
     >>> none = StateSpace(*(np.zeros((i, j)) for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))))
-    >>> white = ErrorBudget((Source("cable", Kind.FORCE, ShapedSpectrum(1.0)),))
+    >>> white = ErrorBudget((ErrorSource("cable", SourceKind.FORCE, ShapedSpectrum(1.0)),))
     >>> loop = Loop(mass, none)
     >>> round(evaluate_budget(loop, white).error ** 2, 12)  # 1/2 over 2 d k, d = 2, k = 1
     0.125
@@ -294,7 +294,7 @@ def evaluate_budget(loop: Loop, budget: ErrorBudget) -> BudgetFigures | None:
     )
 
 
-def _figures(loop: Loop, source: Source, window: float | None) -> SourceFigures:
+def _figures(loop: Loop, source: ErrorSource, window: float | None) -> SourceFigures:
 
     def weight(hz: Array) -> Array:
         return np.ones_like(hz) if window is None else average_gain(hz, window, loop.period)

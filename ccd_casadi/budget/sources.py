@@ -141,7 +141,7 @@ def polynomial(corners: Iterable[Corner], unit: float) -> Array:
     return out
 
 
-class Kind(StrEnum):
+class SourceKind(StrEnum):
     """The place where a source enters the loop."""
 
     FORCE = "force"
@@ -151,13 +151,13 @@ class Kind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Source:
+class ErrorSource:
     """One independent source of a budget.
 
     Attributes
     ----------
     name : str
-    kind : Kind
+    kind : SourceKind
     spectrum : TabulatedSpectrum or ShapedSpectrum
         One-sided density: N²/Hz of a force, m²/Hz of any other.
     path : tuple (m, c, k)
@@ -172,13 +172,13 @@ class Source:
     """
 
     name: str
-    kind: Kind
+    kind: SourceKind
     spectrum: TabulatedSpectrum | ShapedSpectrum
     path: tuple[float, float, float] = (0.0, 0.0, 0.0)
     of_acceleration: bool = False
 
     def __post_init__(self) -> None:
-        floor = self.kind is Kind.FLOOR_MOTION
+        floor = self.kind is SourceKind.FLOOR_MOTION
         if floor != any(self.path) or min(self.path) < 0.0:
             raise ValueError("floor motion needs a mass, a damping or a stiffness it acts through")
         if not isinstance(self.spectrum, ShapedSpectrum):
@@ -187,13 +187,13 @@ class Source:
             words = "a filter of the floor's acceleration acts through a mass only"
             raise ValueError(f"{words}; give its displacement, or a table")
         self.shaping()
-        if self.kind is Kind.SETPOINT and self.spectrum.relative_degree < 1:
+        if self.kind is SourceKind.SETPOINT and self.spectrum.relative_degree < 1:
             raise ValueError("the spectrum of a setpoint has to fall off; give poles_hz")
 
     @property
     def unit(self) -> str:
         """Of the square root of the spectrum's integral."""
-        if self.kind is Kind.FORCE:
+        if self.kind is SourceKind.FORCE:
             return "N"
         return "m/s^2" if self.of_acceleration else "m"
 
@@ -205,7 +205,7 @@ class Source:
     def density(self, hz: Array) -> Array:
         """The one-sided density over Hz of what enters the loop: force, noise or setpoint."""
         found = self.spectrum.at(hz)
-        if self.kind is not Kind.FLOOR_MOTION:
+        if self.kind is not SourceKind.FLOOR_MOTION:
             return found
         s = 2j * np.pi * np.asarray(hz, float)
         power = -2 if self.of_acceleration else 0
@@ -215,7 +215,7 @@ class Source:
     def shaping(self) -> StateSpace:
         """The filter from white noise (one-sided 1/Hz) to what enters the loop."""
         assert isinstance(self.spectrum, ShapedSpectrum)
-        if self.kind is not Kind.FLOOR_MOTION:
+        if self.kind is not SourceKind.FLOOR_MOTION:
             return self.spectrum.filter()
         return self.spectrum.filter(self.path[:1] if self.of_acceleration else self.path)
 
@@ -231,7 +231,7 @@ class Source:
 class ErrorBudget:
     """Independent sources, and the window in s of moving average and standard deviation."""
 
-    sources: tuple[Source, ...]
+    sources: tuple[ErrorSource, ...]
     window: float | None = None
 
     def __post_init__(self) -> None:

@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
+from ccd_casadi.budget import (
+    ErrorBudget,
+    ErrorSource,
+    ShapedSpectrum,
+    SourceKind,
+    TabulatedSpectrum,
+)
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import Fail, several, short_repr
 from ccd_casadi.cases.tables import BudgetTable, PlacesTable
@@ -65,11 +71,11 @@ def places_of(table: PlacesTable) -> Places | None:
 # Unit -> factor of a density to SI, and whether the number is its square root.
 _POSITION = {"m^2/Hz": (1.0, False), "m/rtHz": (1.0, True), "nm/rtHz": (1e-9, True)}
 _ACCELERATION = {"(m/s^2)^2/Hz": (1.0, False), "m/s^2/rtHz": (1.0, True)}
-UNITS: dict[Kind, dict[str, tuple[float, bool]]] = {
-    Kind.FORCE: {"N^2/Hz": (1.0, False), "N/rtHz": (1.0, True)},
-    Kind.FLOOR_MOTION: _POSITION | _ACCELERATION,
-    Kind.SENSOR_NOISE: _POSITION,
-    Kind.SETPOINT: _POSITION,
+UNITS: dict[SourceKind, dict[str, tuple[float, bool]]] = {
+    SourceKind.FORCE: {"N^2/Hz": (1.0, False), "N/rtHz": (1.0, True)},
+    SourceKind.FLOOR_MOTION: _POSITION | _ACCELERATION,
+    SourceKind.SENSOR_NOISE: _POSITION,
+    SourceKind.SETPOINT: _POSITION,
 }
 PATH = ("mass", "damping", "stiffness")
 
@@ -94,7 +100,7 @@ TABLE_CHECKS: dict[str, checks.Check] = {
 def checked_budget(table: BudgetTable, folder: Path, fail: Fail) -> BudgetTable:
     """The table with every entry checked and the files of spectra read into `psd`."""
     found: dict[str, tuple[Mapping[str, Any], ...]] = {}
-    for kind in Kind:
+    for kind in SourceKind:
         given, entries = several(getattr(table, kind.value)), []
         for i, entry in enumerate(given, 1):
             place = f"budget.{kind.value}" + (f" {i}" if len(given) > 1 else "")
@@ -108,16 +114,18 @@ def checked_budget(table: BudgetTable, folder: Path, fail: Fail) -> BudgetTable:
 
 def error_budget(table: BudgetTable) -> ErrorBudget | None:
     """The sources in SI; None for a case without any."""
-    sources = tuple(_source(entry, kind) for kind in Kind for entry in getattr(table, kind.value))
+    sources = tuple(
+        _source(entry, kind) for kind in SourceKind for entry in getattr(table, kind.value)
+    )
     if not sources:
         return None
     return ErrorBudget(sources, None if table.window_ms is None else 1e-3 * table.window_ms)
 
 
 def _checked(
-    entry: Mapping[str, Any], kind: Kind, place: str, folder: Path, fail: Fail
+    entry: Mapping[str, Any], kind: SourceKind, place: str, folder: Path, fail: Fail
 ) -> Mapping[str, Any]:
-    still = kind is not Kind.FLOOR_MOTION
+    still = kind is not SourceKind.FLOOR_MOTION
     known = {key: one for key, one in TABLE_CHECKS.items() if not (still and key in PATH)}
     checks.require_good(place, entry, known, fail)
     if entry.get("unit") not in UNITS[kind]:
@@ -139,7 +147,7 @@ def _checked(
     return entry
 
 
-def _source(entry: Mapping[str, Any], kind: Kind) -> Source:
+def _source(entry: Mapping[str, Any], kind: SourceKind) -> ErrorSource:
     factor, amplitude = UNITS[kind][entry["unit"]]
     power = 2 if amplitude else 1
     spectrum: ShapedSpectrum | TabulatedSpectrum
@@ -157,7 +165,7 @@ def _source(entry: Mapping[str, Any], kind: Kind) -> Source:
         )
     m, c, k = (float(entry.get(name, 0.0)) for name in PATH)
     name = entry.get("name", kind.value.replace("_", " "))
-    return Source(name, kind, spectrum, (m, c, k), entry["unit"] in _ACCELERATION)
+    return ErrorSource(name, kind, spectrum, (m, c, k), entry["unit"] in _ACCELERATION)
 
 
 def _pairs(value: Any) -> tuple[tuple[float, ...], ...]:

@@ -13,8 +13,8 @@ from typing import Any
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.budget import check_directions, checked_budget, checked_places
 from ccd_casadi.cases.checks import CaseError, Fail, short_repr
+from ccd_casadi.cases.controller_kinds import check_kind, idle_keys
 from ccd_casadi.cases.controller_tables import ChannelTable, check_motion
-from ccd_casadi.cases.kinds import check_kind, idle_keys
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.tables import REQUIRED, TABLES, Case
 from ccd_casadi.plants.nodes import names_in

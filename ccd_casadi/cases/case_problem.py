@@ -8,10 +8,10 @@ from typing import Any
 
 from ccd_casadi.cases.budget import error_budget, places_of
 from ccd_casadi.cases.case import CaseError
+from ccd_casadi.cases.controller_kinds import structured_problem, weights_of
 from ccd_casadi.cases.controller_tables import motion_problem
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity, Topic, suitable_effort
-from ccd_casadi.cases.kinds import structured_problem, weights_of
 from ccd_casadi.cases.tables import Case, RobustTable
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, Options, RobustSet
 from ccd_casadi.inner_problem.plant_source import PlantSource

@@ -24,7 +24,6 @@ from ccd_casadi.cases.findings import (
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import with_ranges
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.plants.facts import PlantFacts, facts_of
 from ccd_casadi.plants.modal import (
     ModalPlant,
     Suspension,
@@ -41,6 +40,7 @@ from ccd_casadi.plants.plant import (
     mechanics,
     named_values,
 )
+from ccd_casadi.plants.plant_facts import PlantFacts, facts_of
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.terminal import Progress

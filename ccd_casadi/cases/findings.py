@@ -14,9 +14,9 @@ import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.loop import Sampling
-from ccd_casadi.plants.facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.plant_facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.text import HZ, spoken
 

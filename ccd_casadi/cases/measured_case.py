@@ -18,7 +18,13 @@ from typing import Any
 
 from ccd_casadi.cases.case import read_toml, table_of
 from ccd_casadi.cases.checks import POSITIVE, Fail, count, require_good, short_repr, text
-from ccd_casadi.cases.kinds import KindOptions, check_kind, idle_keys, structure_of, weights_of
+from ccd_casadi.cases.controller_kinds import (
+    KindOptions,
+    check_kind,
+    idle_keys,
+    structure_of,
+    weights_of,
+)
 from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustTable
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response

@@ -11,8 +11,8 @@ from ccd_casadi.cases.diagnosis import first_seen
 from ccd_casadi.cases.findings import Finding
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.facts import PlantFacts
 from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.plants.plant_facts import PlantFacts
 from ccd_casadi.support.text import number, spoken
 
 

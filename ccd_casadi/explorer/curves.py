@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace, frequency_grid, sigma_max
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.reporting.loops import gain_panels
+from ccd_casadi.reporting.gain_figures import gain_panels
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.nyquist import loci_of, loop_panels, nyquist_panel, size_panels
 from ccd_casadi.robust.perturbed import sampled_figures
@@ -32,7 +32,6 @@ from ccd_casadi.support.text import HZ, number, template, with_unit
 POINTS = 180  # of the frequency grid, besides those around resonances
 STEP_POINTS = 240
 STEP_PERIODS = 5.0  # of the bandwidth
-SAME = 1e-3  # relative: the peak of S on the model is that of the design
 WATCHED = 2.0  # durations of the move that are shown
 NONE = np.zeros(0)
 AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, WINDOW)
@@ -95,7 +94,7 @@ def curves_of(look: Look) -> Curves | None:
     f = look.figures
     top, at = f.sensitivity_peak, f.sensitivity_peak_frequency
     own = float(sigma_max(loop.sensitivity(np.array([at])))[0]) if at > 0.0 else np.nan
-    peaks = ((at / HZ, top),) if abs(own / top - 1.0) < SAME else None  # else another plant's
+    peaks = ((at / HZ, top),) if abs(own / top - 1.0) < 1e-3 else None  # else another plant's
     view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=peaks)
     time, step, move = NONE, NONE, AT_REST
     if loop.stable:

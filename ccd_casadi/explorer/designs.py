@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.controller_kinds import with_structure
 from ccd_casadi.cases.controller_tables import LoopTable
-from ccd_casadi.cases.kinds import with_structure
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.verdict import LEAST_SHIFT
 from ccd_casadi.inner_problem.objective import violated
@@ -34,8 +34,6 @@ from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import DesignFigures, figures_from_row, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
-RATE_HZ = 10000.0  # of a sampled loop, where the case gives none
-
 
 @dataclass(frozen=True)
 class Knobs:
@@ -52,7 +50,7 @@ class Knobs:
     structure: str = "h_infinity"
     resonance_shift: float = 0.0
     sampled: bool = False
-    rate_hz: float = RATE_HZ
+    rate_hz: float = 10000.0  # where the case gives none
     delay_us: float = 0.0
 
     @property
@@ -72,7 +70,7 @@ def knobs_of(case: Case) -> Knobs:
         structure=case.controller.structure,
         resonance_shift=case.robust.resonance_shift,
         sampled=rate is not None,
-        rate_hz=RATE_HZ if rate is None else rate,
+        rate_hz=Knobs.rate_hz if rate is None else rate,
         delay_us=case.loop.delay_us,
     )
 

@@ -19,9 +19,6 @@ from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost, WorkerProcess, tell
 
-MOST = 6  # θ that the model is made of: more make it slower than a drag
-FLEXIBLE = 1e-6  # of the largest eigenvalue: what is below is a rigid motion's, rounded
-
 Theta = tuple[float, ...]
 
 
@@ -50,10 +47,13 @@ class KnownPlant:
         self.exact[theta] = system
         return off
 
-    def renew(self) -> None:
-        """Make the model of the θ known nearest to the newest: seconds, for a thread of its own."""
+    def renew(self, *, most: int = 6) -> None:
+        """Make the model of the θ known nearest to the newest: seconds, for its own thread.
+
+        More than `most` θ make it slower than a drag.
+        """
         known = list(self.exact)
-        most = 1 if self.plant.nearby is None else MOST  # to first order: of the newest alone
+        most = 1 if self.plant.nearby is None else most  # to first order: of the newest alone
         close = sorted(known, key=lambda theta: self.distance(theta, known[-1]))[:most]
         used = tuple(theta for theta in known if theta in close)  # a basis grows in one order
         self.model, self.used = nearby_model(self.plant, used, known[-1]), used
@@ -91,7 +91,7 @@ class KnownPlant:
 def frequency_error(one: Mechanics, exact: Mechanics) -> float:
     """Largest relative difference of the flexible frequencies of two plants."""
     a, b = (eigh(system.K, system.M, eigvals_only=True) for system in (one, exact))
-    flexible = b > FLEXIBLE * b.max()
+    flexible = b > 1e-6 * b.max()  # below, it is a rigid motion's, rounded
     return float(np.abs(np.sqrt(np.maximum(a, 0.0)[flexible] / b[flexible]) - 1.0).max())
 
 

@@ -51,7 +51,7 @@ BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that tells progress
 SOLVED = "runs"  # where the pages of such a solve are found, below the address of this one
 
 
-class Page:
+class ExplorerPage:
     """The widgets of one document, and what happens when one is moved."""
 
     def __init__(

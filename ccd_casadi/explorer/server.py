@@ -21,7 +21,7 @@ from tornado.web import StaticFileHandler
 from ccd_casadi.drawing.paint import theme
 from ccd_casadi.explorer.curves import FIGURES
 from ccd_casadi.explorer.known_plant import Background
-from ccd_casadi.explorer.page import SOLVED, Page
+from ccd_casadi.explorer.page import SOLVED, ExplorerPage
 from ccd_casadi.explorer.pins import Kept
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.structured import designed
@@ -62,7 +62,7 @@ class Explorer:
     ) -> None:
         self.session = session
         self.background = Background(user_code)
-        self._pages: list[Page] = []
+        self._pages: list[ExplorerPage] = []
         self._kept: dict[str, Kept] = {}  # by the tab that the address names
         self._of_solves = ("--workers", str(workers), "--seed", str(seed))
         _require_event_loop()
@@ -114,13 +114,13 @@ class Explorer:
         document.js_on_event(ConnectionLost, CustomJS(code=f"{shown}false"))
         document.js_on_event(ClientReconnected, CustomJS(code=f"{shown}true"))
         document.theme = "dark_minimal" if dark else "light_minimal"
-        page = Page(document, self.session, self.background, self._of_solves, dark, kept)
+        page = ExplorerPage(document, self.session, self.background, self._of_solves, dark, kept)
         if self._first is not None and self.session.undesigned:
             page.waits_for(self._first)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._gone(page))
 
-    def _gone(self, page: Page) -> None:
+    def _gone(self, page: ExplorerPage) -> None:
         self._pages.remove(page)
         page.close()
 

@@ -1,7 +1,7 @@
 """What the explorer knows while it runs: the case, the store of its looks, pins, files written."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from time import perf_counter
@@ -36,8 +36,21 @@ from ccd_casadi.sampling.units import unit_of
 from ccd_casadi.support.terminal import Tell
 from surrogates.files import write_whole
 
-QUICK = 0.4  # s of a full search that a drag of S_max waits for
-SLOW = 0.1  # s that the model may take at a θ before it is solved in the background
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """Times that decide what a drag waits for.
+
+    Attributes
+    ----------
+    quick : float
+        Of a full search that a drag of S_max waits for, s.
+    slow : float
+        Of the plant at a θ from which on it is solved in the background, s.
+    """
+
+    quick: float = 0.4
+    slow: float = 0.1
 
 
 class Session:
@@ -63,7 +76,7 @@ class Session:
         problem = self.problems.at(self.start)
         began = perf_counter()
         first = elements_at(problem, self.start.theta)
-        self.slow = perf_counter() - began > SLOW
+        self.slow = perf_counter() - began > SessionOptions.slow
         self.search_seconds = np.inf  # of the last full search
         found = lumped(first.system)
         self.reference = 1.0 if found is None else float(np.abs(found.masses).max())
@@ -128,7 +141,7 @@ class Session:
     @property
     def quick(self) -> bool:
         """Whether a full search is over within a drag's patience."""
-        return self.known is None and self.search_seconds < QUICK
+        return self.known is None and self.search_seconds < SessionOptions.quick
 
     def took(self, look: Look) -> float | None:
         """A full search ended: its weights are those of the syntheses to come.

@@ -13,7 +13,7 @@ import numpy as np
 from ccd_casadi.plants.table_columns import (
     UNITS,
     WANTED,
-    Column,
+    TableColumn,
     columns_of_arrays,
     columns_of_csv,
     meaning_of,
@@ -90,7 +90,7 @@ def holds_lines(names: Sequence[str]) -> bool:
 
 
 def _understood(
-    path: Path, columns: Sequence[Column], notes: Sequence[str], options: ReadingOptions
+    path: Path, columns: Sequence[TableColumn], notes: Sequence[str], options: ReadingOptions
 ) -> ResponseTable:
     """The response that the columns state."""
     known = dict(_quantities(path, columns))
@@ -146,8 +146,8 @@ def _understood(
 
 
 def _quantities(
-    path: Path, columns: Sequence[Column]
-) -> Iterator[tuple[str, tuple[Column, float]]]:
+    path: Path, columns: Sequence[TableColumn]
+) -> Iterator[tuple[str, tuple[TableColumn, float]]]:
     """Each quantity with its column and the factor to SI; -1 of decibels."""
     seen: dict[str, str] = {}
     for column in columns:
@@ -171,7 +171,7 @@ def _quantities(
 
 
 def _of_size_and_angle(
-    path: Path, hz: Array, known: Mapping[str, tuple[Column, float]], options: ReadingOptions
+    path: Path, hz: Array, known: Mapping[str, tuple[TableColumn, float]], options: ReadingOptions
 ) -> np.ndarray:
     """G of a magnitude and a phase. Raises UserError where another reading is as possible."""
     (sized, factor), (turned, to_rad) = known.get("size") or known["G"], known["angle"]

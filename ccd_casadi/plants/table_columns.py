@@ -47,7 +47,7 @@ def npz_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """Values under a name; `rows`: the numbers of the lines of the file they are from."""
 
     name: str
@@ -55,7 +55,7 @@ class Column:
     rows: tuple[int, ...] = ()
 
 
-def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[Column]:
+def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[TableColumn]:
     """Those that hold numbers; texts are notes."""
     found = []
     for name, value in content.items():
@@ -71,11 +71,11 @@ def columns_of_arrays(path: Path, content: Mapping[str, Any]) -> list[Column]:
                 words = "is no response: give (lines,) for one channel or (lines, outputs, inputs)"
                 raise UserError(f"{path}: {name}: {numbers.shape} {words}")
             numbers = numbers.ravel()
-        found.append(Column(name, numbers))
+        found.append(TableColumn(name, numbers))
     return found
 
 
-def columns_of_csv(path: Path) -> tuple[list[Column], list[str]]:
+def columns_of_csv(path: Path) -> tuple[list[TableColumn], list[str]]:
     """The columns of a text table, and what of its form is to be reported."""
     text, notes = _text(path)
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1)
@@ -123,7 +123,7 @@ def columns_of_csv(path: Path) -> tuple[list[Column], list[str]]:
     values = np.array(table)
     parts = [values[:, j] if values[:, j].imag.any() else values[:, j].real
              for j in range(len(names))]  # fmt: skip
-    return [Column(n, part, numbers) for n, part in zip(names, parts, strict=True)], notes
+    return [TableColumn(n, part, numbers) for n, part in zip(names, parts, strict=True)], notes
 
 
 def _text(path: Path) -> tuple[str, list[str]]:

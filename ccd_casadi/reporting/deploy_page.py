@@ -24,7 +24,7 @@ from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.lti.state_space import frequency_grid, sensitivity, sigma_max
 from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
-from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
+from ccd_casadi.reporting.gain_figures import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.structured_page import structured_table
 from ccd_casadi.reporting.verdict import head_of

@@ -24,8 +24,6 @@ from ccd_casadi.support.text import (
     with_unit,
 )
 
-HOLDS = 1e-6  # of the largest multiplier: one below it holds nothing
-
 
 def conclusion(result: Mapping[str, Any]) -> str:
     """One sentence with the key numbers, for every kind of controller."""
@@ -260,10 +258,15 @@ def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
 
 
 def _held_theta(
-    problem: CoDesignProblem, theta: Mapping[str, float], multipliers: Mapping[str, float]
+    problem: CoDesignProblem,
+    theta: Mapping[str, float],
+    multipliers: Mapping[str, float],
+    *,
+    binding: float = 1e-6,
 ) -> dict[str, float] | None:
     """Where bounds and λ alone determine θ, df by each of them that is loosened by 1 of its
-    multiplier's unit. None where θ moves otherwise too: that takes second derivatives."""
+    multiplier's unit. None where θ moves otherwise too: that takes second derivatives. A
+    constraint binds from a multiplier of `binding` times the largest on."""
     point, plant = [theta[name] for name in problem.names], plant_of(problem)
     width = np.subtract(problem.upper, problem.lower)
     df, dlam = (rows * width for rows in hardware_slopes(plant, point))
@@ -271,7 +274,7 @@ def _held_theta(
     for i, name in enumerate(problem.names):
         rows |= {f"{name} lower": -np.eye(len(df))[i], f"{name} upper": np.eye(len(df))[i]}
     most = max(multipliers.values(), default=0.0)
-    names = tuple(name for name, mu in multipliers.items() if name in rows and mu > HOLDS * most)
+    names = tuple(name for name, mu in multipliers.items() if name in rows and mu > binding * most)
     A = np.array([rows[name] for name in names]).reshape(len(names), len(df))
     if len(names) != len(df) or np.linalg.matrix_rank(A) < len(df):
         return None

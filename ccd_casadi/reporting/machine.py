@@ -12,11 +12,11 @@ from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.surface import REACH
 from ccd_casadi.drawing.svg import ModeShapes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.facts import modes_of
 from ccd_casadi.plants.modal import ModalPlant, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.plant_facts import modes_of
 from ccd_casadi.reporting.facts import paragraph
-from ccd_casadi.reporting.loops import S_panel
+from ccd_casadi.reporting.gain_figures import S_panel
 from ccd_casadi.reporting.nyquist import loci_of, nyquist_panel
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, number, spoken, template
@@ -26,7 +26,6 @@ BLUE, GREEN, ORANGE = (
     f"var(--{name}, {colour})"
     for name, colour in (("blue", svg.BLUE), ("green", svg.GREEN), ("orange", svg.ORANGE))
 )
-SMALL = 1e-9  # share of the largest entry below which there is no spring
 MOST_NODES = 12
 SHOWN_MODES = 3
 SHOWN = 6  # of those to turn
@@ -43,7 +42,7 @@ class Lumped:
     measured: tuple[int, ...]
 
 
-def lumped(system: Mechanics) -> Lumped | None:
+def lumped(system: Mechanics, *, small: float = 1e-9) -> Lumped | None:
     """Find the masses and springs that M and K consist of.
 
     M must be diagonal, K without a positive entry beside its diagonal or a negative row sum, and
@@ -52,6 +51,8 @@ def lumped(system: Mechanics) -> Lumped | None:
     Parameters
     ----------
     system : Mechanics
+    small : float
+        Share of the largest entry below which an entry is zero.
 
     Returns
     -------
@@ -59,8 +60,8 @@ def lumped(system: Mechanics) -> Lumped | None:
     """
     n = len(system.M)
     m, K = np.diag(system.M), system.K
-    apart = np.abs(system.M - np.diag(m)).max() <= SMALL * np.abs(m).max()
-    level = SMALL * np.abs(K).max()
+    apart = np.abs(system.M - np.diag(m)).max() <= small * np.abs(m).max()
+    level = small * np.abs(K).max()
     off = K - np.diag(np.diag(K))
     ground = K.sum(axis=1)
     if n > MOST_NODES or not apart or off.max(initial=0.0) > level or ground.min() < -n * level:

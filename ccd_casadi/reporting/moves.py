@@ -21,14 +21,13 @@ from ccd_casadi.inner_problem.structured_bandwidth import motion_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.facts import paragraph
-from ccd_casadi.reporting.loops import of_plants
+from ccd_casadi.reporting.gain_figures import of_plants
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, display_unit, spoken, with_unit
 
 POINTS = 600
 STEPS = 200  # points of a force step
 DRAWN = 1200  # points of a curve of a move on the machine
-HELD = 0.5  # of the largest force: a stage that springs hold takes so much at the end of a move
 FLAT = 30.0  # an error so many times smaller than another is flat beside it
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
@@ -223,7 +222,7 @@ def way_words(name: str, made: Sequence[Move], until: float = np.inf) -> str:
         when += f" ({with_unit(max(m.final_error for m in late), spoken('m'))} left)"
     words = f"{name}: {when}, error of at most {with_unit(peak, spoken('m'))}"
     held, most = (max(of(m) for m in made) for of in (_held, lambda m: m.peak_force.max()))
-    if held > HELD * most:
+    if held > 0.5 * most:  # at the end of a move, as of a stage on springs
         words += f"; {with_unit(held, spoken('N'))} hold the stage there"
     after = np.abs(np.concatenate([_error(m)[m.time > until] for m in made]))
     if not after.size or settled <= until:

@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
 from ccd_casadi.reporting.facts import conclusion, facts, theta_axes, theta_table
-from ccd_casadi.reporting.loops import gains, run_view, view_of
+from ccd_casadi.reporting.gain_figures import gains, run_view, view_of
 from ccd_casadi.reporting.structured_page import controller_blocks
 from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.text import HZ, number, template

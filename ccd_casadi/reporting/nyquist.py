@@ -13,7 +13,7 @@ from ccd_casadi.drawing.content import Area, Curve, Figure, Level, Lines, Mark, 
 from ccd_casadi.drawing.lines import BOTTOM, LEFT, RIGHT, TOP
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY, ORANGE, WIDTH
 from ccd_casadi.reporting.facts import paragraph
-from ccd_casadi.reporting.loops import bandwidth_level, of_plants, over_hz
+from ccd_casadi.reporting.gain_figures import bandwidth_level, of_plants, over_hz
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, number, spoken
 
@@ -115,7 +115,6 @@ def near(values: np.ndarray, far: float = FAR) -> np.ndarray:
     return np.where(np.abs(values) <= far, values, complex(np.nan, np.nan))
 
 
-ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
 TURNS = np.arange(-1980.0, 1981.0, 360.0)  # phases of -1
 Parts = Mapping[str, tuple[np.ndarray, ...]]  # g, k and their product of a channel, by its name
@@ -277,7 +276,7 @@ def scalar_parts(loop: LoopView, channels: Sequence[LoopChannel]) -> Parts:
         u, v = channel.outputs[:, 0], channel.inputs[:, 0]
         g, k = u @ loop.plant @ v, v @ loop.controller @ u
         u = u * np.sign(u[np.abs(u).argmax()])
-        signs = "".join("0" if abs(x) < ZERO else "+" if x > 0.0 else "−" for x in u)
+        signs = "".join("0" if abs(x) < 1e-6 else "+" if x > 0.0 else "−" for x in u)
         found[f"channel {channel.name}, outputs {signs}"] = (g, k, g * k)
     return found
 

@@ -21,7 +21,7 @@ from ccd_casadi.drawing.content import (
 )
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.reporting.facts import facts, paragraph, paragraphs, run_name, theta_words
-from ccd_casadi.reporting.loops import figure_gains
+from ccd_casadi.reporting.gain_figures import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
@@ -30,7 +30,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, number, spoken, with_unit
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
-LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
 
 def robustness_page(
@@ -97,16 +96,16 @@ def _words(part: str, *known: Any) -> list[str]:
     return paragraphs(f"robustness.{part}", *known, way_words=way_words)
 
 
-def _bandwidth_lost(run: FinishedRun, found: Study) -> tuple[float, ...]:
+def _bandwidth_lost(run: FinishedRun, found: Study, *, accepted: float = 0.05) -> tuple[float, ...]:
     """ω_b in Hz of a quarter of the stable plants with other hardware at most, of the slowest one
-    and of the design; nothing where they lose none to speak of.
+    and of the design; nothing where the slowest loses less than the share `accepted`.
 
     A loop that stays stable and within S_max can be half as fast.
     """
     hz = np.array([item.bandwidth / HZ for item in found.tolerances.judged if item.stable])
     hz = hz[np.isfinite(hz)]
     design = run.figures.bandwidth / HZ
-    if not hz.size or hz.min() > (1.0 - LOSS) * design:
+    if not hz.size or hz.min() > (1.0 - accepted) * design:
         return ()
     return float(np.quantile(hz, 0.25)), float(hz.min()), design
 

@@ -21,6 +21,7 @@ from ccd_casadi.deployment.realisation import scalar_channels
 from ccd_casadi.drawing import content as c
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.facts import binding, conclusion, facts, run_name, theta_table
+from ccd_casadi.reporting.gain_figures import gains, run_view, view_of
 from ccd_casadi.reporting.landscape import (
     Truths,
     bandwidth_process,
@@ -33,8 +34,7 @@ from ccd_casadi.reporting.landscape import (
     table_trust,
     trust_figure,
 )
-from ccd_casadi.reporting.limits import budget_chapter, limit_blocks, start_chapter
-from ccd_casadi.reporting.loops import gains, run_view, view_of
+from ccd_casadi.reporting.limit_figures import budget_chapter, limit_blocks, start_chapter
 from ccd_casadi.reporting.machine import SHOWN, glance, mode_shape_figure
 from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_figure
 from ccd_casadi.reporting.nyquist import bode

@@ -20,7 +20,7 @@ from ccd_casadi.inner_problem.sections_words import SectionWords
 from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop, sensitivity, sigma_max
 from ccd_casadi.reporting.facts import binding, facts, gain_words, paragraph
-from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
+from ccd_casadi.reporting.gain_figures import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import near, nyquist_panel
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.text import HZ, counted, number

@@ -4,6 +4,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -33,13 +34,29 @@ USUAL = (  # figure of result.json, its usual least value, words; docs/verdict.m
     ("phase_margin_deg", 30.0, "the phase margin is {:.3g} deg (usual: at least 30)"),
     ("gain_margin", 2.0, "the gain margin is {:.3g} (usual: at least 2)"),
 )
-SLACK = 0.01  # relative: a design lies on its bounds, and 2 is the usual S_max
-OVERSHOOT = 0.5  # of a step without feedforward
-BETWEEN = 1.1  # of the largest |S| on the lines of a response: what it may reach between them
 STATUS = {"verified": "verified", "infeasible": "no feasible design"}  # others: not verified
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
 DECISION = re.compile(r'<p class="decision">(?:Do not b|B)uild this\b.*?</p>', re.DOTALL)
 TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
+
+
+@dataclass(frozen=True)
+class ConcernOptions:
+    """Usual limits of a loop beside those of `USUAL`.
+
+    Attributes
+    ----------
+    slack : float
+        Relative: a design lies on its bounds, and 2 is the usual S_max.
+    overshoot : float
+        Of a step without feedforward.
+    between_lines : float
+        What |S| may reach between the lines of a response, over the largest on them.
+    """
+
+    slack: float = 0.01
+    overshoot: float = 0.5
+    between_lines: float = 1.1
 
 
 def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
@@ -196,7 +213,9 @@ def advice(result: Mapping[str, Any]) -> str:
     )
 
 
-def loop_concerns(result: Mapping[str, Any]) -> list[str]:
+def loop_concerns(
+    result: Mapping[str, Any], *, options: ConcernOptions = ConcernOptions()
+) -> list[str]:
     """What an engineer would ask of a loop that keeps the bounds of its case: its margins, its step
     and what is narrow or rings near the bandwidth, against the usual limits of the field.
 
@@ -205,12 +224,12 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
     found = [
         words.format(result[key])
         for key, least, words in USUAL
-        if result.get(key) is not None and result[key] < (1.0 - SLACK) * least
+        if result.get(key) is not None and result[key] < (1.0 - options.slack) * least
     ]
     if "step_overshoot" in result and "move" not in result:
         overshoot = result["step_overshoot"]
-        if overshoot > OVERSHOOT:
-            usual = f"usual: at most {100.0 * OVERSHOOT:g}"
+        if overshoot > options.overshoot:
+            usual = f"usual: at most {100.0 * options.overshoot:g}"
             found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
         settled = result["settling_ms"]
         if settled is None:
@@ -219,7 +238,7 @@ def loop_concerns(result: Mapping[str, Any]) -> list[str]:
             late = f"only after {with_unit(1e-3 * settled, 's')}"
             found.append(f"a step settles {late}, {PERIODS:g} periods of the bandwidth or more")
     reach = result.get("sensitivity_peak_between_lines")  # of a measured response
-    if reach is not None and reach > max(1.0, BETWEEN * result["sensitivity_peak"]):
+    if reach is not None and reach > max(1.0, options.between_lines * result["sensitivity_peak"]):
         where = result.get("sensitivity_peak_between_lines_hz")
         at = "" if where is None else f" about {where:.4g} Hz"
         found.append(f"|S| may reach {reach:.3g} between two lines{at}")

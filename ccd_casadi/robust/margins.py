@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccd_casadi.budget.evaluation import Lyapunov
-from ccd_casadi.budget.loops import process
-from ccd_casadi.budget.sources import Kind, ShapedSpectrum, Source
+from ccd_casadi.budget.noise_process import process
+from ccd_casadi.budget.sources import ErrorSource, ShapedSpectrum, SourceKind
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import (
@@ -75,8 +75,8 @@ def noise(loop: Loop, sensor: float, disturbance: float) -> Noise:
     They are those of an error budget of both sources: of a sampled loop at its instants.
     """
     found = []
-    for kind, density in ((Kind.SENSOR_NOISE, sensor), (Kind.FORCE, disturbance)):
-        of = process(loop, Source(kind.value, kind, ShapedSpectrum(density**2))).balanced()
+    for kind, density in ((SourceKind.SENSOR_NOISE, sensor), (SourceKind.FORCE, disturbance)):
+        of = process(loop, ErrorSource(kind.value, kind, ShapedSpectrum(density**2))).balanced()
         P = Lyapunov(of.A, sampled=of.sampled).covariance(of.noise)
         position, force = (np.einsum("ij,jk,ik->i", C, P, C) for C in (of.C, of.F))
         force = np.full_like(force, np.inf) if of.infinite_force else force + (of.V**2).sum(1)

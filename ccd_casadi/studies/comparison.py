@@ -30,7 +30,7 @@ from ccd_casadi.studies.steepest_descent import (
     baseline_of,
     steepest_descent,
 )
-from ccd_casadi.studies.worth import HardwareDesign, design_hardware, first_resonance
+from ccd_casadi.studies.worth_estimate import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Progress

@@ -47,7 +47,7 @@ class Gradient(StrEnum):
 
 
 @dataclass(frozen=True)
-class Answer:
+class BaselineDesign:
     """The best design at a θ: ω_b (rad/s), what J counts, that one's slope, (ω_S, ω_T) or NaN."""
 
     design: AnyDesign
@@ -69,7 +69,7 @@ class Baseline(ABC):
     @abstractmethod
     def answer(
         self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
-    ) -> tuple[Answer | None, int]:
+    ) -> tuple[BaselineDesign | None, int]:
         """The best design at θ, near (ω_S, ω_T) where these are given, and the syntheses spent."""
 
     @abstractmethod
@@ -95,14 +95,14 @@ class MixedBaseline(Baseline):
 
     def answer(
         self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
-    ) -> tuple[Answer | None, int]:
+    ) -> tuple[BaselineDesign | None, int]:
         design, spent = _sweep(self.problem, theta, around)
         if design is None:
             return None, spent
         figures = design.figures
         slope = design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
         omega, at = figures.bandwidth, (figures.omega_S, figures.omega_T)
-        return Answer(design, omega, omega, np.asarray(slope, float), at), spent
+        return BaselineDesign(design, omega, omega, np.asarray(slope, float), at), spent
 
     def design_of(self, sample: InnerSample) -> Sensitivities:
         return true_design(self.problem, sample.theta, sample.omega_S, sample.omega_T)
@@ -130,12 +130,12 @@ class StructuredBaseline(Baseline):
 
     def answer(
         self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
-    ) -> tuple[Answer | None, int]:
+    ) -> tuple[BaselineDesign | None, int]:
         value = structured_value(self.problem, theta.tolist())
         if not value.feasible:
             return None, value.syntheses
         slope = np.array(value.gradient)
-        return Answer(value.design, value.bandwidth, value.value, slope), value.syntheses
+        return BaselineDesign(value.design, value.bandwidth, value.value, slope), value.syntheses
 
     def design_of(self, sample: InnerSample) -> SectionsDesign:
         return structured_value(self.problem, sample.theta).design

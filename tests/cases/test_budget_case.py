@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from oracles.case_documents import TWO_MASS
 
-from ccd_casadi.budget import Kind, ShapedSpectrum, TabulatedSpectrum
-from ccd_casadi.budget.frequency import integrate
+from ccd_casadi.budget import ShapedSpectrum, SourceKind, TabulatedSpectrum
+from ccd_casadi.budget.error_density import integrate
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_to_toml
@@ -18,7 +18,7 @@ from ccd_casadi.codesign.result_entries import budget_entry
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.facts import loop_lines
-from ccd_casadi.reporting.limits import budget_chapter
+from ccd_casadi.reporting.limit_figures import budget_chapter
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import synthesise
@@ -67,7 +67,7 @@ def test_a_budget_is_read_in_si_and_comes_back(tmp_path: Path) -> None:
     assert problem.budget is not None
     assert problem.budget.window == pytest.approx(0.01)
     cables, amplifier, floor, noise, setpoint = problem.budget.sources
-    assert (cables.kind, cables.name) == (Kind.FORCE, "cables")
+    assert (cables.kind, cables.name) == (SourceKind.FORCE, "cables")
     assert amplifier.spectrum.level == pytest.approx(1e-6)
     assert floor.spectrum == TabulatedSpectrum((0.5, 5.0, 200.0), (1e-9, 1e-8, 1e-10))
     assert floor.of_acceleration

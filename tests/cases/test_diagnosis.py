@@ -13,7 +13,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Topic
 from ccd_casadi.check import main as check
-from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
+from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
 from ccd_casadi.solve import main as solve
 from ccd_casadi.solve import show_findings
 

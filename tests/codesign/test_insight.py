@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.insight import main
-from ccd_casadi.reporting.insight import front_answer, front_figure
+from ccd_casadi.reporting.insight_page import front_answer, front_figure
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore

@@ -14,8 +14,8 @@ from ccd_casadi.inner_problem.problem import box, plant_of, true_inner
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.studies import worth
-from ccd_casadi.studies.worth import outlook, search_error
+from ccd_casadi.studies import worth_estimate as worth
+from ccd_casadi.studies.worth_estimate import outlook, search_error
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.worth import main
 from surrogates import design

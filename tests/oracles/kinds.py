@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
+from ccd_casadi.budget import ErrorBudget, ErrorSource, ShapedSpectrum, SourceKind
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
@@ -15,8 +15,8 @@ PID = StructuredProblem(
     starts=4,
 )
 CABLES = ErrorBudget((
-    Source("cables", Kind.FORCE, ShapedSpectrum(1e-2, (), ((20.0,),))),
-    Source("encoder", Kind.SENSOR_NOISE, ShapedSpectrum(2.5e-21)),
+    ErrorSource("cables", SourceKind.FORCE, ShapedSpectrum(1e-2, (), ((20.0,),))),
+    ErrorSource("encoder", SourceKind.SENSOR_NOISE, ShapedSpectrum(2.5e-21)),
 ))  # fmt: skip
 SLOW = 8.0 * HZ
 

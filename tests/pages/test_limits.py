@@ -7,7 +7,7 @@ from oracles.helpers import HZ, problem
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.inner_problem.kinds import design_view
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.reporting.limits import limit_sentences, shares, table_limits
+from ccd_casadi.reporting.limit_figures import limit_sentences, shares, table_limits
 from ccd_casadi.support.text import display_unit
 from ccd_casadi.synthesis.synthesis import synthesise
 

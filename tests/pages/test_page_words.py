@@ -24,9 +24,9 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.reporting.facts import conclusion, facts, theta_table, theta_words
-from ccd_casadi.reporting.insight import front_answer
+from ccd_casadi.reporting.gain_figures import above
+from ccd_casadi.reporting.insight_page import front_answer
 from ccd_casadi.reporting.landscape import history_blocks
-from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.moves import shown_until, way_words, ways_figure
 from ccd_casadi.reporting.nyquist import near, nyquist_panel
 from ccd_casadi.reporting.robustness_page import shown_peak

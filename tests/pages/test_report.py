@@ -308,7 +308,7 @@ def test_a_run_without_one_gets_a_report_of_its_design(
     def refused(*given: object, **named: object) -> None:
         raise AssertionError("nothing is designed")
 
-    for place in ("synthesis.synthesis", "reporting.loops"):
+    for place in ("synthesis.synthesis", "reporting.gain_figures"):
         monkeypatch.setattr(f"ccd_casadi.{place}.synthesise", refused)
     assert report_command([str(folder), "--quiet"]) == 0
     text = (folder / "report.html").read_text(encoding="utf-8")

@@ -11,7 +11,7 @@ from oracles.helpers import problem
 from ccd_casadi.drawing.content import Chapter, Figure
 from ccd_casadi.drawing.paint import block_html, tables_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
-from ccd_casadi.reporting.limits import start_chapter
+from ccd_casadi.reporting.limit_figures import start_chapter
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import synthesise
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.drawing.content import Lines
-from ccd_casadi.plants.cad.modes import Body, Material, reduced
+from ccd_casadi.plants.cad.elastic_body import Body, Material, reduced
 from ccd_casadi.plants.cad.morph import Morph, read_morph, write_morph
 from ccd_casadi.plants.cad.plant import CadStage, plant_of_stage
 from ccd_casadi.plants.cad.solid import extended, volumes

@@ -30,7 +30,7 @@ from ccd_casadi.case_studies.rib_stage.geometry import (
 )
 from ccd_casadi.case_studies.rib_stage.mesh import Mesh, build_mesh, line_nodes, plain
 from ccd_casadi.case_studies.rib_stage.model import discretisation, orthonormal_directions
-from ccd_casadi.case_studies.rib_stage.modes import functionals, groups_of, spectrum
+from ccd_casadi.case_studies.rib_stage.stage_modes import functionals, groups_of, spectrum
 from ccd_casadi.plants.plant import Mechanics
 
 Array = np.ndarray

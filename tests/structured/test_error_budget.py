@@ -13,15 +13,15 @@ from scipy.signal import lfilter
 
 from ccd_casadi.budget import (
     ErrorBudget,
-    Kind,
+    ErrorSource,
     ShapedSpectrum,
-    Source,
+    SourceKind,
     TabulatedSpectrum,
     evaluate_budget,
 )
+from ccd_casadi.budget.error_density import integrated
 from ccd_casadi.budget.evaluation import COMPLEX_STEP, ErrorVariance, of_source, variances
-from ccd_casadi.budget.frequency import integrated
-from ccd_casadi.budget.loops import (
+from ccd_casadi.budget.noise_process import (
     Process,
     average_gain,
     average_matrix,
@@ -45,34 +45,36 @@ class Variances(NamedTuple):
     force: float
 
 
-def by_lyapunov(made: Loop, source: Source, window: float | None) -> Variances:
+def by_lyapunov(made: Loop, source: ErrorSource, window: float | None) -> Variances:
     """Of a shaped source."""
     return Variances(*map(float, of_source(made, source, window)))
 
 
 SHAPED = (
-    Source("cable", Kind.FORCE, ShapedSpectrum(1e-4)),
-    Source("amplifier", Kind.FORCE, ShapedSpectrum(1e-2, (), ((20.0, 0.3),))),
-    Source("floor", Kind.FLOOR_MOTION,
+    ErrorSource("cable", SourceKind.FORCE, ShapedSpectrum(1e-4)),
+    ErrorSource("amplifier", SourceKind.FORCE, ShapedSpectrum(1e-2, (), ((20.0, 0.3),))),
+    ErrorSource("floor", SourceKind.FLOOR_MOTION,
            ShapedSpectrum(1e-14, ((1.0,),), ((3.0,), (30.0, 0.5))), (0.0, 10.0, 1e4)),
-    Source("floor accelerating", Kind.FLOOR_MOTION,
+    ErrorSource("floor accelerating", SourceKind.FLOOR_MOTION,
            ShapedSpectrum(1e-8, (), ((30.0, 0.5),)), (60.0, 0.0, 0.0), of_acceleration=True),
-    Source("encoder", Kind.SENSOR_NOISE, ShapedSpectrum(1e-20)),
-    Source("encoder's filter", Kind.SENSOR_NOISE, ShapedSpectrum(1e-18, (), ((500.0,),))),
-    Source("setpoint", Kind.SETPOINT, ShapedSpectrum(1e-10, (), ((2.0, 0.7),))),
+    ErrorSource("encoder", SourceKind.SENSOR_NOISE, ShapedSpectrum(1e-20)),
+    ErrorSource("encoder's filter", SourceKind.SENSOR_NOISE,
+                ShapedSpectrum(1e-18, (), ((500.0,),))),
+    ErrorSource("setpoint", SourceKind.SETPOINT, ShapedSpectrum(1e-10, (), ((2.0, 0.7),))),
 )  # fmt: skip
 TABLES = tuple(
-    Source(kind.value, kind, TabulatedSpectrum((1.0, 10.0, 15.0, 400.0), density),
-           (3.0, 10.0, 1e4) if kind is Kind.FLOOR_MOTION else (0.0, 0.0, 0.0))
+    ErrorSource(kind.value, kind, TabulatedSpectrum((1.0, 10.0, 15.0, 400.0), density),
+           (3.0, 10.0, 1e4) if kind is SourceKind.FLOOR_MOTION else (0.0, 0.0, 0.0))
     for kind, density in (
-        (Kind.FORCE, (1e-3, 1e-2, 1e-2, 1e-5)), (Kind.FLOOR_MOTION, (1e-15, 1e-14, 1e-16, 1e-18)),
-        (Kind.SENSOR_NOISE, (1e-18, 1e-19, 1e-19, 1e-20)),
-        (Kind.SETPOINT, (1e-9, 1e-10, 1e-10, 1e-14)),
+        (SourceKind.FORCE, (1e-3, 1e-2, 1e-2, 1e-5)),
+        (SourceKind.FLOOR_MOTION, (1e-15, 1e-14, 1e-16, 1e-18)),
+        (SourceKind.SENSOR_NOISE, (1e-18, 1e-19, 1e-19, 1e-20)),
+        (SourceKind.SETPOINT, (1e-9, 1e-10, 1e-10, 1e-14)),
     )
 )  # fmt: skip
 
 
-def doubled(source: Source) -> Source:
+def doubled(source: ErrorSource) -> ErrorSource:
     """With twice the amplitude."""
     if isinstance(source.spectrum, ShapedSpectrum):
         return replace(source, spectrum=replace(source.spectrum, level=4.0 * source.spectrum.level))
@@ -124,7 +126,7 @@ def test_a_dense_table_of_a_filter_has_the_filters_budget(sampling: Sampling | N
     [(None, SHAPED), (LATE, SHAPED), (SLOW, SHAPED[:3]), (None, TABLES[:2]), (LATE, TABLES[2:])],
 )
 def test_derivatives_to_controller_and_plant(
-    sampling: Sampling | None, sources: tuple[Source, ...]
+    sampling: Sampling | None, sources: tuple[ErrorSource, ...]
 ) -> None:
     made, structure, kappa = built(sampling)
     budget, scaled, n = ErrorBudget(sources), plant(), len(kappa)
@@ -307,10 +309,10 @@ def test_an_unstable_loop_has_no_budget() -> None:
     lambda: TabulatedSpectrum((1.0, 2.0), (1.0, 0.0)),
     lambda: ShapedSpectrum(0.0),
     lambda: ShapedSpectrum(1.0, (), ((1.0, -0.1),)),
-    lambda: Source("floor", Kind.FLOOR_MOTION, ShapedSpectrum(1.0)),
-    lambda: Source("floor", Kind.FLOOR_MOTION, ShapedSpectrum(1.0), (1.0, 0.0, 0.0)),
-    lambda: Source("force", Kind.FORCE, ShapedSpectrum(1.0), (1.0, 0.0, 0.0)),
-    lambda: Source("setpoint", Kind.SETPOINT, ShapedSpectrum(1.0)),
+    lambda: ErrorSource("floor", SourceKind.FLOOR_MOTION, ShapedSpectrum(1.0)),
+    lambda: ErrorSource("floor", SourceKind.FLOOR_MOTION, ShapedSpectrum(1.0), (1.0, 0.0, 0.0)),
+    lambda: ErrorSource("force", SourceKind.FORCE, ShapedSpectrum(1.0), (1.0, 0.0, 0.0)),
+    lambda: ErrorSource("setpoint", SourceKind.SETPOINT, ShapedSpectrum(1.0)),
     lambda: ErrorBudget(()),
     lambda: ErrorBudget(SHAPED, 0.0),
 ])  # fmt: skip

@@ -9,7 +9,13 @@ import pytest
 from oracles.case_documents import TWO_MASS
 from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
-from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
+from ccd_casadi.budget import (
+    ErrorBudget,
+    ErrorSource,
+    ShapedSpectrum,
+    SourceKind,
+    TabulatedSpectrum,
+)
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Structure, certify, local_search, synthesise_sections
@@ -18,8 +24,9 @@ from ccd_casadi.fixed_structure.least_value import RmsError, least_value
 from ccd_casadi.support.text import HZ
 
 BUDGET = ErrorBudget((
-    Source("cable", Kind.FORCE, ShapedSpectrum(1e-4)),
-    Source("encoder", Kind.SENSOR_NOISE, TabulatedSpectrum((1.0, 1e3), (2.5e-21, 2.5e-21))),
+    ErrorSource("cable", SourceKind.FORCE, ShapedSpectrum(1e-4)),
+    ErrorSource("encoder", SourceKind.SENSOR_NOISE,
+                TabulatedSpectrum((1.0, 1e3), (2.5e-21, 2.5e-21))),
 ))  # fmt: skip
 PID = Structure(biquads=0)
 KEPT = replace(BOUNDS, compliance_max=None)

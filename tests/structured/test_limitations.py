@@ -29,7 +29,7 @@ from ccd_casadi.limitations.of_problem import (
 )
 from ccd_casadi.lti.loop import sampled
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
+from ccd_casadi.plants.plant_facts import Zero, bandwidth_limit_hz
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.synthesis import synthesise

@@ -17,7 +17,7 @@ from ccd_casadi.case_studies.rib_stage.geometry import (
     rigid_values,
 )
 from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
-from ccd_casadi.case_studies.rib_stage.modes import Discretisation, discretise, heights
+from ccd_casadi.case_studies.rib_stage.stage_modes import Discretisation, discretise, heights
 from ccd_casadi.case_studies.rib_stage.truncation import (
     Mode,
     ModeCount,

@@ -37,7 +37,7 @@ from ccd_casadi.case_studies.rib_stage.model import (
     points_of,
     rigid_part,
 )
-from ccd_casadi.case_studies.rib_stage.modes import (
+from ccd_casadi.case_studies.rib_stage.stage_modes import (
     SQUARE_GROUPS,
     Discretisation,
     Group,
@@ -353,7 +353,7 @@ def _coupled(parts: Sequence[Small], masses: Sequence[float]) -> Small:
 
 
 def _slopes(one: Small, rigid: int, count: int, points: int) -> tuple[Array, Array, Array]:
-    """u_z of so many modes at the points, its slopes and those of K, as `modes.slopes` has them:
+    """u_z of `count` modes at the points, its slopes and those of K, as in `stage_modes.slopes`:
 
     φ'_i = -½ φ_i φ_iᵀM'φ_i + Σ_j φ_j φ_jᵀ(K' - λ_i M')φ_i/(λ_i - λ_j).
     """

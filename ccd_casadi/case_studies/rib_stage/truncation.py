@@ -7,7 +7,7 @@ import numpy as np
 
 from ccd_casadi.case_studies.rib_stage.assembly import AS, SA
 from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point, has_square_symmetry
-from ccd_casadi.case_studies.rib_stage.modes import (
+from ccd_casadi.case_studies.rib_stage.stage_modes import (
     Discretisation,
     Group,
     GroupModes,

@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.surface import surface_figure
 from ccd_casadi.drawing.svg import ModeShapes
-from ccd_casadi.plants.cad.modes import Body, Material, mode_shapes, reduced, surface
+from ccd_casadi.plants.cad.elastic_body import Body, Material, mode_shapes, reduced, surface
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
 from ccd_casadi.plants.differenced import remembered, with_fixed

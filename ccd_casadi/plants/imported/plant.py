@@ -8,10 +8,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.imported.frames import fit_entries
 from ccd_casadi.plants.imported.interpolation import Errors, InterpolatedModes, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
+from ccd_casadi.plants.imported.mode_matching import fit_entries
 from ccd_casadi.plants.plant import Plant, named_values
 from ccd_casadi.support.errors import PlantError
 

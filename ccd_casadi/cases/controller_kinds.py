@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from ccd_casadi.budget import Kind
+from ccd_casadi.budget import SourceKind
 from ccd_casadi.cases.checks import Fail
 from ccd_casadi.cases.controller_tables import ChannelTable, ControllerTable
 from ccd_casadi.cases.tables import Case, InnerTable, WeightsTable
@@ -95,7 +95,7 @@ def check_kind(tables: Mapping[str, Any], fail: Fail) -> None:
     if not structured:
         return
     inner, budget = tables["inner"], tables["budget"]
-    if v is RMS_ERROR and not any(getattr(budget, kind.value) for kind in Kind):
+    if v is RMS_ERROR and not any(getattr(budget, kind.value) for kind in SourceKind):
         words = 'is "rms_error", and no spectrum says what moves the stage; add [budget.force]'
         raise fail("inner.minimise", f"{words} or another")
     if inner.bandwidth_least_hz is not None and not of_error:

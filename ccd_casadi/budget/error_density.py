@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.budget.loops import FORCES, process
-from ccd_casadi.budget.sources import Kind, Source
+from ccd_casadi.budget.noise_process import FORCES, process
+from ccd_casadi.budget.sources import ErrorSource, SourceKind
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import frequency_grid, root_flanks, sensitivity
 from ccd_casadi.support.arrays import Array
@@ -148,16 +148,16 @@ class Responses:
     free: np.ndarray
     S: np.ndarray
 
-    def seen(self, kind: Kind) -> np.ndarray:
+    def seen(self, kind: SourceKind) -> np.ndarray:
         """What of a source the controller reads."""
         if kind in FORCES:
             return -self.S @ self.free
-        return self.S if kind is Kind.SETPOINT else -self.S
+        return self.S if kind is SourceKind.SETPOINT else -self.S
 
-    def of(self, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
+    def of(self, kind: SourceKind) -> tuple[np.ndarray, np.ndarray]:
         """H_e and H_u of a source."""
         seen = self.seen(kind)
-        true = np.eye(seen.shape[1]) + seen if kind is Kind.SENSOR_NOISE else seen
+        true = np.eye(seen.shape[1]) + seen if kind is SourceKind.SENSOR_NOISE else seen
         return true, self.K @ seen
 
 
@@ -180,7 +180,7 @@ def responses(loop: Loop, hz: Array) -> Responses:
     return Responses(G, K, free, sensitivity(G @ K))
 
 
-def densities(loop: Loop, source: Source) -> Callable[[Array], Array]:
+def densities(loop: Loop, source: ErrorSource) -> Callable[[Array], Array]:
     """f in Hz -> (S_e, S_u) as rows, of all channels together; one-sided, m²/Hz and N²/Hz."""
     if loop.sampling is not None and source.shaped:
         return _folded(loop, source, loop.sampling.period)
@@ -193,7 +193,7 @@ def densities(loop: Loop, source: Source) -> Callable[[Array], Array]:
     return at
 
 
-def _folded(loop: Loop, source: Source, T: float) -> Callable[[Array], Array]:
+def _folded(loop: Loop, source: ErrorSource, T: float) -> Callable[[Array], Array]:
     """The densities of the samples below half the rate, with all that is folded into them."""
     model = process(loop, source).balanced()
 
@@ -211,7 +211,7 @@ def _folded(loop: Loop, source: Source, T: float) -> Callable[[Array], Array]:
     return at
 
 
-def panels(loop: Loop, source: Source, *, options: PanelOptions = PanelOptions()) -> Array:
+def panels(loop: Loop, source: ErrorSource, *, options: PanelOptions = PanelOptions()) -> Array:
     """Rising frequencies in Hz between which the densities are smooth, from end to end.
 
     A table's own range. What is white goes on from far below the slowest to far above the fastest
@@ -233,7 +233,7 @@ def panels(loop: Loop, source: Source, *, options: PanelOptions = PanelOptions()
     return np.asarray(frequency_grid(low, high, points, *special, apart=1e-9) / HZ)
 
 
-def integrated(loop: Loop, source: Source, weight: Callable[[Array], Array]) -> Integral:
+def integrated(loop: Loop, source: ErrorSource, weight: Callable[[Array], Array]) -> Integral:
     """∫ w(f) S_e df and ∫ S_u df; rows S_e, S_u and w S_e. In Hz, m² and N²."""
     both = densities(loop, source)
 

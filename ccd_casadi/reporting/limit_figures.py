@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inn
 from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import paragraph, paragraphs, theta_axes
-from ccd_casadi.reporting.loops import gain_panels, over_hz, synthesised_loop, view_of
+from ccd_casadi.reporting.gain_figures import gain_panels, over_hz, synthesised_loop, view_of
 from ccd_casadi.support.text import HZ, display_unit, spoken
 
 if TYPE_CHECKING:
@@ -140,17 +140,19 @@ def _figure(model: BudgetFigures) -> Figure:
 
 
 HEADING = "Start against optimum"
-SAME = 1e-6  # of the box: an optimum this close to the start is the start
 HEIGHTS = (3.0, 3.0)  # inches
 
 
-def start_chapter(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[Chapter]:
-    """Both as figures, poles and a table; nothing where the run did not leave its start.
+def start_chapter(
+    problem: CoDesignProblem, verified: "VerifiedDesign", *, same: float = 1e-6
+) -> list[Chapter]:
+    """Both as figures, poles and a table; nothing where the run stayed within `same` (a share of
+    the box) of its start.
 
     At the start the true inner problem is solved, so that each hardware has its best controller.
     """
     width = np.subtract(problem.upper, problem.lower)
-    if (np.abs(np.subtract(verified.theta, problem.start)) <= SAME * width).all():
+    if (np.abs(np.subtract(verified.theta, problem.start)) <= same * width).all():
         return []
     found = true_inner(problem, problem.start)
     if found.optimum is None:

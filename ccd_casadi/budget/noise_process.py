@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag, expm, matrix_balance
 
-from ccd_casadi.budget.sources import Kind, Source
+from ccd_casadi.budget.sources import ErrorSource, SourceKind
 from ccd_casadi.lti.loop import Loop, Sampling, delay_parts, delayed
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -46,7 +46,7 @@ def average_matrix(A: Array, window: float, period: float | None) -> Array:
     return (N * one + 2.0 * A @ power) / N**2
 
 
-FORCES = (Kind.FORCE, Kind.FLOOR_MOTION)
+FORCES = (SourceKind.FORCE, SourceKind.FLOOR_MOTION)
 Matrix = np.ndarray[Any, Any]  # real, or complex with a step along the imaginary axis
 
 
@@ -111,7 +111,7 @@ class Process:
 
 
 def disturbed(
-    G: StateSpace, sources: Sequence[Source], hold: Sampling | None, order: int
+    G: StateSpace, sources: Sequence[ErrorSource], hold: Sampling | None, order: int
 ) -> Process:
     """A plant without feedthrough (SI) under independent sources of white noise through filters,
     with the states of a controller of this order that does nothing yet.
@@ -152,7 +152,7 @@ def disturbed(
 
 
 @lru_cache(64)  # every plant of a set has the same
-def _joined(sources: tuple[Source, ...], channels: int) -> tuple[StateSpace, Matrix]:
+def _joined(sources: tuple[ErrorSource, ...], channels: int) -> tuple[StateSpace, Matrix]:
     """The filters side by side, each in every channel, with their sum as the controller reads it;
     and C of what of it is true."""
     none, out = np.zeros((0, 0)), np.zeros((channels, 0))
@@ -160,9 +160,9 @@ def _joined(sources: tuple[Source, ...], channels: int) -> tuple[StateSpace, Mat
     for one in sources:
         if not one.shaped:
             raise ValueError("a tabulated source has no state space")
-        own, sign = one.shaping(), -1.0 if one.kind is Kind.SENSOR_NOISE else 1.0
+        own, sign = one.shaping(), -1.0 if one.kind is SourceKind.SENSOR_NOISE else 1.0
         A, B, C, D = (np.kron(np.eye(channels), part) for part in (own.A, own.B, own.C, own.D))
-        added = (A, B, sign * C, sign * D, C * (one.kind is Kind.SETPOINT))
+        added = (A, B, sign * C, sign * D, C * (one.kind is SourceKind.SETPOINT))
         for part, own_part in zip(parts, added, strict=True):
             part.append(own_part)
     A, B = (block_diag(*part) for part in parts[:2])
@@ -191,13 +191,13 @@ def run_matrix(parts: Sequence[Matrix], period: float | None) -> Matrix:
     return np.block([[D, C], [B, A]])
 
 
-def process(loop: Loop, source: Source) -> Process:
+def process(loop: Loop, source: ErrorSource) -> Process:
     """Make the state space of a loop, whose plant has no feedthrough, under a source.
 
     Parameters
     ----------
     loop : Loop
-    source : Source
+    source : ErrorSource
         With a shaping filter.
 
     Returns

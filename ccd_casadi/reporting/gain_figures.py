@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ccd_casadi.codesign.verified import Verified
 
 UNITS = {"S": "–", "KS": "N/m", "T": "–"}
-PEAK = 1.05  # |S| of a local maximum that is worth a word
 
 
 def synthesised_loop(
@@ -215,9 +214,9 @@ def _box(left: float, right: float, bottom: float, top: float) -> Area:
     return Area(np.array([left, right, right, left]), np.array([bottom, bottom, top, top]))
 
 
-def _high_peaks(view: LoopView) -> list[tuple[float, float]]:
-    """Those of S worth a word, the highest first."""
-    return sorted((p for p in view.peaks if p[1] > PEAK), key=lambda p: -p[1])
+def _high_peaks(view: LoopView, *, least: float = 1.05) -> list[tuple[float, float]]:
+    """Local maxima of |S| above `least`, the highest first."""
+    return sorted((p for p in view.peaks if p[1] > least), key=lambda p: -p[1])
 
 
 def _peak_marks(tops: Sequence[tuple[float, float]], colour: str, of: str = "") -> list[Mark]:

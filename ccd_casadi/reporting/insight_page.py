@@ -20,14 +20,13 @@ from ccd_casadi.reporting.facts import (
     theta_axes,
     theta_words,
 )
-from ccd_casadi.reporting.limits import limit_blocks
-from ccd_casadi.reporting.loops import run_view
+from ccd_casadi.reporting.gain_figures import run_view
+from ccd_casadi.reporting.limit_figures import limit_blocks
 from ccd_casadi.reporting.machine import machine
 from ccd_casadi.reporting.structured_page import binding_words
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.text import HZ, display_unit, number, spoken
 
-ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 MOST = 12  # designs along the front that are drawn
 
 
@@ -171,8 +170,13 @@ def _table(problem: CoDesignProblem, front: Front) -> c.Table:
     return c.Table(head, rows)
 
 
-def table_responses(problem: CoDesignProblem, found: PostOptimal) -> c.Table:
-    """The parameters that the optimum answers to, per unit, in the units of the case file."""
+def table_responses(
+    problem: CoDesignProblem, found: PostOptimal, *, rounding: float = 1e-9
+) -> c.Table:
+    """The parameters that the optimum answers to, per unit, in the units of the case file.
+
+    A doubled parameter that moves θ by less than `rounding` of the box does not move it.
+    """
     rows = []
     swept = any(item.ln_omega for item in found.responses)
     lower, upper = lifted_bounds(problem) if swept else box(problem)
@@ -189,7 +193,7 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> c.Table:
         theta = ", ".join(
             f"{label} {number(v / factor, 3)}"
             for label, v, size in zip(labels, moves, sizes, strict=True)
-            if abs(v) * (abs(item.value) or 1.0) > ROUNDING * size
+            if abs(v) * (abs(item.value) or 1.0) > rounding * size
         )
         still = "does not move" if found.determined or swept else "–"
         slopes = (item.objective, item.bandwidth / HZ, item.hardware_cost)
