@@ -22,7 +22,7 @@ from peer_table import keep
 from scipy.linalg import block_diag, solve_continuous_are, solve_continuous_lyapunov
 
 import ccd_casadi as ccd
-from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
+from ccd_casadi.budget import ErrorBudget, ErrorSource, ShapedSpectrum, SourceKind
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.least_value import RmsError
@@ -84,8 +84,8 @@ def of_beam(draws: int) -> list[list[str]]:
     plants = [scale_state_space(G, 1e4) for G in (nominal, *corners)]
     bounds = Bounds(S_max=3.0, S_low=1.0, omega_low=0.01)
     problem = problem_for(plants, structure, bounds, None, (0.1, 5000.0))
-    budget = ErrorBudget((Source("d", Kind.FORCE, ShapedSpectrum(2.0)),
-                          Source("n", Kind.SENSOR_NOISE, ShapedSpectrum(2.0 * NOISE))))  # fmt: skip
+    noise = ErrorSource("n", SourceKind.SENSOR_NOISE, ShapedSpectrum(2.0 * NOISE))
+    budget = ErrorBudget((ErrorSource("d", SourceKind.FORCE, ShapedSpectrum(2.0)), noise))
     goal = RmsError(tuple(plants[:5]), structure, budget, None)
     w0, force = problem.plants.omega_0, problem.plants.force
     model = LoopModel(problem, lambda k: goal.at(structure.in_units(k, w0, force)), 1e-6, -9.0)

@@ -23,7 +23,7 @@ from problems import BACKOFF, HZ, OMEGA_LOW, Problem, stage, two_masses, weights
 
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerBounds
-from ccd_casadi.kernels.design import design, judge, sweep
+from ccd_casadi.kernels.certified_design import design, judge, sweep
 from ccd_casadi.kernels.gamma import optimal_gamma
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.linear_algebra import stable_subspace

@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def table(comparison: "Comparison") -> str:
     """The methods in columns that a terminal of 80 characters holds, then how they ended."""
-    from ccd_casadi.reporting.verdict import head_words
+    from ccd_casadi.reporting.run_verdict import head_words
 
     lines = [f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>9}{'syntheses':>10}{'check':>7}{'s':>8}"]
     ends: dict[str, list[str]] = {}

@@ -108,7 +108,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     inform(_summary(finished, found))
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.moves import way_words
-    from ccd_casadi.reporting.verdict import index_of, publish
+    from ccd_casadi.reporting.run_verdict import index_of, publish
 
     if moved is not None:
         last = list(moved.ways)[-1]
@@ -127,7 +127,7 @@ def main(options: argparse.Namespace) -> ExitCode:
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.outcome import figure_rows, order_words, status_words
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.reporting.verdict import advice
+    from ccd_casadi.reporting.run_verdict import advice
     from ccd_casadi.support.text import template
 
     return template("templates/deploy.txt", place_words=place_words).render(

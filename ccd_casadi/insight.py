@@ -47,7 +47,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     inform(f"front         {len(verified)} of {len(front.points)} points verified, "
            f"{front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
     from ccd_casadi.reporting.insight_page import insight_page
-    from ccd_casadi.reporting.verdict import index_of, publish
+    from ccd_casadi.reporting.run_verdict import index_of, publish
 
     page = insight_page(done, front, responses, index_of(folder))
     publish(folder, folder / "insight.html", page)

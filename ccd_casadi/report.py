@@ -20,8 +20,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Draw every page of the folder, and of those of deployments and the like below it."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.drawing.paint import NAME, draw, read_pages
+    from ccd_casadi.reporting.run_verdict import publish, write_index
     from ccd_casadi.reporting.solve_page import page_of_run
-    from ccd_casadi.reporting.verdict import publish, write_index
 
     folder = options.run
     if not folder.is_dir():

@@ -26,7 +26,17 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     place=RUN | {"help": "the run folder; with --out a copy there is retrained"},
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
-    """The command itself."""
+    """Add true samples to a run where they help its optimum most, and fit again.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        Of the command line.
+
+    Returns
+    -------
+    ExitCode
+    """
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.result import write_run

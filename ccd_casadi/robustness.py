@@ -70,7 +70,7 @@ def main(options: argparse.Namespace) -> ExitCode:
     answer |= {"seed": options.seed, "versions": versions(), "seconds": options.seconds()}
     write_json(folder / "robustness.json", answer)
     from ccd_casadi.reporting.robustness_page import conclusion, robustness_page
-    from ccd_casadi.reporting.verdict import index_of, publish  # matplotlib is slow to import
+    from ccd_casadi.reporting.run_verdict import index_of, publish  # matplotlib is slow to import
 
     own = options.controller is None
     if own:

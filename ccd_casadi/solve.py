@@ -29,7 +29,7 @@ def summary(solution: "Solution") -> str:
         loop_lines,
         theta_words,
     )
-    from ccd_casadi.reporting.verdict import advice, terminal_lines
+    from ccd_casadi.reporting.run_verdict import advice, terminal_lines
     from ccd_casadi.support.text import template
 
     r = solution.result

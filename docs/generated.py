@@ -40,7 +40,7 @@ def result() -> str:
 
 def files() -> str:
     """Every file that a run's folder may hold, as its index.html lists them."""
-    from ccd_casadi.reporting.verdict import FILES, PAGES
+    from ccd_casadi.reporting.run_verdict import FILES, PAGES
 
     rows = [f"| `{name}` | {words} |" for name, words in (PAGES | FILES).items()]
     return "\n".join(["| file | holds |", "|---|---|", *rows])

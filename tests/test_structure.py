@@ -1,6 +1,7 @@
 """How the code is cut: numbers of algorithms belong to the options of these."""
 
 import ast
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,3 +70,22 @@ def test_a_bare_number_outside_drawing_is_counted() -> None:
     assert list(structure.bare_constants(tree, "ccd_casadi.support.text")) == ["STEP"]
     assert list(structure.bare_constants(tree, "ccd_casadi.lti.norms")) == ["HZ", "STEP"]
     assert not list(structure.bare_constants(tree, "ccd_casadi.drawing.svg"))
+
+
+def documented(text: str) -> list[str]:
+    """Names in the section Parameters of a docstring."""
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", text, re.M | re.S)
+    lines = section[1].splitlines() if section else []
+    heads = (line.split(" :")[0] for line in lines if line and not line.startswith(" "))
+    return [name.strip().lstrip("*") for head in heads for name in head.split(",")]
+
+
+def test_documented_parameters_are_those_of_the_signature() -> None:
+    wrong = {}
+    for module, tree in modules():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                own = {arg.arg for arg in ast.walk(node.args) if isinstance(arg, ast.arg)}
+                found = set(documented(ast.get_docstring(node) or "")) - own
+                wrong |= {f"{module}.{node.name}": found} if found else {}
+    assert wrong == {}

@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.problem import (
     scaled_system,
 )
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_bounds
-from ccd_casadi.kernels.design import failed_row
+from ccd_casadi.kernels.certified_design import failed_row
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics

@@ -76,7 +76,7 @@ def packed(changes: Sequence[Change]) -> tuple[list[Any], np.ndarray]:
 
 HEIGHT = 230
 FEW = 4  # ticks of a linear axis across: a figure may be 240 px wide
-USUAL, PX = (240, 150), 11.0 / SIZE  # px of the axes inside; px of a pt of its words
+PX = 11.0 / SIZE  # of a pt of its words
 PADDING = 0.1  # of the data, that a linear axis reaches beyond them
 CENTRE, HALF = -0.8, (2.4, 2.0)  # of a round plot, and what it shows at least to both sides
 DASHES = {"-": "solid", "--": "dashed", ":": "dotted", "-.": "dotdash"}
@@ -96,9 +96,9 @@ class PanelFigure:
     def __init__(
         self, name: str, heading: str, dark: bool, *, log_x: bool = False, log_y: bool = False,
         x_range: models.Range1d | None = None, cursor: Span | None = None,
-        whole_circles: bool = False,
+        whole_circles: bool = False, inside: tuple[int, int] = (240, 150),
     ) -> None:  # fmt: skip
-        self.name, self.heading = name, heading
+        self.name, self.heading, self._inside = name, heading, inside  # px of the axes, at first
         self._dark, self._log_x, self._log_y, self._round = dark, log_x, log_y, whole_circles
         self._shared = x_range is not None
         self.own, self._lines, self._pins = (_source(LINE, f"own_{name}"), _source(LINE),
@@ -230,7 +230,7 @@ class PanelFigure:
         try:
             wide, tall = self.figure.inner_width, self.figure.inner_height
         except UnsetValueError:
-            wide, tall = USUAL
+            wide, tall = self._inside
         logs = self._log_x, self._log_y
         if self._round:  # as round.js has them
             scale = max(2.0 * HALF[0] / wide, 2.0 * HALF[1] / tall)

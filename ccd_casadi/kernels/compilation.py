@@ -44,7 +44,9 @@ def compile_part(part: str) -> None:
     """
     if part in ("rows", "curvature"):
         return _compile_rows(part == "curvature")
-    from ccd_casadi.kernels import design, frequency, gamma, riccati, sensitivity, synthesis
+    from ccd_casadi.kernels import certified_design as design
+    from ccd_casadi.kernels import frequency, gamma, riccati, sensitivity
+    from ccd_casadi.kernels import riccati_synthesis as synthesis
     from ccd_casadi.kernels.generalized_plant import generalized_plant, squared_weights
     from ccd_casadi.kernels.linear_algebra import lyapunov_triangular, stable_subspace
 
@@ -167,7 +169,7 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    names = ("design", "gradients", "loop_grid", "loop_point", "modes")
+    names = ("certified_design", "gradients", "loop_grid", "loop_point", "modes")
     for name in names:  # with them all the others
         import_module(f"{PACKAGE}.{name}")
     found = {}

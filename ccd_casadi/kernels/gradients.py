@@ -44,8 +44,12 @@ from ccd_casadi.kernels.riccati import (
     lqr_hamiltonian,
     riccati_level,
 )
+from ccd_casadi.kernels.riccati_synthesis import (
+    disturbance_bound,
+    filter_solution,
+    innovations_plant,
+)
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.synthesis import disturbance_bound, filter_solution, innovations_plant
 from ccd_casadi.support.arrays import Array
 
 

@@ -26,8 +26,8 @@ from ccd_casadi.lti.state_space import frequency_grid, sensitivity, sigma_max
 from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
+from ccd_casadi.reporting.run_verdict import head_of
 from ccd_casadi.reporting.structured_page import structured_table
-from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.text import HZ, number, spoken, with_unit
 
 POINTS = 900

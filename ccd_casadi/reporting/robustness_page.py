@@ -23,7 +23,7 @@ from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.reporting.facts import facts, paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import figure_gains
 from ccd_casadi.reporting.moves import way_words, ways_figure
-from ccd_casadi.reporting.verdict import head_of
+from ccd_casadi.reporting.run_verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array

@@ -38,13 +38,13 @@ from ccd_casadi.reporting.limit_figures import budget_chapter, limit_blocks, sta
 from ccd_casadi.reporting.machine import SHOWN, glance, mode_shape_figure
 from ccd_casadi.reporting.moves import cycle_chapter, force_step, move_figure
 from ccd_casadi.reporting.nyquist import bode
+from ccd_casadi.reporting.run_verdict import publish, run_head
 from ccd_casadi.reporting.structured_page import (
     bandwidths_table,
     binding_words,
     controller_blocks,
     limits_blocks,
 )
-from ccd_casadi.reporting.verdict import publish, run_head
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Progress
 

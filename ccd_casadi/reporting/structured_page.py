@@ -22,7 +22,7 @@ from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop, sensiti
 from ccd_casadi.reporting.facts import binding, facts, gain_words, paragraph
 from ccd_casadi.reporting.gain_figures import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import near, nyquist_panel
-from ccd_casadi.reporting.verdict import head_of
+from ccd_casadi.reporting.run_verdict import head_of
 from ccd_casadi.support.text import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
 

@@ -24,9 +24,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import slycot
 
-from ccd_casadi.kernels.design import DesignOptions
+from ccd_casadi.kernels.certified_design import DesignOptions
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.synthesis import four_block_plant
+from ccd_casadi.kernels.riccati_synthesis import four_block_plant
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

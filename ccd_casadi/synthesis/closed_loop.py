@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.kernels.design import judge
+from ccd_casadi.kernels.certified_design import judge
 from ccd_casadi.kernels.sensitivity import Column
 from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ccd_casadi.kernels.design import design, failed_row
+from ccd_casadi.kernels.certified_design import design, failed_row
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gradients import LoopAt, MadeFor, figure_gradients, peak_gradients
 from ccd_casadi.kernels.sensitivity import Code, Column, sensitivity_gain, sensitivity_gains

@@ -5,8 +5,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from ccd_casadi.kernels.design import design, judge
-from ccd_casadi.kernels.design import sweep as _sweep
+from ccd_casadi.kernels.certified_design import design, judge
+from ccd_casadi.kernels.certified_design import sweep as _sweep
 from ccd_casadi.kernels.sensitivity import Code, Column
 from ccd_casadi.lti.norms import gains, hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop, refine_peak

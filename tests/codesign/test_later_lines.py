@@ -13,7 +13,7 @@ from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Page
 from ccd_casadi.drawing.paint import page_html
-from ccd_casadi.reporting.verdict import run_head, write_index
+from ccd_casadi.reporting.run_verdict import run_head, write_index
 from ccd_casadi.robustness import main as robustness
 
 

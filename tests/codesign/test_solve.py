@@ -23,7 +23,7 @@ from oracles.helpers import (
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.inner import main as inner
-from ccd_casadi.kernels.design import DesignOptions
+from ccd_casadi.kernels.certified_design import DesignOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics

@@ -38,7 +38,7 @@ from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.reporting import verdict as shown
+from ccd_casadi.reporting import run_verdict as shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import local_peaks_with_gradients
 from ccd_casadi.synthesis.synthesis import Statics, synthesise

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from ccd_casadi.__main__ import COMMANDS
-from ccd_casadi.reporting.verdict import FILES
+from ccd_casadi.reporting.run_verdict import FILES
 from ccd_casadi.support.text import package_text
 
 ROOT = Path(__file__).parents[2]

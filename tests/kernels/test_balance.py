@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from oracles.bound_error import gamma_error
 from oracles.helpers import OMEGA_LOW, PAPER, flexible_case, stack_gain, two_mass
 
-from ccd_casadi.kernels import design as module
-from ccd_casadi.kernels.design import design
+from ccd_casadi.kernels import certified_design as module
+from ccd_casadi.kernels.certified_design import design
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.riccati import RiccatiOptions, balancing, lqr_hamiltonian, rounding_noise
+from ccd_casadi.kernels.riccati_synthesis import synthesise
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.synthesis import synthesise
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights

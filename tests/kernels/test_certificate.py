@@ -19,9 +19,9 @@ from oracles.helpers import (
     two_mass,
 )
 
-from ccd_casadi.kernels.certificate import level_test, stack_norm, weighted_loop
-from ccd_casadi.kernels.design import certificate_grid
+from ccd_casadi.kernels.certified_design import certificate_grid
 from ccd_casadi.kernels.frequency import prepare
+from ccd_casadi.kernels.loop_certificate import level_test, stack_norm, weighted_loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise

@@ -14,7 +14,7 @@ from oracles.helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
 
 from ccd_casadi.kernels import compilation
 from ccd_casadi.kernels.gamma import plant_gain
-from ccd_casadi.kernels.synthesis import synthesise as search
+from ccd_casadi.kernels.riccati_synthesis import synthesise as search
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import sensitivities
@@ -68,7 +68,7 @@ def test_no_kernel_returns_a_named_tuple_to_python() -> None:
         for made in kernel.overloads.values()
         for part in _parts(made.signature.return_type)
     }
-    assert "ccd_casadi.kernels.synthesis._mixed" in {name for name, _ in returned}
+    assert "ccd_casadi.kernels.riccati_synthesis._mixed" in {name for name, _ in returned}
     assert {name for name, part in returned if isinstance(part, types.BaseNamedTuple)} == set()
 
 

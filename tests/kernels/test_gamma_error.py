@@ -9,8 +9,8 @@ from oracles.helpers import PAPER, few, flexible_case, two_mass
 
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
+from ccd_casadi.kernels.riccati_synthesis import synthesise
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.synthesis import synthesise
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 

@@ -5,10 +5,11 @@ import pytest
 from oracles.helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
 from oracles.kernel_draws import WEIGHTS
 
-from ccd_casadi.kernels import design, gamma, riccati
+from ccd_casadi.kernels import certified_design as design
+from ccd_casadi.kernels import gamma, riccati
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.synthesis import SynthesisOptions
-from ccd_casadi.kernels.synthesis import synthesise as kernel
+from ccd_casadi.kernels.riccati_synthesis import SynthesisOptions
+from ccd_casadi.kernels.riccati_synthesis import synthesise as kernel
 from ccd_casadi.synthesis.synthesis import synthesise
 
 NOISE = riccati.RiccatiOptions.noise

@@ -20,8 +20,9 @@ from oracles.helpers import (
 )
 from oracles.kernel_draws import WEIGHTS, random_system, seeds
 
-from ccd_casadi.kernels import certificate, frequency, sensitivity
-from ccd_casadi.kernels.certificate import loop_matrices, reachable_loop, weighted_loop
+from ccd_casadi.kernels import frequency, sensitivity
+from ccd_casadi.kernels import loop_certificate as certificate
+from ccd_casadi.kernels.loop_certificate import loop_matrices, reachable_loop, weighted_loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.synthesis.synthesis import synthesise

@@ -17,7 +17,7 @@ from scipy.optimize import brentq, minimize_scalar
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sweep import InnerBounds
-from ccd_casadi.kernels.design import judge
+from ccd_casadi.kernels.certified_design import judge
 from ccd_casadi.kernels.sensitivity import Column
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant

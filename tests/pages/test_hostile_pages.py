@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ccd_casadi.reporting.verdict import FILES
+from ccd_casadi.reporting.run_verdict import FILES
 from ccd_casadi.solve import main as solve
 
 ROOT = Path(__file__).parents[2]

@@ -30,7 +30,7 @@ from ccd_casadi.reporting.landscape import history_blocks
 from ccd_casadi.reporting.moves import shown_until, way_words, ways_figure
 from ccd_casadi.reporting.nyquist import near, nyquist_panel
 from ccd_casadi.reporting.robustness_page import shown_peak
-from ccd_casadi.reporting.verdict import LINES, advice, head_of, run_head
+from ccd_casadi.reporting.run_verdict import LINES, advice, head_of, run_head
 from ccd_casadi.studies.comparison import conclusions
 from ccd_casadi.support.text import HZ
 

@@ -16,11 +16,11 @@ from scipy.linalg import schur
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import true_inner
-from ccd_casadi.kernels.design import design, judge
+from ccd_casadi.kernels.certified_design import design, judge
 from ccd_casadi.kernels.linear_algebra import stable_subspace
 from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian
+from ccd_casadi.kernels.riccati_synthesis import filter_solution, innovations_plant
 from ccd_casadi.kernels.sensitivity import Code, Column
-from ccd_casadi.kernels.synthesis import filter_solution, innovations_plant
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics

@@ -5,7 +5,11 @@ from math import exp, isnan, log, nan
 
 import numpy as np
 
-from ccd_casadi.kernels.certificate import (
+from ccd_casadi.kernels.compiled import compiled, inlined
+from ccd_casadi.kernels.frequency import prepare
+from ccd_casadi.kernels.generalized_plant import generalized_plant, place
+from ccd_casadi.kernels.linear_algebra import eigenvalues
+from ccd_casadi.kernels.loop_certificate import (
     level_test,
     loop_matrices,
     pole_rounding,
@@ -13,13 +17,9 @@ from ccd_casadi.kernels.certificate import (
     stack_norm,
     weighted_loop,
 )
-from ccd_casadi.kernels.compiled import compiled, inlined
-from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.kernels.generalized_plant import generalized_plant, place
-from ccd_casadi.kernels.linear_algebra import eigenvalues
 from ccd_casadi.kernels.riccati import lqr_hamiltonian
+from ccd_casadi.kernels.riccati_synthesis import central_controller, synthesise
 from ccd_casadi.kernels.sensitivity import Code, Column, bandwidth, peak, sensitivity_gain
-from ccd_casadi.kernels.synthesis import central_controller, synthesise
 
 _COUNT, _CODE, _GAMMA_OPT = int(Column.COUNT), int(Column.CODE), int(Column.GAMMA_OPT)
 _BALANCED = int(Column.BALANCED)
