@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class RunFolderOptions:
     """Relative tolerances with which a run folder is read.
 
     Attributes
@@ -133,14 +133,14 @@ class FinishedRun(NotebookHtml):
         return to_control(plant, "plant"), to_control(controller, "controller")
 
 
-def read_run(folder: str | Path, *, options: RunOptions = RunOptions()) -> FinishedRun:
+def read_run(folder: str | Path, *, options: RunFolderOptions = RunFolderOptions()) -> FinishedRun:
     """Read a finished run, and certify its controller again.
 
     Parameters
     ----------
     folder : path
         With case.toml, result.json and controller.json.
-    options : RunOptions
+    options : RunFolderOptions
         Tolerances.
 
     Returns
@@ -219,7 +219,7 @@ def _read_mixed(
     problem: CoDesignProblem,
     theta: tuple[float, ...],
     result: Mapping[str, Any],
-    options: RunOptions,
+    options: RunFolderOptions,
 ) -> dict[str, Any]:
     """Weights, controller and figures of a run of mixed sensitivity, certified again at its γ."""
     path = folder / "result.json"

@@ -26,7 +26,7 @@ _BALANCED = int(Column.BALANCED)
 
 
 @dataclass(frozen=True)
-class DesignOptions:
+class CertifiedDesignOptions:
     """Relative tolerances of the certificate.
 
     Attributes
@@ -155,7 +155,7 @@ def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
 
 def design(
     A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0, judged_on=(),
-    options=DesignOptions(),
+    options=CertifiedDesignOptions(),
 ):  # fmt: skip
     """Synthesise at backoff·γ_opt, certify and measure.
 
@@ -182,7 +182,7 @@ def design(
     judged_on : A, B, C
         Of the plant on which the loop is closed, with free bodies in the place of suspended ones.
         Its norm may be above γ by `freed`; above that it is certified at its value.
-    options : DesignOptions
+    options : CertifiedDesignOptions
 
     Returns
     -------

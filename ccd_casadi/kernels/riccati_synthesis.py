@@ -29,7 +29,7 @@ from ccd_casadi.kernels.riccati import (
 from ccd_casadi.kernels.sensitivity import Code, Column
 
 
-class SynthesisOptions(NamedTuple):
+class RiccatiSynthesisOptions(NamedTuple):
     """Numbers of a synthesis.
 
     Attributes
@@ -51,7 +51,7 @@ class SynthesisOptions(NamedTuple):
     zoom_points: int = 17
 
 
-OPTIONS = SynthesisOptions()
+OPTIONS = RiccatiSynthesisOptions()
 
 
 def filter_solution(A, B, C, delta):

@@ -17,7 +17,7 @@ DERIVATIVES = {1: "a mobility (velocity over force); divide it by j 2π f",
 
 
 @dataclass(frozen=True)
-class ResponseOptions:
+class MeasuredResponseOptions:
     """Numbers by which a measured response is read.
 
     Attributes
@@ -74,7 +74,7 @@ class MeasuredResponse:
         Least damping ratio of a resonance: one between two lines shows on them or is harmless.
     undamped_hz : tuple of float
         Poles of G on the axis, Hz.
-    options : ResponseOptions
+    options : MeasuredResponseOptions
         Of every response.
 
     Raises
@@ -92,7 +92,7 @@ class MeasuredResponse:
     words: str = field(default="", compare=False)
     least_damping: float = 5e-4
     undamped_hz: tuple[float, ...] = ()
-    options: ClassVar[ResponseOptions] = ResponseOptions()
+    options: ClassVar[MeasuredResponseOptions] = MeasuredResponseOptions()
 
     def __post_init__(self) -> None:
         shape = self.G.shape
@@ -140,8 +140,8 @@ class MeasuredResponse:
         agree; empty where of none."""
         order = round(-self._fall)
         angle = float(np.angle((self.matrix[0] * (-1j) ** order).sum()))
-        gap = max(abs(order + self._fall), abs(angle))
-        rises = order in DERIVATIVES and gap < self.options.derivative_gap
+        most = self.options.derivative_gap
+        rises = order in DERIVATIVES and abs(order + self._fall) < most and abs(angle) < most
         return DERIVATIVES[order] if rises else ""
 
     @cached_property

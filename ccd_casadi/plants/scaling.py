@@ -20,7 +20,7 @@ from ccd_casadi.support.errors import PlantError
 
 
 @dataclass(frozen=True)
-class ChannelOptions:
+class ChannelSplitOptions:
     """Numbers of the split into separate channels.
 
     Attributes
@@ -56,7 +56,7 @@ class Channel:
 
 
 def find_channels(
-    K: Array, D: Array, B: Array, C: Array, *, options: ChannelOptions = ChannelOptions()
+    K: Array, D: Array, B: Array, C: Array, *, options: ChannelSplitOptions = ChannelSplitOptions()
 ) -> tuple[Channel, ...]:
     """The blocks of q̈ + D q̇ + K q = B u, y = C q; one, the plant itself, where it has no more.
 

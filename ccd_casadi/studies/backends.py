@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import slycot
 
-from ccd_casadi.kernels.certified_design import DesignOptions
+from ccd_casadi.kernels.certified_design import CertifiedDesignOptions
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.riccati_synthesis import four_block_plant
 from ccd_casadi.lti.state_space import StateSpace, balanced
@@ -221,7 +221,7 @@ def synthesise_with(
         return BackendResult(backend, gamma_opt, design, words, time.perf_counter() - began)
     # Free bodies are suspended in a synthesis, and its loop is judged without that.
     task = (SOLVERS[backend], mixed_sensitivity(plant.design_plant, weights), gamma_backoff)
-    slack = 1.0 + DesignOptions.freed if plant.family else 1.0
+    slack = 1.0 + CertifiedDesignOptions.freed if plant.family else 1.0
     try:
         attempt, seconds = _timed(*task) if runner is None else runner.call(limit, _timed, *task)
     except Overrun as error:

@@ -23,7 +23,7 @@ from oracles.helpers import (
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.inner import main as inner
-from ccd_casadi.kernels.certified_design import DesignOptions
+from ccd_casadi.kernels.certified_design import CertifiedDesignOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import FREE
 from ccd_casadi.plants.plant import mechanics
@@ -68,7 +68,7 @@ def test_case_study_1_is_solved_and_verified(
     assert certificate["max_real_pole"] < 0.0
     assert certificate["norm"] <= certificate["norm_bound"]
     assert result["gamma_lower_bound"] <= result["gamma_opt"] <= result["gamma"]
-    freed = 1.0 + DesignOptions.freed  # of the free stage
+    freed = 1.0 + CertifiedDesignOptions.freed  # of the free stage
     assert result["gamma"] <= 1.02 * result["gamma_opt"] * freed
     assert result["sensitivity_peak"] <= 1.75
     assert result["sensitivity_low"] <= 0.03

@@ -8,7 +8,7 @@ from oracles.kernel_draws import WEIGHTS
 from ccd_casadi.kernels import certified_design as design
 from ccd_casadi.kernels import gamma, riccati
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.riccati_synthesis import SynthesisOptions
+from ccd_casadi.kernels.riccati_synthesis import RiccatiSynthesisOptions
 from ccd_casadi.kernels.riccati_synthesis import synthesise as kernel
 from ccd_casadi.synthesis.synthesis import synthesise
 
@@ -181,7 +181,7 @@ def test_gamma_that_rounding_would_spoil_is_found_in_balanced_coordinates(seed: 
     bound, tolerance = row[design.Column.GAMMA_LOWER_BOUND], 1e-11
     own = gamma.optimal_gamma(H0, gp[1], gp[3], gp[5], bound, 0.0, tolerance, NOISE)
     assert own[3]
-    assert own[4] > SynthesisOptions().error_accepted
+    assert own[4] > RiccatiSynthesisOptions().error_accepted
     assert row[design.Column.GAMMA_ERROR] < 0.1 * own[4]
     assert row[design.Column.GAMMA_OPT] == pytest.approx(own[0], rel=own[4])
     for guess in (0.98, 1.01, 1.03):  # other levels on the way, other rounding
