@@ -14,6 +14,8 @@ from ccd_casadi.support.arrays import Array
 NEAR_AXIS = 1e-3  # |Re λ|/|λ| of a candidate: a spurious one costs an evaluation, no more
 RESOLUTION = 1e-10  # relative step of the level
 ROUNDS = 40
+CLIMBED = 0.1  # relative: how far below the largest a maximum of the grid is climbed, too
+MOST_CLIMBS, DIVISIONS, POINTS = 4, 4, 41  # maxima, times that each is divided, into how many
 MEMORY = 1_000_000  # complex numbers at once
 
 
@@ -74,9 +76,7 @@ def hinf_norm(system: StateSpace, start: float | None = None) -> tuple[float, fl
     if not poles.real.max() < 0.0:
         return np.inf, float(abs(poles[np.argmax(poles.real)].imag))
     omega = _first_grid(poles) if start is None else np.array([start, np.inf])
-    values = gains(scaled, omega)
-    i = int(np.argmax(values))
-    best, at = float(values[i]), float(omega[i])
+    best, at = _climbed(scaled, omega)
     for _ in range(ROUNDS):
         level = best * (1.0 + RESOLUTION)
         if level == 0.0:
@@ -92,6 +92,31 @@ def hinf_norm(system: StateSpace, start: float | None = None) -> tuple[float, fl
         if found[i] <= level:
             break
         best, at = float(found[i]), float(trials[i])
+    return best, at
+
+
+def _climbed(system: StateSpace, omega: Array) -> tuple[float, float]:
+    """The largest gain, and its ω, on ascending frequencies and on finer ones beside its maxima.
+
+    A flat maximum far below the other poles is an eigenvalue of the Hamiltonian that rounding moves
+    off the axis; the climb does not depend on it.
+    """
+    values = gains(system, omega)
+    i = int(np.argmax(values))
+    best, at = float(values[i]), float(omega[i])
+    if not 0.0 < best < np.inf:
+        return best, at
+    inside = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    tops = inside[(values[inside] > (1.0 - CLIMBED) * best) & np.isfinite(omega[inside + 1])]
+    for top in tops[np.argsort(-values[tops])][:MOST_CLIMBS]:
+        low, high = omega[top - 1], omega[top + 1]
+        for _ in range(DIVISIONS):
+            fine = np.linspace(low, high, POINTS)
+            found = gains(system, fine)
+            k = int(np.argmax(found))
+            if found[k] > best:
+                best, at = float(found[k]), float(fine[k])
+            low, high = fine[max(k - 1, 0)], fine[min(k + 1, POINTS - 1)]
     return best, at
 
 
