@@ -5,8 +5,10 @@
 in the person's own coordinates and units, free bodies free, nothing reduced, scaled or put in modal
 form, but for one case: beside a link so stiff that λ_max > 1e7 λ_min the eigenvalues of A err by
 ε λ_max in squares of rates, which moves the soft poles and hides free bodies. There x = (η, η̇),
-q = Φ η with `natural_modes`, which know the soft modes, M = 1 and K = Λ. Off the model, with a common shift s of the resonances, shifts s_i of single modes, a factor d
-of the damping and a gain g,
+q = Φ η with `natural_modes`, which know the soft modes, M = 1 and K = Λ.
+
+Off the model, with a common shift s of the resonances, shifts s_i of single modes, a factor d of
+the damping and a gain g,
 
     K' = (1 + s)²(K + Σ_i ((1 + s_i)² - 1) λ_i M φ_i (M φ_i)ᵀ),
     D' = d (D + Σ_i 2 ζ (1 + s)(1 + s_i) ω_i M φ_i (M φ_i)ᵀ),   B' = (1 + g) B.
