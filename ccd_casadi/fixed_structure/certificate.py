@@ -39,7 +39,7 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.support.worker_process import one_blas_thread
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ class PlantFigures(LoopPeaks):
     `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
     `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
     `static_compliance` is GS towards 0 Hz, 0 with an integrator; `low_compliance` at ω_low.
+    `GS_beyond`: rad/s of a resonance beyond half the rate where |GS| is largest; 0: it is below.
     `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peaks by Hamiltonians.
     `channels`: as those of the bounds.
     """
@@ -75,6 +76,7 @@ class PlantFigures(LoopPeaks):
     crossing: float = np.nan
     static_compliance: float = np.nan
     low_compliance: float = np.nan
+    GS_beyond: float = 0.0
     confirmed: bool = False
     channels: tuple[ChannelFigures, ...] = ()
 
@@ -145,6 +147,11 @@ def certify(
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
     if broken:
         words = f"exceeds its bound on {', '.join(broken)}"
+        beyond = max(found, key=lambda figures: figures.GS).GS_beyond
+        if beyond and not worst.get("GS", 0.0) <= 1.0 + TOLERANCE:
+            words += (f"; |GS| is largest at {beyond / HZ:.4g} Hz, at a resonance beyond half the "
+                      "sampling rate, which the search does not see: raise the rate, or damp that "
+                      "resonance")  # fmt: skip
     elif not bandwidth > 0.0:
         words = "S does not start below -3 dB on every plant"
     elif lost:
@@ -203,9 +210,12 @@ def judged(
         values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
     tops = peaks(table, grid, values)
+    beyond_half_the_rate = np.zeros(len(good))
     if table.free is not None and bounds.compliance_max is not None:
-        beyond = _compliance_beyond(table, [free[i] for i in good])
-        tops["GS"] = np.maximum(tops["GS"][0], beyond), tops["GS"][1]
+        beyond, at = _compliance_beyond(table, [free[i] for i in good])
+        larger = beyond > tops["GS"][0]
+        tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
+        beyond_half_the_rate = np.where(larger, at, 0.0)
     loops = [loops[i] for i in good]
     for k, i in enumerate(good):
         _raised(tops, k, loops[k], G[i], held, bounds, table.period)
@@ -233,6 +243,7 @@ def judged(
             KS=float(tops["KS"][0][k]),
             T=float(tops["T"][0][k]),
             GS=float(tops["GS"][0][k]),
+            GS_beyond=float(beyond_half_the_rate[k]),
             weighted_KS=float(weighted[0][k]),
             weighted_T=float(weighted[1][k]),
             # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
@@ -275,16 +286,18 @@ def _raised(
             value[row], at[row] = norm, place
 
 
-def _compliance_beyond(table: LoopTable, plants: Sequence[StateSpace]) -> Array:
-    """|S G| of every plant (P,) beyond half the rate, at its resonances there: a force of such a
-    frequency moves it by G, and its samples are those of a slower one."""
-    found = np.zeros(len(plants))
+def _compliance_beyond(table: LoopTable, plants: Sequence[StateSpace]) -> tuple[Array, Array]:
+    """|S G| of every plant (P,) beyond half the rate, at its resonances there, and their ω: a force
+    of such a frequency moves it by G, and its samples are those of a slower one."""
+    found, at = np.zeros(len(plants)), np.zeros(len(plants))
     for i, G in enumerate(plants):
         poles = np.linalg.eigvals(G.A)
         for p in poles[poles.imag > np.pi / (table.period or np.inf)]:
             around = p.imag + abs(p.real) * np.linspace(-HALF_WIDTHS, HALF_WIDTHS, 8 * FINE + 1)
-            found[i] = max(found[i], float(table.at(np.array([i]), around[None])["GS"].max()))
-    return found
+            most = float(table.at(np.array([i]), around[None])["GS"].max())
+            if not most <= found[i]:  # NaN stays NaN
+                found[i], at[i] = most, p.imag
+    return found, at
 
 
 def _rows(
