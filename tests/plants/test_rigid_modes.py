@@ -13,7 +13,7 @@ from ccd_casadi.lti.state_space import StateSpace, balanced, closed_loop
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rigid_modes import natural_modes
+from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -152,3 +152,12 @@ def test_the_loop_of_the_plant_as_written_keeps_its_slow_poles_beside_a_stiff_li
     slowest = true[np.argsort(np.abs(true))[:3]]
     off = np.abs(slowest[:, None] - found).min(axis=1) / np.abs(slowest)
     assert off.max() < 1e-4
+
+
+def test_a_rigid_body_that_is_weakly_driven_and_measured_is_kept() -> None:
+    """A thousandth of the other's force and reading is a motion that the loop has to hold."""
+    for share, kept in ((1e-3, 2), (1e-6, 2), (1e-12, 1)):
+        sides = np.diag([1.0, share])
+        T, back = driven_and_measured(sides, sides)
+        assert T.shape == (2, kept)
+        assert back @ T == pytest.approx(np.eye(kept))
