@@ -13,7 +13,7 @@ from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.certificate_responses import LoopTable
 from ccd_casadi.fixed_structure.channel_structure import given_decoupling
-from ccd_casadi.fixed_structure.discs import Terms, quotient
+from ccd_casadi.fixed_structure.discs import RankOneDiscs, quotient
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import sampled, tustin
@@ -206,7 +206,7 @@ def wild(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def moved(
-    terms: Terms, delta: np.ndarray, A: np.ndarray, B: np.ndarray, Z: np.ndarray
+    terms: RankOneDiscs, delta: np.ndarray, A: np.ndarray, B: np.ndarray, Z: np.ndarray
 ) -> np.ndarray:
     """e of f where every w_i is δ_i times what it sees: (1 + Σ δ_i c_i q_iᵀ)u = ..."""
     delta = terms.radius * delta
@@ -223,14 +223,14 @@ def test_the_largest_norm_holds_for_all_discs_and_of_one_is_reached(p) -> None:
     rows[:, n // 2 :], inputs[: n // 2] = 0.0, 0.0
     size = np.linalg.norm(columns, axis=1) * np.linalg.norm(rows, axis=2)
     radius = 0.6 * rng.dirichlet(np.ones(n), count) / np.where(size > 0.0, size, 1.0)
-    terms = Terms(columns, rows, radius, inputs)
+    terms = RankOneDiscs(columns, rows, radius, inputs)
     most = terms.largest(A, B, Z)
     assert np.isfinite(most).all()
     for _ in range(300):
         e = moved(terms, np.exp(2j * np.pi * rng.random((count, n))), A, B, Z)
         assert (np.linalg.norm(e, 2, axis=(1, 2)) <= most).all()
     # one disc alone, far from small: what is said is what a point of its edge shows
-    one = Terms(columns[:1], rows[:, :1], 0.9 / size[:, :1], inputs[:1])
+    one = RankOneDiscs(columns[:1], rows[:, :1], 0.9 / size[:, :1], inputs[:1])
     seen = np.max([np.linalg.norm(moved(one, turn, A, B, Z), 2, axis=(1, 2))
                    for turn in np.exp(1j * ANGLES)], axis=0)  # fmt: skip
     most = one.largest(A, B, Z)
@@ -241,14 +241,14 @@ def test_the_largest_norm_holds_for_all_discs_and_of_one_is_reached(p) -> None:
 def test_where_a_disc_makes_the_loop_singular_no_norm_is_found() -> None:
     for n in (1, 2):
         eye, radii = np.tile(np.eye(n), (3, 1, 1)), np.array([[0.99], [1.0], [1.01]])
-        found = Terms(np.eye(n), -eye, np.tile(radii, n)).largest(eye, eye, eye)
+        found = RankOneDiscs(np.eye(n), -eye, np.tile(radii, n)).largest(eye, eye, eye)
         assert 100.0 * (1.0 - 1e-9) <= found[0] <= 115.0  # 112.8 of two, which are not one disc
         assert np.isinf(found[1:]).all()
 
 
 def test_channels_that_are_apart_count_apart() -> None:
     A, one = np.diag([2.0, 1.0])[None] + 0j, np.eye(2)[None]
-    terms = Terms(np.eye(2), 0.0 * one, np.array([[0.3, 0.9]]), np.eye(2))
+    terms = RankOneDiscs(np.eye(2), 0.0 * one, np.array([[0.3, 0.9]]), np.eye(2))
     assert terms.largest(A, one, one) == pytest.approx([2.3], rel=1e-2)
 
 
