@@ -32,7 +32,7 @@ from ccd_casadi.fixed_structure.design import (
 )
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.multi_start import LocalOptimum, run_race, started
+from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, run_race, started
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
@@ -43,9 +43,6 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent, titled
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.interchange import from_control, plant_from_control
-
-SLOWEST = 10.0  # ω₀ over ω_low/S_low, the bandwidth that S of slope one needs at least
-TIGHTENED = (1.0, 0.6, 0.3)  # of the room that S_max leaves above 1, for channels of coupled plants
 
 
 @one_blas_thread
@@ -143,7 +140,8 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
         if scale is None:
             space = from_control(system)
             order, gain = leading_gain(space)
-            scale = (SLOWEST * bounds.omega_low / bounds.S_low) ** order / gain if order else 1.0
+            least = bounds.omega_low / bounds.S_low  # rad/s: the bandwidth of an S of slope one
+            scale = (10.0 * least) ** order / gain if order else 1.0
         scaled[i] = plant_from_control(system, scale)
     return scaled
 
@@ -169,7 +167,7 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
         evaluations += len(field)
     elif not field or not only_initial:
         before: list[SectionsDesign] = []
-        for share in TIGHTENED:
+        for share in search.options.peak_shares:
             before = _of_channels(search, problem, alike, share, before)
             stack = _stacked(structure, before)
             evaluations += 1
@@ -180,7 +178,8 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
     if not field:
         return search.failed()
     tell = titled(search.tell, "whole loop")
-    runners = run_race(problem, np.array(field), tell, search.workers, known=known)
+    runners = run_race(problem, np.array(field), tell, search.workers, known=known,
+                       options=search.options.multi_start)  # fmt: skip
     return search.concluded(runners, len(field), evaluations)
 
 
@@ -243,7 +242,7 @@ def _joined(
     slowest = min(one.bandwidth / np.exp(lead) for one, lead in zip(designs, leads, strict=True))
     tau = float(np.log(slowest / problem.plants.omega_0))
     point = Point(inside, tau, assess(problem, inside, tau))
-    optima = (LocalOptimum(slowest, 1, tuple(map(float, kappa))),)
+    optima = (BandwidthOptimum(slowest, 1, tuple(map(float, kappa))),)
     starts = sum(one.starts for one in designs)
     return search.designed(point, optima, starts, sum(one.evaluations for one in designs))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.structure import Kind
+from ccd_casadi.fixed_structure.structure import ParameterKind
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, spoken
 
@@ -79,13 +79,13 @@ def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict
     """
     if isinstance(structure, ChannelStructure):
         return _channels_dict(structure, kappa)
-    units = {Kind.GAIN: spoken("N/m"), Kind.FREQUENCY: "Hz", Kind.DAMPING: "1"}
+    units = dict(zip(ParameterKind, (spoken("N/m"), "Hz", "1"), strict=True))
     rows = zip(structure.names, structure.kinds, np.exp(kappa).tolist(), strict=True)
     return {
         "structure": asdict(structure),
         "order": structure.order,
         "parameters": [
-            {"name": name, "value": value / HZ if kind is Kind.FREQUENCY else value,
+            {"name": name, "value": value / HZ if kind is ParameterKind.FREQUENCY else value,
              "unit": units[kind]}
             for name, kind, value in rows
         ],

@@ -14,7 +14,7 @@ from ccd_casadi.fixed_structure import SectionsDesign, Structure
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
-from ccd_casadi.fixed_structure.local_search import RESIDUAL, Envelope
+from ccd_casadi.fixed_structure.local_search import Envelope, OptimalityOptions
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.objective import InnerValue
@@ -209,7 +209,7 @@ def structured_value(
     if made is None or (starts and not made.certified):
         made = here.searched(initial, min(FEW, starts), workers=workers)
         spent += 1
-    while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
+    while made.certified and made.kkt_residual > OptimalityOptions.residual and spent < FURTHER:
         again = here.searched([made.kappa], workers=workers)
         spent += 1
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:

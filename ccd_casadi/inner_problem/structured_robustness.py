@@ -13,14 +13,13 @@ import numpy as np
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
-from ccd_casadi.fixed_structure.certificate import TOLERANCE
+from ccd_casadi.fixed_structure.certificate import CertificateOptions
 from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
-    LATTICE,
-    WITHIN,
     Excess,
     LoopOnBox,
+    WorstPlantOptions,
     lattice,
     worst_plants,
 )
@@ -44,7 +43,7 @@ from ccd_casadi.support.text import HZ, of_a_bound
 AT_ONCE = 8  # plants added in a round
 APART = 1e-4  # of the box: plants that are closer are the same plant
 CHECKED = 200  # plants that the judge looks at in the end
-LOOSE = 2.0 * WITHIN  # relative: by how much they may pass a bound
+LOOSE = 2.0 * WorstPlantOptions.within  # relative: by how much they may pass a bound
 # Plants drawn for the yield, by their cost (2 ms, and 120 ms with four channels): where none fails
 # they prove 99.54 % and 95.5 % at confidence 1 - 1e-6.
 FRESH, FRESH_OF_SEVERAL = 3000, 300
@@ -103,7 +102,7 @@ class DesignOnBox:
         """The independent judge on a lattice of the box and the worst plant; how many plants it
         saw.
 
-        The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
+        The bounds count as met within `LOOSE`, since the search stops at half of it.
         """
         structured, uncertain = structured_of(self.problem), self.uncertain
         points = [*lattice(uncertain, CHECKED, structured.seed + 1000), (worst.option, worst.point)]
@@ -132,7 +131,7 @@ class DesignOnBox:
         kept = [
             one.stable and one.confirmed and one.bandwidth >= least
             and all(
-                share <= 1.0 + TOLERANCE
+                share <= 1.0 + CertificateOptions.tolerance
                 for share in (bounds.shares(one) | bounds.channel_shares(one.channels)).values()
             )
             for one in found
@@ -183,9 +182,9 @@ def violations(
     bandwidth: float,
     turn: int,
     tell: Tell | None = None,
-    within: float = WITHIN,
+    within: float = WorstPlantOptions.within,
     others: Sequence[Scenario] = (),
-    count: int = LATTICE,
+    count: int = WorstPlantOptions.lattice,
 ) -> tuple[Excess, tuple[Scenario, ...]]:
     """The worst plant found for κ (SI) at ω_b in rad/s from a lattice of `count`, and new ones over
     a bound by `within`; the `others` are known and tried besides."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
-from ccd_casadi.fixed_structure.local_search import RESIDUAL
+from ccd_casadi.fixed_structure.local_search import OptimalityOptions
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
@@ -101,7 +101,7 @@ def prepared(
     last = True  # a search that ended off its optimum goes on to it once no plant is found worse
     for turn in range(ROUNDS if made.certified else 0):
         worst, wider = _wider(problem, problem.start, made, turn, tell)
-        if wider is None and (last or made.kkt_residual <= RESIDUAL):
+        if wider is None and (last or made.kkt_residual <= OptimalityOptions.residual):
             break
         last = wider is None
         problem = with_structured(wider or problem, warm_starts=_warm_starts(made))

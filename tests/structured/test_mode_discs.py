@@ -11,7 +11,7 @@ from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Struc
 from ccd_casadi.fixed_structure.affine import Affine
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
-from ccd_casadi.fixed_structure.certificate_responses import LoopTable
+from ccd_casadi.fixed_structure.certificate_responses import LoopResponses
 from ccd_casadi.fixed_structure.channel_structure import given_decoupling
 from ccd_casadi.fixed_structure.discs import RankOneDiscs, quotient
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
@@ -145,7 +145,8 @@ def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
             G, own = free, K
             if sampling is not None:
                 G, own = sampled(free, sampling.period, sampling.delay), tustin(K, sampling.period)
-            table = LoopTable([free], [G], own, sampling, bounds).at(np.array([0]), at[None, :1])
+            table = LoopResponses([free], [G], own, sampling, bounds)
+            table = table.at(np.array([0]), at[None, :1])
             for name, (figure, limit) in limits.items():
                 k, value = found.names.index(name), table[figure][0, 0] / limit
                 assert found.lowest[k, i] * (1.0 - 1e-9) <= value
