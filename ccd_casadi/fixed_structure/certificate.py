@@ -49,14 +49,31 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CertificateOptions:
-    """Numbers of the judge."""
+    """Numbers of the judge.
 
-    tolerance: float = 1e-5  # relative: by how much a figure may exceed its bound and count as met
-    batch: int = 16  # plants of one task: the last ones keep all workers busy
-    rounding: float = 1e3 * float(np.finfo(float).eps)  # of a balanced matrix; poles showed 31 eps
-    half_widths: float = 3.0  # to either side of a resonance beyond half the rate
-    points: int = 240  # there
-    rest: float = 1e-3  # of the grid's lowest frequency: counts as 0 Hz
+    Attributes
+    ----------
+    tolerance : float
+        Relative: by how much a figure may exceed its bound and count as met.
+    batch : int
+        Plants of one task: the last ones keep all workers busy.
+    rounding : float
+        Of a balanced matrix; poles showed 31 eps.
+    half_widths : float
+        To either side of a resonance beyond half the rate.
+    points : int
+        Of the grid there.
+    rest : float
+        Of the grid's lowest frequency: counts as 0 Hz.
+    curves : CurveOptions
+    """
+
+    tolerance: float = 1e-5
+    batch: int = 16
+    rounding: float = 1e3 * float(np.finfo(float).eps)
+    half_widths: float = 3.0
+    points: int = 240
+    rest: float = 1e-3
     curves: CurveOptions = field(default_factory=CurveOptions)
 
 

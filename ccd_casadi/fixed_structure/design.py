@@ -41,17 +41,40 @@ from ccd_casadi.support.text import HZ, number
 
 @dataclass(frozen=True)
 class DesignOptions:
-    """Numbers of a design: where its searches start, how often, and what they leave of a bound."""
+    """Numbers of a design: where its searches start, how often, and what they leave of a bound.
 
-    margin: float = 1e-6  # ln: a design lies this far within its bounds
-    crossovers: tuple[float, float] = (0.03, 10.0)  # of starts, over ω₀ = √(M_K/mass) about
-    pool: int = 12  # random starts that are tried for stability for each one that is kept
-    batch: int = 16  # controllers that one task assesses
-    reworks: int = 2  # searches at most from the best ends with one section moved or drawn anew
-    reworked: int = 3  # ends
-    repeats: int = 2  # times that the best of a search is to be found, from starts apart
-    least_starts: int = 12  # of a search that may add starts: two of four may end in a lesser one
-    peak_shares: tuple[float, ...] = (1.0, 0.6, 0.3)  # of S_max - 1, tried for coupled channels
+    Attributes
+    ----------
+    margin : float
+        ln: a design lies this far within its bounds.
+    crossovers : tuple of float
+        Of starts, over ω₀ = √(M_K/mass) about.
+    pool : int
+        Random starts that are tried for stability for each one that is kept.
+    batch : int
+        Controllers that one task assesses.
+    reworks : int
+        Searches at most from the best ends with one section moved or drawn anew.
+    reworked : int
+        Best ends that are reworked.
+    repeats : int
+        Times that the best of a search is to be found, from starts apart.
+    least_starts : int
+        Of a search that may add starts: two of four may end in a lesser one.
+    peak_shares : tuple of float
+        Of S_max - 1, tried for coupled channels.
+    multi_start : MultiStartOptions
+    """
+
+    margin: float = 1e-6
+    crossovers: tuple[float, float] = (0.03, 10.0)
+    pool: int = 12
+    batch: int = 16
+    reworks: int = 2
+    reworked: int = 3
+    repeats: int = 2
+    least_starts: int = 12
+    peak_shares: tuple[float, ...] = (1.0, 0.6, 0.3)
     multi_start: MultiStartOptions = field(default_factory=MultiStartOptions)
 
 

@@ -52,7 +52,7 @@ class Enclosures:
     bounded: np.ndarray
 
 
-class Figure(NamedTuple):
+class FigureBounds(NamedTuple):
     """A norm on N boxes: at most `upper`, at least `lower` (N,), and what makes it uncertain: each
     disc by `by_disc` per radius (N, n), to first order, and all else by `beside` (N,)."""
 
@@ -134,20 +134,20 @@ class LoopDiscs:
         """‖S₂ - y_c W‖ and ‖T₂ - (1 - y_c W)‖ (N,) at most, by (9) and (10)."""
         return np.asarray(np.abs(self.y) * self.a * self.d + self.u2)
 
-    def S(self) -> Figure:
+    def S(self) -> FigureBounds:
         """(11)."""
         size = np.abs(self.y)
         upper = np.fmin(size * self.a + self.u2, self.y_max * self.a2)
         by_disc = size[:, None] * self.terms.pushes(self.W, self.unit)
-        return Figure(upper, size * self.w - self.off_middle, by_disc, self.u2)
+        return FigureBounds(upper, size * self.w - self.off_middle, by_disc, self.u2)
 
-    def T(self) -> Figure:
+    def T(self) -> FigureBounds:
         """(12)."""
         rounding = GUARD * (1.0 + np.abs(self.y) * self.w)
         lower = norm(self.unit - self.yW) - rounding - self.off_middle
-        return Figure(self.t + self.u2, lower, self.terms.pushes(self.yW, self.unit), self.u2)
+        return FigureBounds(self.t + self.u2, lower, self.terms.pushes(self.yW, self.unit), self.u2)
 
-    def KS(self) -> Figure:
+    def KS(self) -> FigureBounds:
         """(13) to (16)."""
         KW, rounding = self.K @ self.W, GUARD * norm(self.K) * self.w
         k = self.terms.largest(KW, KW, self.unit) + rounding
@@ -156,9 +156,9 @@ class LoopDiscs:
         least = norm(KW) - rounding - k * self.d - k1 + k - v
         lower = (1.0 - self.epsilon) * least - self.grain * self.a2
         upper = (1.0 + self.epsilon) * (k1 + v) + self.grain * self.a2
-        return Figure(upper, lower, self.terms.pushes(KW, self.unit), upper - k)
+        return FigureBounds(upper, lower, self.terms.pushes(KW, self.unit), upper - k)
 
-    def GS(self) -> Figure:
+    def GS(self) -> FigureBounds:
         """(17) to (19)."""
         c, b, rows = self.c, self.b, self.terms.rows
         G = (c.T * self.g[:, None]) @ b
@@ -175,9 +175,9 @@ class LoopDiscs:
         least = least - (self.delta_y + self.y_max * moved) * h
         upper = self.y_max * h * (1.0 + moved) / (1.0 - self.q)
         by_disc = both.pushes(self.W, G)
-        return Figure(upper, least / (1.0 + self.q), by_disc, (moved + self.q) * h)
+        return FigureBounds(upper, least / (1.0 + self.q), by_disc, (moved + self.q) * h)
 
-    def spread(self, worst: np.ndarray, figures: dict[str, Figure]) -> Array:
+    def spread(self, worst: np.ndarray, figures: dict[str, FigureBounds]) -> Array:
         """How much each coordinate moves the loop (1 + n_p, N): along what moves M, of several
         outputs the figure `worst` (N,) that is furthest above its bound."""
         n, rows = len(self.c), self.terms.rows

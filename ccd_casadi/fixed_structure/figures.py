@@ -153,11 +153,21 @@ def closed_on_peaks(
 
 @dataclass(frozen=True)
 class HessianOptions:
-    """Numbers of the rows' second derivatives."""
+    """Numbers of the rows' second derivatives.
 
-    step: float = 1e-5  # of ln v
-    parameter_step: float = 1e-6  # of a parameter's range: far less than a half width's worth
-    unlike: float = 0.1  # relative: by how much the orders of a mixed difference may disagree
+    Attributes
+    ----------
+    step : float
+        Of ln v.
+    parameter_step : float
+        Of a parameter's range: far less than a half width's worth.
+    unlike : float
+        Relative: by how much the orders of a mixed difference may disagree.
+    """
+
+    step: float = 1e-5
+    parameter_step: float = 1e-6
+    unlike: float = 0.1
 
 
 @singledispatch

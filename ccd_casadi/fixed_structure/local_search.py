@@ -237,11 +237,21 @@ def descend(
 
 @dataclass(frozen=True)
 class OptimalityOptions:
-    """Numbers of the conditions of optimality."""
+    """Numbers of the conditions of optimality.
 
-    active: float = 1e-5  # ln of the share of its bound within which a constraint binds
-    near: float = 1e-3  # the same within which it may bind at a kink that is all but reached
-    residual: float = 1e-3  # of ∇τ, which is 1: above it there is no envelope gradient
+    Attributes
+    ----------
+    active : float
+        ln of the share of its bound within which a constraint binds.
+    near : float
+        The same within which it may bind at a kink that is all but reached.
+    residual : float
+        Of ∇τ, which is 1: above it there is no envelope gradient.
+    """
+
+    active: float = 1e-5
+    near: float = 1e-3
+    residual: float = 1e-3
 
 
 @dataclass(frozen=True)

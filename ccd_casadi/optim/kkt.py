@@ -180,11 +180,19 @@ def convex(H: Array, least: float) -> Array:
 
 @dataclass(frozen=True)
 class KktOptions:
-    """Numbers of the conditions of optimality."""
+    """Numbers of the conditions of optimality.
 
-    active: float = 1e-6  # shares of its size or the box: a closer constraint is active; a polish
-    # stops where steps change J by rounding
-    step: float = 1e-4  # of the box: differences of true gradients
+    Attributes
+    ----------
+    active : float
+        Shares of its size or the box: a closer constraint is active; a polish stops where
+        steps change J by rounding.
+    step : float
+        Of the box: differences of true gradients.
+    """
+
+    active: float = 1e-6
+    step: float = 1e-4
 
 
 @dataclass(frozen=True)

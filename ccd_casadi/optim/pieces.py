@@ -63,21 +63,49 @@ Constraints = Callable[[Array], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class PiecesOptions:
-    """Numbers of the descent on pieces; lengths are shares of the box."""
+    """Numbers of the descent on pieces; lengths are shares of the box.
 
-    radius: float = 1e-2  # the first
+    Attributes
+    ----------
+    radius : float
+        The first.
+    least_radius : float
+    largest_radius : float
+    near : float
+        Radii from the best point within which a piece counts.
+    pieces : int
+        Per variable, at most.
+    lowering : float
+        Of the largest slope, per length: by what a piece is lowered at least.
+    restorations : int
+        Newton steps back to λ <= 0.
+    inside : float
+        Of λ.
+    held : float
+        Share of a piece in the combination above which it counts.
+    straight : float
+        Of the change of slope: how far J may be off the mean slope.
+    jump : float
+        Times the slopes on both sides: what is steeper is not a kink.
+    jump_length : float
+        Within which no other piece is as steep.
+    basin : float
+        Of an optimum that is known: this close and no lower is its basin.
+    """
+
+    radius: float = 1e-2
     least_radius: float = 1e-10
     largest_radius: float = 0.2
-    near: float = 4.0  # radii from the best point within which a piece counts
-    pieces: int = 8  # per variable, at most
-    lowering: float = 0.5  # of the largest slope, per length: by what a piece is lowered at least
-    restorations: int = 5  # Newton steps back to λ <= 0
-    inside: float = 1e-10  # of λ
-    held: float = 1e-3  # share of a piece in the combination above which it counts
-    straight: float = 0.05  # of the change of slope: how far J may be off the mean slope
-    jump: float = 10.0  # times the slopes on both sides: what is steeper is not a kink
-    jump_length: float = 1e-3  # within which no other piece is as steep
-    basin: float = 1e-2  # of an optimum that is known: this close and no lower is its basin
+    near: float = 4.0
+    pieces: int = 8
+    lowering: float = 0.5
+    restorations: int = 5
+    inside: float = 1e-10
+    held: float = 1e-3
+    straight: float = 0.05
+    jump: float = 10.0
+    jump_length: float = 1e-3
+    basin: float = 1e-2
 
 
 @dataclass(frozen=True)
