@@ -119,7 +119,7 @@ class ChannelBounds:
 
     @property
     def given(self) -> bool:
-        """Whether there is any bound of its own."""
+        """Whether the channel has any bound besides the whole loop's."""
         return (self.S_max, self.M_K, self.bandwidth_ratio) != (None, None, 1.0)
 
 

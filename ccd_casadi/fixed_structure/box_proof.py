@@ -37,7 +37,7 @@ class BoxProofOptions:
 
 @dataclass(frozen=True)
 class Division:
-    """What so many `boxes` prove: figures over bounds at most, by kind of bound.
+    """What a number of `boxes` prove: figures over bounds at most, by kind of bound.
 
     `passed`: a bound, by which factor it is passed at least on some box, and that one's middle.
     """
@@ -203,7 +203,7 @@ class Proof:
 
     @property
     def conclusive(self) -> bool:
-        """Whether that is all that is asked for, and closely: no plant need be drawn besides."""
+        """Whether it proves all that is required, and closely: no plant need be drawn besides."""
         return self.proven and self.slack <= BoxProofOptions.slack
 
     @property
@@ -218,15 +218,14 @@ class Proof:
 
     @property
     def unasked(self) -> str:
-        """Why nothing was proven that was not begun either: the proof does not apply, or is not of
-        every bound; empty where it is complete in kind."""
+        """Why the proof does not apply, or is not of every bound; empty where it is of all."""
         if self.outcome in NOT_APPLICABLE:
             return self.outcome.value
         return "bounds of single channels are judged, not proven" if self.channels else ""
 
     @property
     def unclosed(self) -> bool:
-        """Whether it was begun, and did not reach every bound within its slack."""
+        """Whether it applied, and did not reach every bound within its slack."""
         return self.outcome in (ProofOutcome.LOOSER, ProofOutcome.OPEN)
 
     @property
@@ -236,7 +235,7 @@ class Proof:
 
     @property
     def words(self) -> str:
-        """One line."""
+        """The outcome in one line, with its levels."""
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
             return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"

@@ -42,7 +42,7 @@ class Boxes:
         return type(self)(*(part[..., chosen] for part in vars(self).values()))
 
     def beside(self, other: Self) -> Self:
-        """Both."""
+        """These boxes, then the others."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return type(self)(*map(np.hstack, pairs))
 

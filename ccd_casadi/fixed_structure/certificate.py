@@ -204,7 +204,7 @@ def judged(
     poles = [np.linalg.eigvals(S.A) for S in loops]
     grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
     found = [PlantFigures(False, one) for one in grown]
-    # A pole that is no further from the axis than rounding may move it may lie on it. Eigenvalues
+    # A pole as close to the axis as rounding may move it may lie on it. Eigenvalues
     # are those of the balanced matrix: a large gain of K does not move them in proportion.
     sizes = [np.linalg.norm(matrix_balance(S.A)[0]) for S in loops]
     good = [i for i, size in enumerate(sizes) if grown[i] < -options.rounding * size]
@@ -367,7 +367,7 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     held = np.zeros((n + m, n + m))
     held[:n, :n], held[:n, n:] = G.A, G.B
     first, second = expm(held * rest), expm(held * (T - rest))
-    age = m * (whole + 1)  # u_{k-1} … of so many periods are kept
+    age = m * (whole + 1)  # u_{k-1} … of these periods are kept
     A, B = np.zeros((n + age, n + age)), np.zeros((n + age, m))
     A[:n, :n] = second[:n, :n] @ first[:n, :n]
     A[:n, n + m * whole : n + m * (whole + 1)] = second[:n, :n] @ first[:n, n:]

@@ -19,7 +19,7 @@ from ccd_casadi.support.arrays import Array
 
 
 class Triangular:
-    """State spaces of one shape by their Schur forms; one alone stands for every plant's."""
+    """State spaces of one shape by their Schur forms; one alone counts for every plant."""
 
     def __init__(self, systems: Sequence[StateSpace]) -> None:
         forms = [_schur(x.A) for x in systems]

@@ -83,7 +83,7 @@ def synthesise_sections(
     starts, seed : int
         Of the multi-start search: how many controllers by rules and at random, and which.
     most_starts : int
-        Of one channel: up to so many in all, until the best was found from two of them.
+        Of one channel: up to this many in all, until the best was found from two of them.
     initial, only_initial : sequence of array, bool
         Parameters κ in SI of earlier designs, of several channels stacked, which start beside the
         others, or alone.
@@ -100,7 +100,7 @@ def synthesise_sections(
     Raises
     ------
     UserError
-        A system is no continuous one.
+        A system is not continuous.
     PlantError
         A system cannot be a plant, or the plants cannot be in a set.
 

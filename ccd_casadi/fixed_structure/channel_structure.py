@@ -287,7 +287,7 @@ class ChannelStructure:
 
     @cached_property
     def apart(self) -> "ChannelStructure":
-        """The same with parameters of its own for each channel."""
+        """The same with separate parameters for each channel."""
         return replace(self, owners=())
 
     @cached_property

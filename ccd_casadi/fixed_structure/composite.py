@@ -123,7 +123,6 @@ class CompositeProblem(LoopProblem):
         return out
 
     def plants_of(self, constraints: Constraints) -> np.ndarray:
-        """Of all."""
         out = np.zeros(len(constraints.v), int)
         for part, at, own in self.split(constraints):
             out[at] = part.members[part.problem.plants_of(own)]

@@ -135,20 +135,20 @@ class LoopDiscs:
         return np.asarray(np.abs(self.y) * self.a * self.d + self.u2)
 
     def S(self) -> FigureBounds:
-        """(11)."""
+        """Enclose ‖S₂‖ by (11)."""
         size = np.abs(self.y)
         upper = np.fmin(size * self.a + self.u2, self.y_max * self.a2)
         by_disc = size[:, None] * self.terms.pushes(self.W, self.unit)
         return FigureBounds(upper, size * self.w - self.off_middle, by_disc, self.u2)
 
     def T(self) -> FigureBounds:
-        """(12)."""
+        """Enclose ‖T₂‖ by (12)."""
         rounding = GUARD * (1.0 + np.abs(self.y) * self.w)
         lower = norm(self.unit - self.yW) - rounding - self.off_middle
         return FigureBounds(self.t + self.u2, lower, self.terms.pushes(self.yW, self.unit), self.u2)
 
     def KS(self) -> FigureBounds:
-        """(13) to (16)."""
+        """Enclose ‖K̂M₂⁻¹‖ by (13) to (16)."""
         KW, rounding = self.K @ self.W, GUARD * norm(self.K) * self.w
         k = self.terms.largest(KW, KW, self.unit) + rounding
         k1 = k * (1.0 + self.a1 * (self.delta_GK + self.delta_y))
@@ -159,7 +159,7 @@ class LoopDiscs:
         return FigureBounds(upper, lower, self.terms.pushes(KW, self.unit), upper - k)
 
     def GS(self) -> FigureBounds:
-        """(17) to (19)."""
+        """Enclose ‖yM₂⁻¹G‖ by (17) to (19)."""
         c, b, rows = self.c, self.b, self.terms.rows
         G = (c.T * self.g[:, None]) @ b
         WG, by_all = self.W @ G, _lengths(c) * _lengths(b)

@@ -64,10 +64,10 @@ def frequency_grid(
     problem: LoopProblem, roots: np.ndarray, poles: np.ndarray,
     options: PeakOptions = PeakOptions(),
 ) -> tuple[Array, np.ndarray, Answers]:  # fmt: skip
-    """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base,
-    and what the plants answer there.
+    """The frequencies v (P, k), ascending, on which peaks are searched; which are of the base, and
+    what the plants answer there.
 
-    `roots`: the zeros and the poles of K. A loop may be faster than the base: the grid goes on past
+    `roots`: the zeros and the poles of K. A loop may be faster than the base: the grid extends past
     its last root.
     """
     fixed, base = problem.fixed, problem.base

@@ -70,7 +70,7 @@ class Judgement:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of result.json."""
+        """Its entry in result.json."""
         return {**vars(self)}
 
 

@@ -121,7 +121,6 @@ class RmsError:
         return self._of_mean(np.asarray(kappa, complex)[None], moved)[1]
 
     def shown(self, value: float) -> str:
-        """In nm."""
         return spoken(f"{1e9 * value:.4g} nm RMS")
 
     def _of_mean(

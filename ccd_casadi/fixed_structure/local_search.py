@@ -69,7 +69,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Ascent:
-    """Where a local search is, the radius it has, and how many loops it looked at.
+    """Where a local search is, the radius it has, and how many loops it assessed.
 
     `done`: further steps do not help.
     """
@@ -141,7 +141,7 @@ class LoopModel(TrustRegionModel[Assessment]):
         step: Step,
         radius: float,
     ) -> Array:
-        """That of v."""
+        """H by a symmetric rank-one update, where there is a goal v."""
         if self.goal is None:
             return H
         return symmetric_rank_one(H, there.x - here.x, there.gradient - here.gradient)
@@ -219,7 +219,7 @@ def descend(
     model: TrustRegionModel[Data], start: Iterate[Data], H: Array, within: float,
     options: DescentOptions = DescentOptions(),
 ) -> tuple[Iterate[Data], int]:  # fmt: skip
-    """From a stable start to where steps help no longer, and how many loops were looked at.
+    """From a stable start to where steps help no longer, and how many loops were assessed.
 
     `within`: a violation that needs no larger penalty. H (n + 1, n + 1): the first of v.
     """

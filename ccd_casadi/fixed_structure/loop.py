@@ -114,7 +114,7 @@ class PlantSet:
 
     @property
     def count(self) -> int:
-        """How many plants."""
+        """The number of plants."""
         return len(self.poles)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What is asked of the loops of a set, as constraints on logarithms of gains over their bounds.
+"""The requirements on the loops of a set, as constraints on logarithms of gains over their bounds.
 
     S_max   ln|S| - ln S_max                    every local peak
     level   ln|S| + ½ ln 2 - ln x               every local peak on ω <= ω_b, and ω_b itself
@@ -9,7 +9,7 @@
 A constraint is c(κ, τ) <= 0 with τ = ln ω_b and x = ω/ω_b; without a shape, or where it ends at
 ω_b, the level has no x (`kernels.limits`). Of several channels |M| stands for every singular
 value: row number i + kP is the k-th of plant i of P. After those of the whole, p of them, come the
-rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u and w of `ChannelBounds`.
+rows that single channels keep within their bounds: uᵀS and wᵀKS, u and w of `ChannelBounds`.
 """
 
 from dataclasses import dataclass
@@ -265,7 +265,7 @@ class Columns:
         return type(self)(*(part[chosen] for part in vars(self).values()))
 
     def and_those(self, *others: Self) -> Self:
-        """These and others."""
+        """These rows, then those of others."""
         parts = zip(*(vars(one).values() for one in (self, *others)), strict=True)
         return type(self)(*map(np.concatenate, parts))
 

@@ -117,10 +117,10 @@ class BandwidthOptimum:
 
 @dataclass(frozen=True)
 class SearchRun(Ascent):
-    """One search: where it is, with the loops looked at in all, and what its last round gained,
+    """One search: where it is, with the loops assessed in all, and what its last round gained,
     or where that ended in a crawl gains at this rate.
 
-    `running`: it goes on. `count`: searches that it stands for.
+    `running`: it continues. `count`: searches that were merged into it.
     """
 
     gained: float = np.inf
@@ -146,8 +146,8 @@ def run_race(
     """All searches from the starts `pool` (N, n), the best first.
 
     The first `known` of these are controllers that searches have ended with. Those of searches
-    `before` are in the field too and have to be overtaken. Where this race is not the `last` one,
-    a search that goes on alone and gains little does so in the next.
+    `before` are in the field too and have to be overtaken. Where another multi-start search follows
+    (not `last`), one that runs alone and gains little is left to it.
     """
     field = list(before)
     field += [SearchRun(at_its_bandwidth(problem, kappa)) for kappa in pool[:known]]

@@ -201,7 +201,7 @@ class UncertainPlant:
         """The model of every option, then the corners of its box.
 
         With more than three parameters single modes' shifts go together, with the least damping:
-        of the other corners there are too many to look at, and a search finds those that matter.
+        there are too many other corners to assess, and a search finds those that matter.
         """
         box, centre = self.box, self.nominal
         found = [(option, centre) for option in range(len(self.options))]
@@ -222,7 +222,7 @@ class ModalSum:
     """One option of an uncertain plant as Σ c_i b_iᵀ/(s² + g_i s + k_i), time in 1/`unit`, SI else.
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
-    `rigid` ones are free, k = g = 0, and stand first; the others are in the order of
+    `rigid` ones are free, k = g = 0, and come first; the others are in the order of
     their numbers. `drive` (n, m), `reading` (n, p) are b_i and c_i. `moving` has ω and b_i c_i
     over boxes of the parameters that modes move with, the last ones; see `moving_modes`.
     """

@@ -22,24 +22,42 @@ from ccd_casadi.support.arrays import Array
 
 @dataclass(frozen=True)
 class WorstPlantOptions:
-    """Numbers of the search for the worst plants; levels are ln of a figure over its bound."""
+    """Numbers of the search for the worst plants; levels are ln of a figure over its bound.
 
-    within: float = 1e-4  # by how much a plant of the box may exceed a bound and count as within
-    few: int = 4  # parameters up to which every one is moved separately
-    # of few parameters: a compass search
-    lattice: int = 200  # plants over the box
-    searches: int = 6  # from the worst of these
-    rounds: int = 7  # the step is halved after each
-    # of more
+    Attributes
+    ----------
+    within : float
+        By how much a plant of the box may exceed a bound and count as within.
+    few : int
+        Parameters up to which every one is moved separately: a compass search.
+    lattice, searches, rounds : int
+        Its plants over the box, starts from the worst of them, halvings of its step.
+    lattice_of_many, damped_every : int
+        With more parameters: plants; of so many one keeps its damping, the others have the least.
+    steps : tuple of float
+        Shares of the way to the corner that a peak points to: ridges are narrow.
+    near : float
+        ln of the frequency: closer rows of one curve are one peak.
+    peaks, plants_of_peak, climbs : int
+        That climb, the highest; from how many plants each; rounds.
+    depth, least_gain : float
+        How far below its bound a peak may start; a peak that gains less is at its end.
+    """
+
+    within: float = 1e-4
+    few: int = 4
+    lattice: int = 200
+    searches: int = 6
+    rounds: int = 7
     lattice_of_many: int = 30
-    damped_every: int = 4  # one plant in 4 keeps its damping, the others have the least
-    steps: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03)  # shares of the way to a peak's corner
-    near: float = 0.1  # ln of the frequency: closer rows of one curve are one peak
-    peaks: int = 40  # that climb, the highest
-    plants_of_peak: int = 2  # from which each climbs
-    depth: float = 0.1  # below its bound at most, where a peak starts
+    damped_every: int = 4
+    steps: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03)
+    near: float = 0.1
+    peaks: int = 40
+    plants_of_peak: int = 2
     climbs: int = 4
-    least_gain: float = 1e-5  # of a climb: a peak that gains less is at its end
+    depth: float = 0.1
+    least_gain: float = 1e-5
 
 
 @dataclass(frozen=True)

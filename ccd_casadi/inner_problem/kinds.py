@@ -119,7 +119,7 @@ class MixedSensitivity(InnerKind):
         return "mixed sensitivity", ", ".join(words)
 
     def require_function(self) -> None:
-        """It always is."""
+        """It is a function of θ for every problem."""
 
     def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
         return list(scaled_plant(self.problem, theta).members)
@@ -133,7 +133,7 @@ class MixedSensitivity(InnerKind):
         return (1.0,) if robust is None else robust.damping, (1.0,)
 
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
-        """γ/|W|."""
+        """S, KS and T stay below γ/|W|."""
 
         def over(hz: Array) -> Array:
             return np.asarray(gamma / np.abs(weights.responses(HZ * hz)))

@@ -62,7 +62,7 @@ class InnerValue:
 
     @property
     def value(self) -> float:
-        """What J counts."""
+        """v: the error where it is minimised, else the bandwidth."""
         return self.bandwidth if np.isnan(self.error) else self.error
 
     @property

@@ -46,7 +46,7 @@ def files_of(path: Path, words: Iterable[str] = ()) -> tuple[Path, ...]:
         try:
             tree = ast.parse(module.read_bytes())
         except (OSError, SyntaxError, ValueError, RecursionError):
-            continue  # it is told where the file is loaded
+            continue  # reported where the file is loaded
         strings = [
             node.value for node in ast.walk(tree)
             if isinstance(node, ast.Constant) and isinstance(node.value, str)
@@ -326,7 +326,7 @@ def _own_function(source: PlantSource) -> ModelFunction:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     try:
-        sys.dont_write_bytecode = True  # which is told apart by the second: an edit may be sooner
+        sys.dont_write_bytecode = True  # it is dated by the second: an edit may be sooner
         with_time_limit(loader.exec_module, source.seconds, late)(module)
         function = with_time_limit(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:

@@ -1,4 +1,4 @@
-"""A co-design problem: everything that determines the true ω_b*(θ), and the way to ask for it.
+"""A co-design problem: everything that determines the true ω_b*(θ), and the way to find it.
 
 It is made of plain values, so that it can be sent to a worker process, hashed, and written
 beside the samples that it determines.
@@ -197,7 +197,7 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
     Raises
     ------
     PlantError
-        The model is no plant at θ.
+        The model is not a plant at θ.
 
     Examples
     --------

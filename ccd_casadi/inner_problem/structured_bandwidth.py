@@ -194,7 +194,6 @@ class ProblemAt:
 
     @cached_property
     def plants(self) -> list[ScaledPlant]:
-        """The plant set."""
         return plants_of(self.problem, self.theta)
 
     def searched(
@@ -319,7 +318,7 @@ def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
 
 
 def too_slow(problem: CoDesignProblem, design: SectionsDesign) -> SectionsDesign:
-    """The design, no longer a certified one where what is minimised asks for more bandwidth."""
+    """The design, not certified where what is minimised requires more bandwidth."""
     least = structured_of(problem).bandwidth_least
     if not design.certified or design.bandwidth >= least:
         return design

@@ -136,7 +136,6 @@ class StructuredProblem(ControllerProblem):
 
     @property
     def plant_options(self) -> tuple[Options, ...]:
-        """Loads and positions."""
         return self.uncertainty.options
 
     def require_plants(self, plants: Sequence[Plant]) -> None:

@@ -96,7 +96,7 @@ class DesignOnBox:
 
     @property
     def uncertain(self) -> UncertainPlant:
-        """The box."""
+        """The plants of the box at θ."""
         return uncertain_plant(self.problem, self.theta)
 
     def worst(self, turn: int = 0, tell: Tell = silent) -> tuple[Excess, tuple[Scenario, ...]]:

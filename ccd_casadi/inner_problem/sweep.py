@@ -259,7 +259,7 @@ def local_solve(
 ) -> list[Sensitivities]:
     """Maximise ln ω_b from `start` by SLSQP over (ln ω_S, ln ω_T); every design on the way.
 
-    Where a step ends in an uncertified design, the search goes on from the best one so far in a
+    Where a step ends in an uncertified design, the search continues from the best one so far in a
     box that reaches half way to there.
     """
     bounds = np.log([problem.omega_S, problem.omega_T])

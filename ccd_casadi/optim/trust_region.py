@@ -275,7 +275,7 @@ def minimise(
         if step.predicted <= least_gain or step.straight <= least_gain:
             zoomed = radius.options.zoom * step.size
             if step.straight > least_gain or step.rows.margin is not None:
-                radius = radius.times(0.3)  # so bent that nothing is found as far as this
+                radius = radius.times(0.3)  # so curved that nothing is found as far as this
             elif model.growing and radius.least < zoomed < radius.value:
                 # The programme is solved to a share of the radius, and the merit counts what it
                 # leaves of a violation: next to an optimum that is more than is left to gain.

@@ -140,7 +140,7 @@ def margins(respond: PlantAndController, hz: Array) -> Margins:
     """Margins of a loop from its responses in SI, on a grid in Hz that resolves resonances.
 
     The grid only brackets: crossings are bisected on the response itself, and the least disk margin
-    is looked for again between its neighbours. Of a sampled loop the grid ends at half its rate.
+    is searched again between its neighbours. Of a sampled loop the grid ends at half its rate.
     """
     loops, together = [], []
     for name in ("output", "input"):

@@ -116,21 +116,21 @@ def structured_bound(
 
 
 def _errors(modal: ModalPlant, kept: NDArray[np.intp], omega: float, K: NDArray) -> NDArray:
-    """M(jω)."""
+    """M(jω) = -K^½ Z⁻¹ K^½ of the modes `kept`, Z the dynamic stiffness of the closed loop."""
     root = np.sqrt(np.diag(modal.K)[kept])
     stiffness = modal.K + modal.B @ K @ modal.C
     Z = stiffness + 1j * omega * modal.D - omega**2 * np.eye(len(stiffness))
     return -root[:, None] * np.linalg.inv(Z)[np.ix_(kept, kept)] * root
 
 
-def _stand(M: NDArray, r: float, slopes: tuple[float, ...]) -> NDArray[np.bool_]:
+def _regular(M: NDArray, r: float, slopes: tuple[float, ...]) -> NDArray[np.bool_]:
     """Whether a disk around [-r, r], its centre at ±jκr of some κ of `slopes`, is free of singular
     points, for matrices (k, n, n)."""
     diagonal = np.einsum("kii->ki", M)
     side = np.where(diagonal.imag < 0.0, -1.0, 1.0)[:, None, :]
-    standing = np.zeros(len(M), dtype=bool)
+    regular = np.zeros(len(M), dtype=bool)
     for kappa in slopes:
-        left = np.flatnonzero(~standing)
+        left = np.flatnonzero(~regular)
         if left.size == 0:
             break
         moved = np.eye(M.shape[1]) - 1j * kappa * r * M[left] * side[left]
@@ -141,24 +141,24 @@ def _stand(M: NDArray, r: float, slopes: tuple[float, ...]) -> NDArray[np.bool_]
         bound = np.sqrt(size.sum(axis=1).max(axis=1) * size.sum(axis=2).max(axis=1))
         open_ = bound >= 1.0
         bound[open_] = mu_bound(turned[open_])
-        standing[left] = bound < 1.0
-    return standing
+        regular[left] = bound < 1.0
+    return regular
 
 
 def _largest(
     M: NDArray, low: float, high: float, options: StructuredBoundOptions
 ) -> tuple[float, int] | None:
-    """The largest r below `high` at which all matrices stand, as they do at `low`; which decides.
+    """The largest r below `high` at which all matrices have a disk, as at `low`; which decides.
 
-    None where all of them stand at `high`. What stands at some r does so at any smaller one.
+    None where all of them have one at `high`. A matrix with a disk at some r has one at smaller r.
     """
-    falls = np.flatnonzero(~_stand(M, high, options.slopes))
+    falls = np.flatnonzero(~_regular(M, high, options.slopes))
     if falls.size == 0:
         return None
     low = min(low, high)
     for _ in range(options.bisections):
         middle = 0.5 * (low + high)
-        still = falls[~_stand(M[falls], middle, options.slopes)]
+        still = falls[~_regular(M[falls], middle, options.slopes)]
         if still.size:
             falls, high = still, middle
         else:
