@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.channel_structure import (
 )
 from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike
 from ccd_casadi.fixed_structure.design import (
+    DesignOptions,
     DesignSearch,
     SectionsDesign,
     in_problem_units,
@@ -61,6 +62,7 @@ def synthesise_sections(
     frequencies: tuple[float, float] | None = None,
     progress: Tell | None = None,
     workers: Pool | None = None,
+    options: DesignOptions | None = None,
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every plant of a set.
 
@@ -91,6 +93,8 @@ def synthesise_sections(
         As in `problem_for`, rad/s: give them where designs at several θ are compared.
     progress, workers : callable, Pool, optional
         Is given a line at a time; the searches are spread over them, which changes nothing else.
+    options : DesignOptions, optional
+        Numbers of the searches.
 
     Returns
     -------
@@ -118,10 +122,10 @@ def synthesise_sections(
     >>> design.certified, design.certificate.words
     (True, 'stable and within every bound on 2 plants')
     """
-    scaled = _scaled(plants, bounds, M_K)
-    problem = problem_for(scaled, structure, bounds, sampling, frequencies)
+    scaled, options = _scaled(plants, bounds, M_K), options or DesignOptions()
+    problem = problem_for(scaled, structure, bounds, sampling, frequencies, margin=options.margin)
     search = DesignSearch(problem, scaled, sampling, starts, most_starts, seed, initial,
-                          only_initial, progress or silent, workers)  # fmt: skip
+                          only_initial, progress or silent, workers, options=options)  # fmt: skip
     if isinstance(problem, CompositeProblem):
         return _of_several(search, problem)
     return of_one_channel(search)
@@ -223,7 +227,8 @@ def _of_channels(
         if same and (not begins or again):
             found.append(found[same[0]])
             continue
-        alone = problem_for(members, own, own_limits[i], search.sampling, span_of(problem))
+        alone = problem_for(members, own, own_limits[i], search.sampling, span_of(problem),
+                            margin=problem.margin)  # fmt: skip
         title = f"channel {structure.decoupling.names[i]}"
         found.append(of_one_channel(replace(
             search, problem=alone, plants=members, initial=begins, began=perf_counter(),

@@ -206,7 +206,7 @@ class DesignSearch:
         peaks = point.assessment.peaks
         assert peaks is not None
         for name, value in zip(problem.kinds_of(peaks), peaks.value, strict=True):
-            if value > 2.0 * self.options.margin:
+            if value > 2.0 * problem.margin:
                 short[name] = max(short.get(name, 0.0), float(np.exp(value)))
         outcome, words = SectionsOutcome.CERTIFIED, judged.words
         if short:
@@ -245,7 +245,7 @@ class DesignSearch:
         best: SectionsDesign | None = None
         optima = local_optima(problem, ends, self.options.multi_start)
         for point in (runner.point for runner in ends):
-            if point.assessment.violation > self.options.margin:
+            if point.assessment.violation > problem.margin:
                 again = ascend(problem, point, iterations=30, restoring=True, radius=0.02)
                 evaluations += again.evaluations
                 point = again.point
@@ -268,6 +268,8 @@ def problem_for(
     bounds: Bounds,
     sampling: Sampling | None = None,
     frequencies: tuple[float, float] | None = None,
+    *,
+    margin: float = DesignOptions.margin,
 ) -> LoopProblem:
     """Make the problem of a controller on a set of plants, in the units of the first plant.
 
@@ -279,6 +281,8 @@ def problem_for(
     frequencies : tuple of two floats, optional
         Bounds of the frequencies of K's roots, rad/s; by default 1e-3 ω₀ and 30 times the fastest
         pole of any plant, sampled 2/T at most. The gain lies within a factor 1e6 of M_K.
+    margin : float
+        ln: how far inside every bound its searches aim.
 
     Returns
     -------
@@ -290,7 +294,6 @@ def problem_for(
     PlantError
         As `plant_set` does.
     """
-    margin = DesignOptions.margin
     if isinstance(structure, ChannelStructure):
         return composite_problem(plants, structure, bounds, sampling, frequencies, margin)
     family = plant_set(plants, sampling)

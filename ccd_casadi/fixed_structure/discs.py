@@ -156,11 +156,39 @@ class RankOneDiscs:
     inputs: Array | None = None
 
     def pushes(self, B: np.ndarray, Z: np.ndarray) -> Array:
-        """How far each moves e per radius, to first order (N, n): |B c_i|(|q_iᵀZ| + |b_i|)."""
+        """How far each moves e of `largest` per radius, to first order (N, n):
+        |B c_i|(|q_iᵀZ| + |b_i|)."""
         return _lengths(B @ self.columns.T, 1) * self._seen(self.rows @ Z)
 
     def largest(self, A: np.ndarray, B: np.ndarray, Z: np.ndarray) -> Array:
-        """γ (N,) of A (N, k, m), B (N, k, p), Z (N, p, m); infinite where none is found."""
+        """Bound ‖e‖ <= γ‖f‖ over all discs, of
+
+            e = Af + Bu,   u = Σ w_i c_i,   w_i = δ_i(q_iᵀ(Zf + u) + b_iᵀf),   |δ_i| <= r_i
+
+        so that with D = Σ δ_i c_i q_iᵀ and b = 0, e = (A + B(1 - D)⁻¹DZ)f. For every τ > 0 the sum
+        of τ_i(r_i²|q_iᵀ(Zf + u) + b_iᵀf|² - |w_i|²) is not negative. Added to ‖e‖² - γ²‖f‖², whose
+        largest value over w and u is to be 0 (S-procedure), it gives, where P⁻¹ > N,
+
+            γ² = λ_max(AᴴA + ZᴴQZ + Q_b + Xᴴ(P⁻¹ - N)⁻¹X),   X = BᴴA + QZ,   N = BᴴB + Q,
+            P = Σ c_i c_iᵀ/τ_i,   Q = Σ τ_i r_i² q̄_i q_iᵀ,   Q_b = Σ τ_i r_i² b_i b_iᵀ
+
+        as Σ τ_i|w_i|² >= uᴴP⁻¹u. With p = 1, |D| <= R = Σ r_i |c_i| |q_i| < 1, and D/(1 - D) lies
+        in the disc of centre R²/(1 - R²) and radius R/(1 - R²).
+
+        Parameters
+        ----------
+        A, B, Z : array (N, k, m), (N, k, p), (N, p, m)
+
+        Returns
+        -------
+        array (N,)
+            γ with its rounding; infinite where no τ is found with P⁻¹ > N.
+
+        References
+        ----------
+        S. Boyd, L. El Ghaoui, E. Feron and V. Balakrishnan, Linear Matrix Inequalities in System
+        and Control Theory, SIAM 1994, section 2.6.3.
+        """
         if B.shape[2] == 1:
             R = (_lengths(self.rows, 2) * np.abs(self.columns[:, 0]) * self.radius).sum(axis=1)
             good, BZ = R < 1.0, B @ Z
