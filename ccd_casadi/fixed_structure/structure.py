@@ -47,7 +47,8 @@ class Structure:
     biquads: int = 2
     roll_off: int = 2
     least_damping: float = 0.0
-    dampings: ClassVar[tuple[float, float]] = (1e-3, 3.0)  # ratios: a needle; roots 34 times apart
+    # Ratios: below the first a notch is a needle; at the second two real roots are 34 times apart.
+    dampings: ClassVar[tuple[float, float]] = (1e-3, 3.0)
     least_roll_off_damping: ClassVar[float] = 0.3  # below it a roll-off is a resonance
 
     def __post_init__(self) -> None:
