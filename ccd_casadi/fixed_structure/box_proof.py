@@ -291,6 +291,7 @@ def prove(
         By default those of `options`.
     workers : Pool, optional
         The options are spread over them.
+    options : BoxProofOptions
 
     Returns
     -------

@@ -138,6 +138,7 @@ def certify(
         With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
         None: a continuous loop; the plants are spread over them.
+    options : CertificateOptions
 
     Returns
     -------

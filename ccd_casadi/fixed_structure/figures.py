@@ -301,6 +301,7 @@ def hessians(
         M of them.
     beside : sequence of LoopProblem
         The k problems whose plants are moved by `options.parameter_step` along each z.
+    options : HessianOptions
 
     Returns
     -------

@@ -128,6 +128,7 @@ def judge_loops(
         As for `certify`.
     bandwidth, on_all : float, bool
         ω_b that is claimed, rad/s: on each plant, or on the first alone.
+    options : JudgementOptions
 
     Returns
     -------

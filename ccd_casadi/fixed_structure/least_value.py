@@ -188,6 +188,7 @@ def least_value(
         where these lead to no certified design.
     tell : callable
         Is given a line for each end.
+    options : LeastValueOptions
 
     Returns
     -------

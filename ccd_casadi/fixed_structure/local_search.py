@@ -195,6 +195,7 @@ def ascend(
         Of the trust region, in κ and τ; gain of the merit of a step below which it ends.
     restoring : bool
         Bring the point within its bounds first.
+    options : LocalSearchOptions
 
     Returns
     -------

@@ -358,6 +358,7 @@ def worst_plants(
     loop, seed : LoopOnBox, int
     count : int
         Plants of the lattice, of many parameters `options.lattice_of_many` at most.
+    options : WorstPlantOptions
 
     Returns
     -------

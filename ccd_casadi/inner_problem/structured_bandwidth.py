@@ -133,6 +133,7 @@ def stated_time(
     problem, theta, K : CoDesignProblem, sequence of float, StateSpace
     value : float
         The smooth time on the set, s.
+    options : MoveTimeOptions
 
     Returns
     -------
@@ -274,6 +275,7 @@ def structured_value(
         θ in SI.
     workers : Pool, optional
         The searches are spread over them.
+    options : StructuredValueOptions
 
     Returns
     -------

@@ -243,6 +243,7 @@ def violations(
         ln of a bound, above which a plant violates it.
     others : sequence of (option, point)
         Known plants, which are tried besides.
+    options : BoxCheckOptions
 
     Returns
     -------

@@ -63,6 +63,7 @@ def race(
     tell, workers : callable, Pool, optional
     only_warm_starts : bool
         Without other starts than the problem's warm starts.
+    options : StructuredSearchOptions
 
     Returns
     -------
@@ -88,6 +89,7 @@ def with_range(
     Parameters
     ----------
     problem : CoDesignProblem
+    options : StructuredSearchOptions
 
     Returns
     -------
@@ -125,6 +127,7 @@ def prepared(
     tell, workers : callable, Pool, optional
     only_warm_starts : bool
         Searches start from the problem's warm starts alone.
+    options : StructuredSearchOptions
 
     Returns
     -------
@@ -213,6 +216,7 @@ def least_from(
     ----------
     problem, theta, design : CoDesignProblem, sequence of float, SectionsDesign
     tell : callable
+    options : StructuredSearchOptions
 
     Returns
     -------

@@ -161,6 +161,7 @@ def descend(
         The first radius, a share of the box.
     ended : sequence of (z, J)
         Optima where others ended.
+    options : PiecesOptions
 
     Returns
     -------
