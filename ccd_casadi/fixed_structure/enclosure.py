@@ -309,16 +309,11 @@ class LoopFamily:
     def _loop_discs(self, boxes: Boxes) -> LoopDiscs:
         """(1) to (10) on boxes; where one of them does not hold it is one that does."""
         axis = axis_of(boxes, self.period, self.delay)
-        held, free, damped = discs_of(
-            self.plant, self.names, boxes.low[1:], boxes.high[1:], axis,
-            self.bounds.compliance_max is not None,
-        )  # fmt: skip
-        gains, epsilon, bounded = self._gains(axis)
+        held, free, damped = self._discs(boxes, axis)
+        gains, epsilon, bounded, grain = self._gains(axis)
         finite = np.isfinite(held.middle + held.radius + free.middle + free.radius)
         good = finite.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
-        y, delta_y, y_max = np.ones(len(good)), np.zeros(len(good)), np.ones(len(good))
-        if self._integrator:
-            y, delta_y, y_max = axis.y.centre, axis.y.reach + axis.y.rest, axis.y.size
+        y, y_max, delta_y = self._y(axis)
         K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
         c, b = self.plant.reading, self.plant.drive
         rows = b @ K
@@ -331,7 +326,6 @@ class LoopFamily:
         w, yW = norm(W), y[:, None, None] * W
         terms = RankOneDiscs(c, rows @ W, r)
         # (3): what is bounded only, and the rounding of M and W
-        grain = np.linalg.norm(bounded, axis=1) * norm(self.inputs) * norm(self.outputs)
         each = _lengths(c)[:, None] * np.abs(b @ self.inputs) * np.linalg.norm(self.outputs, axis=0)
         sizes = np.abs(y) + ((np.abs(m) + r) * (_lengths(c) * _lengths(rows))).sum(axis=1)
         delta_GK = np.einsum("Ni,ic,Nc->N", np.abs(m) + r, each, bounded)
@@ -340,7 +334,6 @@ class LoopFamily:
         good &= damped & (a * (delta_GK + delta_y) < 1.0)
         a = np.where(good, a, 1.0)
         a1 = a / np.where(good, 1.0 - a * (delta_GK + delta_y), 1.0)  # (4)
-        epsilon = epsilon * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
         t = terms.largest(unit - yW, -yW, unit) + GUARD * (1.0 + np.abs(y) * w)  # (5)
         u1 = a1 * (np.abs(y) * a * delta_GK + t * delta_y)  # (6)
         q = epsilon * (t + u1)  # (7)
@@ -376,10 +369,8 @@ class LoopFamily:
         """
         axis = axis_of(boxes, self.period, self.delay, at_rest=True)
         compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
-        held, free, damped = discs_of(
-            self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
-        )
-        gains, epsilon, bounded = self._gains(axis)
+        held, free, damped = self._discs(boxes, axis)
+        gains, epsilon, _, grain = self._gains(axis)
         finite = np.isfinite(held.middle + held.radius + free.middle + free.radius).all(axis=0)
         good = finite & np.isfinite(gains).all(axis=1) & damped
         m, r, g, e = (np.where(good, part, 0.0).T
@@ -400,15 +391,12 @@ class LoopFamily:
         n = np.maximum(q, P_norm)
         columns = np.where(rigid[:, None], c, c @ P)
         rows, one = b @ K, np.ones(len(good))
-        y, y_max, delta_y = one, one, 0.0 * one
-        if self._integrator:
-            y, y_max, delta_y = axis.y.centre, axis.y.size, axis.y.reach + axis.y.rest
+        y, y_max, delta_y = self._y(axis)
         M = y[:, None, None] * P + (columns.T * m[:, None]) @ rows
         good &= np.linalg.det(M) != 0.0
         W = np.linalg.inv(np.where(good[:, None, None], M, unit))
         sizes = (np.abs(m) + r) * _lengths(c) * _lengths(rows)
         delta = q * (y_max + sizes[:, ~rigid].sum(axis=1)) + P_norm * delta_y  # (2)
-        grain = np.linalg.norm(bounded, axis=1) * norm(self.inputs) * norm(self.outputs)
         delta += grain * ((np.abs(m) + r) * _lengths(c) * _lengths(b)).sum(axis=1)
         total = sizes.sum(axis=1) + P_norm * np.abs(y)
         delta += GUARD * total * (1.0 + total * norm(W))
@@ -416,7 +404,6 @@ class LoopFamily:
         a = RankOneDiscs(columns, rows @ W, r, None).largest(W, W, ones)  # (1)
         good &= a * delta < 1.0
         a1 = np.where(good, a, 1.0) / np.where(good, 1.0 - a * delta, 1.0)  # (3)
-        epsilon = epsilon * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
         T1E = epsilon * (1.0 + y_max * n * a1)  # (4)
         good &= T1E < 1.0
         a2 = n * a1 / np.where(good, 1.0 - T1E, 1.0)  # (5)
@@ -447,12 +434,25 @@ class LoopFamily:
         known = [own.integrator for own, _ in self.parts]
         return any(known) if len(self.outputs) == 1 else all(known)
 
-    def _gains(self, axis: FrequencyAxis) -> tuple[np.ndarray, Array, Array]:
-        """K̂ of every channel in the middle (N, c), and how far K̂ lies from it at most, relative
-        (N,); where that is far, as at infinity, the middle is 0 and |K̂| is in the last (N, c).
+    def _discs(self, boxes: Boxes, axis: FrequencyAxis) -> tuple[Discs, Discs, np.ndarray]:
+        """`discs_of` the modes on boxes, those without hold and delay where GS is bounded."""
+        compliance = self.bounds.compliance_max is not None
+        return discs_of(self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance)
+
+    def _y(self, axis: FrequencyAxis) -> tuple[np.ndarray, Array, Array]:
+        """y_c, max |y| and δ_y (N,); y is 1 without an integrator."""
+        if self._integrator:
+            return axis.y.centre, axis.y.size, axis.y.reach + axis.y.rest
+        one = np.ones(len(axis.y.rest))
+        return one, one, 0.0 * one
+
+    def _gains(self, axis: FrequencyAxis) -> tuple[np.ndarray, Array, Array, Array]:
+        """K̂ of every channel in the middle (N, c); ε (N,), by the largest relative distance of K̂
+        from it; and where that is far, as at infinity, the middle is 0 and |K̂| is in the third
+        (N, c), whose norm, that of F, is the last (N,).
 
         Where several channels share an output, E would not be a factor of theirs alone: how far
-        they lie from the middle is in the last too."""
+        they lie from the middle is in the third too."""
         found, bounded, epsilon = [], [], np.zeros(len(axis.x.centre))
         own = self.outputs.shape[0] == self.outputs.shape[1]
         for structure, kappa in self.parts:
@@ -462,7 +462,10 @@ class LoopFamily:
             found.append(np.where(near, K.centre, 0.0))
             bounded.append(np.where(near, 0.0 if own else radius, np.abs(K.centre) + radius))
             epsilon = np.maximum(epsilon, np.where(near & own, radius / np.abs(K.centre), 0.0))
-        return np.array(found).T, epsilon, np.array(bounded).T
+        epsilon = epsilon * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
+        rest = np.array(bounded).T
+        grain = np.linalg.norm(rest, axis=1) * norm(self.inputs) * norm(self.outputs)
+        return np.array(found).T, epsilon, rest, grain
 
     def _inside(self, boxes: Boxes) -> Array:
         """1, and infinite at the point that is not part of the axis."""
