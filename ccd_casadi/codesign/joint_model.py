@@ -11,11 +11,11 @@ import numpy as np
 from ccd_casadi.fixed_structure.channel_structure import in_units_of
 from ccd_casadi.fixed_structure.composite import on_plants
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
+from ccd_casadi.fixed_structure.figures import HessianOptions, assess, hessians, to_theta
 from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
 from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import LATTICE
+from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
 from ccd_casadi.inner_problem.objective import hardware_at
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -27,7 +27,7 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import violations
-from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
+from ccd_casadi.optim.trust_region import Iterate, Radius, Rows, TrustRegionModel, minimise
 from ccd_casadi.plants.plant import Evaluate, Mechanics, hardware_cost, to_first_order
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.sampler import Sampler
@@ -86,7 +86,7 @@ def proposed(
     return Proposal(model.place(end.x), model.unit * float(gain))
 
 
-class JointModel(Model[tuple[LoopProblem, Assessment]]):
+class JointModel(TrustRegionModel[tuple[LoopProblem, Assessment]]):
     """J over its `unit`, w2 ω_b in the middle, around a place; over x = (z, κ, τ), with the loops
     at x. With `bent` the plants' own curvature counts: not far from an optimum, as a model may jump
     where a mode that it keeps meets another."""
@@ -190,7 +190,7 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
     def _loops_beside(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> list[LoopProblem]:
         z, sampling = self.parts(here.x)[0], structured_of(self.problem).sampling
         known, found = self.known(z), []
-        for step in BESIDE * np.eye(len(z)):
+        for step in HessianOptions.parameter_step * np.eye(len(z)):
             moved = (
                 self.known(z + step)
                 if self.bent
@@ -300,7 +300,7 @@ class WorkingSet:
         looks: Sequence[int],
         within: float,
         tell: Callable[[str], None] | None,
-        count: int = LATTICE,
+        count: int = WorstPlantOptions.lattice,
     ) -> tuple["WorkingSet", JointPoint, float]:
         """With the plants on which the controller exceeds a bound, the controller adapted to them,
         and J there; `looks`: the searches for worse plants, one after the other, each elsewhere in

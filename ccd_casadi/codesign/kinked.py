@@ -26,7 +26,7 @@ from ccd_casadi.codesign.kkt import (
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.optim.kkt import damped_bfgs
-from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, minimise
+from ccd_casadi.optim.trust_region import Iterate, Radius, Rows, Step, TrustRegionModel, minimise
 from ccd_casadi.support.arrays import Array
 
 BAND = 0.25  # ln: peaks this close to their bound are constraints of a step
@@ -84,7 +84,7 @@ def descend(
     return model.box.lower + model.box.width * end.best.x
 
 
-class _Peaks(Model[_Design]):
+class _Peaks(TrustRegionModel[_Design]):
     """The true problem in unit-box variables."""
 
     growing = True

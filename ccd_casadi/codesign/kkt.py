@@ -17,10 +17,10 @@ from ccd_casadi.inner_problem.objective import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.optim.kkt import (
-    ACTIVE,
     ActiveSet,
     FirstOrder,
     KktCertificate,
+    KktOptions,
     active_set,
     hessian_products,
     reduced_curvature,
@@ -165,7 +165,7 @@ def kkt_certificate(here: TrueDesign, second: bool = False) -> KktCertificate:
     plain = _certificate(here, active_at(here), second)
     if plain.stationarity <= SMOOTH:
         return plain
-    others = other_peaks(here.problem, here.x, here.design, ACTIVE)
+    others = other_peaks(here.problem, here.x, here.design, KktOptions.active)
     if not others:  # with them a difference of gradients would mix one peak with another
         return plain
     return _certificate(here, active_at(here, others), False)

@@ -16,7 +16,7 @@ import numpy as np
 
 from ccd_casadi.inner_problem.objective import constraint_shares, constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sweep import MARGIN
+from ccd_casadi.inner_problem.sweep import SweepOptions
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
@@ -76,7 +76,7 @@ class OuterFailure(RuntimeError):
 
 
 def outer_program(
-    problem: CoDesignProblem, model: ca.Function, *, margin: float = MARGIN
+    problem: CoDesignProblem, model: ca.Function, *, margin: float = SweepOptions.margin
 ) -> NonlinearProgram:
     """Over θ with model(θ) -> ω_b in rad/s; or over (θ, ln ω_S, ln ω_T), where the model is a
     function of these, with model(x) -> ω_b, ln of what is bounded."""

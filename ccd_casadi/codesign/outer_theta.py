@@ -18,7 +18,7 @@ from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
-from ccd_casadi.optim.pieces import FIRST, Local, descend
+from ccd_casadi.optim.pieces import Local, PiecesOptions, descend
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
@@ -58,7 +58,7 @@ class ThetaOuter(Outer, ABC):
         self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem = self.problem
-        first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)
+        first, least = (FAR, SETTLED) if settled is None else (PiecesOptions.radius, settled)
         best = pieces_from(self.sampler, sample, least, first, known)
         J = objective_of(problem, best)
         if not np.isfinite(J):
@@ -74,7 +74,7 @@ def pieces_from(
     sampler: Sampler,
     best: InnerSample,
     settled: float,
-    first: float = FIRST,
+    first: float = PiecesOptions.radius,
     ends: Sequence[Place] = (),
 ) -> InnerSample:
     """From a sample to where the pieces of J promise no more, or near a stationary point of `ends`,

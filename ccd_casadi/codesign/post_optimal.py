@@ -34,7 +34,7 @@ from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of
-from ccd_casadi.optim.kkt import ACTIVE, ActiveSet, KktCertificate
+from ccd_casadi.optim.kkt import ActiveSet, KktCertificate, KktOptions
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.sampling.samples import InnerSample
@@ -96,7 +96,7 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
     design, kkt, active = here.design, here.kkt, active_at(here)
     kinked = not set(_strong(kkt)) <= set(active.labels)
     if kinked:  # where local peaks are equal, each is a constraint
-        active = active_at(here, other_peaks(problem, x, design, ACTIVE))
+        active = active_at(here, other_peaks(problem, x, design, KktOptions.active))
 
     def hessian() -> Array | None:
         if kinked:

@@ -14,7 +14,7 @@ from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import BINDS, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.certificate import TOLERANCE
+from ccd_casadi.fixed_structure.certificate import CertificateOptions
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_bandwidth import exact_times, motion_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
-from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, compliance_words, statics
@@ -156,7 +156,7 @@ def _source(item: SourceFigures, whole: BudgetFigures) -> dict[str, Any]:
     }
 
 
-WORST = 1.0 + TOLERANCE  # figure over bound up to which the judge counts a bound as met
+WORST = 1.0 + CertificateOptions.tolerance  # figure over bound that the judge counts as met
 
 
 def design_dict(
@@ -258,10 +258,10 @@ def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
 
 
 def kept_words(worst: Excess) -> str:
-    """Which bounds hold on a box whose judge allows `LOOSE`, by its worst plant to six digits."""
+    """Which bounds hold on a box whose judge is loose, by its worst plant to six digits."""
     if float(f"{100.0 + 100.0 * np.expm1(worst.value):.6g}") <= 100.0:
         return "within every bound"
-    return f"no bound exceeded by more than {100.0 * LOOSE:g} %"
+    return f"no bound exceeded by more than {100.0 * BoxCheckOptions.looseness:g} %"
 
 
 def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from ccd_casadi.codesign.joint_model import (
     WorkingSet,
     proposed,
 )
-from ccd_casadi.fixed_structure.worst_plant import WITHIN
+from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import nearby, structured_of
@@ -92,7 +92,7 @@ def joint_search(
     bent = plant_of(problem).nearby is not None
     polls, before = polls and bent, np.inf
     for turn in range(TURNS):
-        within = UNDERWAY if turn else WITHIN
+        within = UNDERWAY if turn else WorstPlantOptions.within
         working, best, J = working.on_worse_plants(
             plants.models, best, (turn,), within, tell, ON_THE_WAY
         )
@@ -217,7 +217,9 @@ def finished(
                 continue
         if found.gain <= KEPT * abs(J):
             before, true = working, nearby(problem, (), best.theta)
-            working, best, there = working.on_worse_plants(true, best, (look, *again), WITHIN, tell)
+            working, best, there = working.on_worse_plants(
+                true, best, (look, *again), WorstPlantOptions.within, tell
+            )
             if working is before or there - J <= KEPT * abs(J):
                 return working, best, True
             J = there
@@ -227,7 +229,9 @@ def finished(
         reach = min(2.0 * reach, LARGEST) if J - there > GOOD * found.gain else 0.3 * reach
         if there < J:
             plants, looks = beside, (look + step,)
-            working, best, J = working.on_worse_plants(plants.models, end, looks, WITHIN, tell)
+            working, best, J = working.on_worse_plants(
+                plants.models, end, looks, WorstPlantOptions.within, tell
+            )
     return working, best, False
 
 

@@ -34,11 +34,11 @@ from ccd_casadi.inner_problem.objective import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import (
-    STEP,
     ActiveSet,
     FirstOrder,
     Kink,
     KktCertificate,
+    KktOptions,
     active_set,
     hessian_products,
     reduced_curvature,
@@ -53,7 +53,7 @@ from ccd_casadi.support.arrays import Array
 SMOOTH = 1e-3
 Beside = Callable[[Array], Array]
 EQUATION = 10.0  # weight of the controller's own conditions, which no θ may pay for
-BESIDE = 10.0 * STEP  # of the box: differences of true values and gradients
+BESIDE = 10.0 * KktOptions.step  # of the box: differences of true values and gradients
 
 
 def theta_kkt(
@@ -101,7 +101,7 @@ def theta_kkt(
         return [objective_gradient(problem, one) for one in there]
 
     if kink is not None:
-        step = STEP if beside else BESIDE
+        step = KktOptions.step if beside else BESIDE
         slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.size, step)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
     elif beside is None:  # λ's own curvature is left out

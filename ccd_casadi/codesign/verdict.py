@@ -19,7 +19,7 @@ from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
-from ccd_casadi.optim.kkt import STEP, Kink, KktCertificate
+from ccd_casadi.optim.kkt import Kink, KktCertificate, KktOptions
 from ccd_casadi.support.text import counted, small_share, spoken, with_unit
 from ccd_casadi.synthesis.second_engine import Comparison
 from surrogates import Quality
@@ -118,7 +118,7 @@ def optimal(
     if kink.least_slope < -level:
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
         return VerdictLine(State.FAILED, f"{words}; {known}", figures)
-    beside = f"J by climbs of its controller, {STEP:g} of the box away,"
+    beside = f"J by climbs of its controller, {KktOptions.step:g} of the box away,"
     words = (
         f"locally optimal to first order at a kink of J: KKT residual {residual:.2g} over theta "
         f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "

@@ -21,7 +21,7 @@ from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.design import TWICE
+from ccd_casadi.fixed_structure.design import DesignOptions
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
@@ -226,7 +226,7 @@ class VerifiedStructured(Verified):
         multistart = ", ".join(f"{value:.2f}" for value in found)
         words = f"a multi-start search at this theta ended at {multistart} Hz{of}"
         design = self.multistart.design
-        if design.found is not None and design.found < TWICE:
+        if design.found is not None and design.found < DesignOptions.repeats:
             words += f", its best not found again from {counted(design.starts, 'start')}"
         figures = {**figures, "local_optima_hz": found, "best_found": design.found}
         return f"{words}; {known}", figures

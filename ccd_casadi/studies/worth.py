@@ -23,7 +23,7 @@ from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.objective import (
-    MET,
+    ConstraintOptions,
     constraint_sizes,
     objective,
     objective_of,
@@ -266,7 +266,8 @@ def outlook(
     cloud = best.theta + np.vstack([reach * spread for reach in REACHES])
     cloud = np.clip(np.vstack([expected, best.theta, cloud]), lower, upper)
     costs, constraints = (np.array(value) for value in plant_of(problem).hardware(cloud.T))
-    allowed = (constraints <= MET * constraint_sizes(problem)[:, None]).all(axis=0)
+    met = ConstraintOptions.met * constraint_sizes(problem)[:, None]
+    allowed = (constraints <= met).all(axis=0)
     steps = (cloud[:, None] - [each.theta for each in known]) / (upper - lower)
     new = np.abs(steps).max(axis=2).min(axis=1) > APART
     mean, deviation = process.predict(cloud, return_std=True)

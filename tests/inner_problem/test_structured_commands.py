@@ -26,10 +26,10 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
-from ccd_casadi.inner_problem import structured_robustness
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.limitations.limits import discs
 from ccd_casadi.limitations.multiplier import Basis
@@ -158,15 +158,13 @@ def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_
     )
 
 
-def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(folder: Path) -> None:
     run = read_run(folder / "run")
-    monkeypatch.setattr(structured_robustness, "FRESH", 40)
+    options = BoxCheckOptions(fresh=40)
     for more, survived in ((1.0, 40), (1.05, 0)):
         bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
         made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
-        drawn = structured_robustness.DesignOnBox(run.problem, run.theta, made).fresh_yield()
+        drawn = DesignOnBox(run.problem, run.theta, made, options).fresh_yield()
         assert drawn is not None
         assert (drawn.survived, drawn.draws) == (survived, 40)
 

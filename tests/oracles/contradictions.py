@@ -8,7 +8,7 @@ from ccd_casadi.codesign.verdict import LEAST_SHIFT
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 
 CLOSE = 1e-6
 
@@ -29,7 +29,8 @@ def _claims(r: Mapping[str, Any], problem: CoDesignProblem) -> Iterator[tuple[bo
     yield sum(r["spent"].values()) == r["syntheses"], "spent and syntheses"
     yield 0 <= r["syntheses_to_optimum"] <= r["syntheses"], "syntheses to the optimum"
 
-    certificate, S_max = r["certificate"], problem.inner.S_max * (1.0 + LOOSE * sections)
+    loose = 1.0 + BoxCheckOptions.looseness * sections
+    certificate, S_max = r["certificate"], problem.inner.S_max * loose
     certain = checks["certificate"] and checks["constraints"]
     certain = certain and checks["second_engine"] is not False
     yield failed["certified"] == (not certain), "certified line and checks"
