@@ -20,8 +20,18 @@ from surrogates import GaussianProcess
 class Iterate:
     """One round: what the surrogate promised at θ and what the true inner problem gave.
 
-    Bandwidths in rad/s; `truth` NaN where θ is infeasible; `radius` of the trust region as a
-    share of the box; `step` from the incumbent, likewise.
+    Attributes
+    ----------
+    theta : tuple of float
+        SI.
+    predicted, truth : float
+        ω_b in rad/s, or another figure in SI; `truth` NaN where θ is infeasible.
+    predicted_objective, objective : float
+        J of both.
+    error : float
+        Relative.
+    step, radius : float
+        From the incumbent, and of the trust region, in shares of the box.
     """
 
     theta: tuple[float, ...]
@@ -85,7 +95,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class GlobalCheck:
-    """What was looked at: true inner problems at `points` θ, `feasible` of these with a design.
+    """What was evaluated: true inner problems at `points` θ, `feasible` of these with a design.
 
     `fresh`: those that were solved for it; the run had solved the rest on its way.
     `better`: how many of them beat the J that the formulation came `before` with; `starts` local

@@ -23,8 +23,22 @@ from ccd_casadi.synthesis.synthesis import Design
 def written_plants(
     problem: CoDesignProblem, theta: Sequence[float], shifts: int | None = None
 ) -> list[StateSpace]:
-    """The model at θ and the plants of a mixed-sensitivity design's set, as they were written;
-    with so many `shifts` of its resonances."""
+    """The model at θ and the plants of a mixed-sensitivity design's set, as they were written.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With the plant and its set.
+    theta : (n_θ,) sequence
+        SI.
+    shifts : int or None
+        The number of shifts of its resonances; None: the set's own.
+
+    Returns
+    -------
+    list of StateSpace
+        The model first; SI, u in and y out.
+    """
     system, robust = mechanics(plant_of(problem), theta, derivatives=False), problem.robust
     places = () if robust is None else robust.perturbations(shifts)
     others = [off for off in places if off != NOMINAL]

@@ -29,8 +29,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import counted
 from surrogates import design
 
-BASIN = 1e-2  # of the box: ends of local solves on the truth that are closer are of one optimum
-
 
 @dataclass(frozen=True)
 class Place:
@@ -71,6 +69,7 @@ class Outer(ABC):
     """The outer problem of one kind of inner problem, on a sampler's store and workers."""
 
     kkt_level: float  # residual up to which an end counts as stationary
+    same_optimum = 1e-2  # of the box: ends of local solves on the truth that are closer are one
     extra_variables: tuple[str, ...] = ()  # what else x holds, logarithms
 
     def __init__(self, sampler: Sampler) -> None:
@@ -147,7 +146,9 @@ class Outer(ABC):
         if not places:
             words = f"no design meets its constraints from {counted(starts, 'start')}"
             return FormulationResult(message=words)
-        ends = distinct([(one.objective, one.x) for one in places], self.bounds, starts, BASIN)
+        ends = distinct(
+            [(one.objective, one.x) for one in places], self.bounds, starts, self.same_optimum
+        )
         return FormulationResult(ends.best.x, outer=ends, agreed=True)
 
     @abstractmethod

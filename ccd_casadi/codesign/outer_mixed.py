@@ -5,7 +5,7 @@ x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what th
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.judgement import second_on_weighted
-from ccd_casadi.codesign.kinked import SETTLED, descend, polish
+from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
@@ -31,14 +31,20 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 from surrogates import design
 
-POLISH_ROUNDS = 3
-INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
-BASIN = 1e-4  # residual of an end whose basin is not searched again
+
+@dataclass(frozen=True)
+class MixedOuterOptions:
+    """Numbers of the outer problem with mixed-sensitivity controllers."""
+
+    polishes: int = 3  # at most, each from a better controller of the whole inner problem
+    inner_gap: float = 1e-6  # relative: by how much the whole inner problem may be better
+    stationary: float = 1e-4  # residual of an end whose basin is not searched again
 
 
 class MixedOuter(Outer):
     """See the module."""
 
+    options = MixedOuterOptions()
     kkt_level = VerifiedDesign.kkt_level
     extra_variables = ("omega_S", "omega_T")
 
@@ -65,7 +71,7 @@ class MixedOuter(Outer):
         sampler, truth = self.sampler, self.sampler.truth
         lower, upper = self.bounds
         width = 1e-9 * self.bounds.width  # within rounding of a bound: onto it
-        for _ in range(POLISH_ROUNDS):
+        for _ in range(self.options.polishes):
             before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
             with polishing as progress, sampler.spent.on("polish"):
@@ -80,7 +86,7 @@ class MixedOuter(Outer):
                 inner = sampler.values(end.theta, "verifying")[0]
             bandwidth = end.design.figures.bandwidth
             gap = inner.bandwidth / bandwidth - 1.0 if inner.feasible else np.nan
-            if not gap > INNER_GAP:
+            if not gap > self.options.inner_gap:
                 break
             x = inner.joint
         J = end.objective if end.acceptable else np.inf
@@ -99,12 +105,12 @@ class MixedOuter(Outer):
         # where no design is feasible it goes from the middle of the weights' frequencies
         begin = np.where(np.isfinite(sample.joint), sample.joint, np.mean(self.bounds, axis=0))
         basins = [(place.x, place.objective) for place in known if place.stationary]
-        settled = SETTLED if settled is None else settled
+        settled = PeakDescentOptions().settled if settled is None else settled
         end = descend(truth, begin, ended=basins, settled=settled)
         for x in (end, begin):
             made = TrueDesign(truth, x)
             if made.acceptable:
-                return Place(x, made.objective, made.kkt.stationarity <= BASIN)
+                return Place(x, made.objective, made.kkt.stationarity <= self.options.stationary)
         return None
 
     def failure_reason(self, solution: Solution, share: float | None) -> str:

@@ -41,8 +41,6 @@ from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 
-WEAK = 1e-6  # a multiplier below this share of ‖∇J‖∞ holds nothing
-
 
 @dataclass(frozen=True)
 class Response:
@@ -63,10 +61,19 @@ class Response:
 
 @dataclass(frozen=True)
 class PostOptimal:
-    """The responses, the certificate that they rest on, and whether they are determined.
+    """How an optimum responds to the parameters of its case.
 
-    `weak` names what touches without a multiplier: across it a response is one-sided. Where
-    `determined` is False (dependent constraints, no second-order minimum) only dJ*/dp is given.
+    Attributes
+    ----------
+    responses : tuple of Response
+        Derivatives, one per parameter.
+    kkt : KktCertificate
+        Of the optimality conditions on which they rest.
+    weak : tuple of str
+        What binds without a multiplier: across it a response is one-sided.
+    determined : bool
+        False with dependent constraints or without a second-order minimum: then only dJ*/dp is
+        given.
     """
 
     responses: tuple[Response, ...]
@@ -141,10 +148,10 @@ def structured_responses(
     )  # fmt: skip
 
 
-def _strong(kkt: KktCertificate) -> list[str]:
-    """What holds the design: a multiplier that counts."""
+def _strong(kkt: KktCertificate, weak: float = 1e-6) -> list[str]:
+    """What holds the design: a multiplier above this share of ‖∇J‖∞."""
     size = float(np.abs(kkt.objective_gradient).max())
-    return [name for name in kkt.active if kkt.multipliers[name] > WEAK * size]
+    return [name for name in kkt.active if kkt.multipliers[name] > weak * size]
 
 
 def _responses(

@@ -149,7 +149,20 @@ def run_entry(terms: Terms, spent: Mapping[str, int], moved: bool = False) -> di
 
 
 def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """A line as the solve wrote it; empty where a run is older than verdicts."""
+    """A line of the verdict as the solve wrote it.
+
+    Parameters
+    ----------
+    result : mapping
+        result.json.
+    name : str
+        Of the line.
+
+    Returns
+    -------
+    mapping
+        Its entry; empty where the file has no such line.
+    """
     verdict = result.get("verdict")
     line = verdict.get(name) if isinstance(verdict, Mapping) else None
     if not isinstance(line, Mapping):
@@ -159,10 +172,24 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine) -> FinishedRun:
-    """The run with a line of its verdict, written into its folder if `out` lies in that.
+    """Replace a line of a run's verdict, and write it if `out` is within the run's folder.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays
     that of the solve.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        The run.
+    out : Path
+        Where the command writes.
+    name, line : str, VerdictLine
+        Of the verdict.
+
+    Returns
+    -------
+    FinishedRun
+        With the line in its result.
     """
     folder, before = run.folder.resolve(), at_solve(run.result, name)
     if not before or not out.resolve().is_relative_to(folder):
@@ -174,7 +201,20 @@ def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine)
 
 
 def resolved(case: Case, solution: Solution) -> Case:
-    """The case with what was found best of what it left open: design plant, listed values."""
+    """Fix what a case left open at what was found best: design plant, listed values.
+
+    Parameters
+    ----------
+    case : Case
+        As it was solved.
+    solution : Solution
+        Its result.
+
+    Returns
+    -------
+    Case
+        With nothing left open.
+    """
     problem = solution.problem
     if problem is None:
         return case
@@ -191,7 +231,16 @@ def resolved(case: Case, solution: Solution) -> Case:
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
     """Write what a run folder holds besides samples and report; clear an earlier run's.
 
-    The case in it names what was found best of what was open, so that what works on the run does.
+    The case in it names what was found best of what was open: later commands use that.
+
+    Parameters
+    ----------
+    folder : Path
+        Exists.
+    case : Case
+        As it was solved.
+    solution : Solution
+        Its result.
     """
     for name in ("result.json", "controller.json", "surrogate.json", "report.html", "index.html"):
         (folder / name).unlink(missing_ok=True)

@@ -103,8 +103,28 @@ def co_design(
     """Run one formulation on a sampler, verify and polish its design on the truth.
 
     A robust problem that leaves its design plant open is solved for each, and the best one kept;
-    one with parameters from lists by branching over these (`catalogue`). `known`: a local optimum
-    that is known already, in place of the formulation.
+    one with parameters from lists by branching over these (`catalogue`).
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the problem.
+    formulation : Nested, Lifted or Direct
+        With its options.
+    seed : int
+        Of every random choice.
+    known : (n,) array
+        x of a local optimum that is known already, in place of the formulation.
+
+    Returns
+    -------
+    Solution
+        With `verified` None where no design is feasible.
+
+    Raises
+    ------
+    UserError
+        J rewards what it should not.
     """
     if sampler.problem.listed:
         return _of_lists(sampler, formulation, seed)
@@ -121,7 +141,18 @@ def co_design(
 
 
 def outer_of(sampler: Sampler) -> Outer:
-    """The outer problem of the kind of controller that a sampler's problem has."""
+    """The outer problem of the kind of controller that a sampler's problem has.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the problem.
+
+    Returns
+    -------
+    Outer
+        An instance of its class in `OUTERS`.
+    """
     return OUTERS[type(sampler.problem.controller)](sampler)
 
 
@@ -153,7 +184,13 @@ def verify(sampler: Sampler, x: Array) -> Verified:
 
 
 def require_solvable(problem: CoDesignProblem) -> None:
-    """Raise UserError where J rewards what it should not."""
+    """Refuse a problem whose J rewards what it should not.
+
+    Raises
+    ------
+    UserError
+        J decreases with a figure of which less is better.
+    """
     if not problem.figure.larger_is_better and not problem.w2 > 0.0:
         v = problem.figure
         words = f'with inner.minimise = "{v.key}" J = w1 f + w2 {v.symbol} counts the {v.words} '
