@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.search import conclude_at
@@ -67,7 +67,7 @@ def best_over_design_plants(
     sampler: Sampler,
     outer_of: Callable[[Sampler], Outer],
     solve: Callable[[Outer], Solution],
-    terms: Terms,
+    terms: RunTerms,
 ) -> Solution:
     """The best of a problem's solutions over its design plants, by `solve` and continuation.
 

@@ -17,7 +17,7 @@ from surrogates import GaussianProcess
 
 
 @dataclass(frozen=True)
-class Iterate:
+class FormulationRound:
     """One round: what the surrogate promised at θ and what the true inner problem gave.
 
     Attributes
@@ -47,11 +47,11 @@ class Iterate:
 def iterate_of(
     problem: CoDesignProblem, theta: tuple[float, ...], predicted: float, truth: float,
     *, error: float, step: float, radius: float = 1.0,
-) -> Iterate:  # fmt: skip
+) -> FormulationRound:  # fmt: skip
     """A round with J as it was promised and as it is, infinite where there is no true value."""
     promised, J = (objective(problem, theta, value) for value in (predicted, truth))
     J = J if np.isfinite(truth) else np.inf
-    return Iterate(theta, predicted, truth, promised, J, error, step, radius)
+    return FormulationRound(theta, predicted, truth, promised, J, error, step, radius)
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class FormulationResult:
     """
 
     x: Array | None = None
-    iterates: tuple[Iterate, ...] = ()
+    iterates: tuple[FormulationRound, ...] = ()
     surrogates: tuple[GaussianProcess, ...] = ()
     outer: OuterSolution | None = None
     agreed: bool = False
@@ -83,7 +83,7 @@ KnownSamples = Sequence[InnerSample | QuantitySample]
 
 
 @dataclass(frozen=True)
-class Terms:
+class RunTerms:
     """By which formulation, to what relative tolerance and from which seed a run goes; `began` on
     the clock of `perf_counter`."""
 

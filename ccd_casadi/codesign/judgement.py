@@ -16,7 +16,12 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison, compared, second_opinion
+from ccd_casadi.synthesis.second_engine import (
+    NOT_COMPARED,
+    EngineComparison,
+    compared,
+    second_opinion,
+)
 from ccd_casadi.synthesis.synthesis import Design
 
 
@@ -62,7 +67,7 @@ def judge_on_model(
 
 def second_on_weighted(
     problem: CoDesignProblem, theta: Sequence[float], design: Design
-) -> Comparison:
+) -> EngineComparison:
     """Of mixed sensitivity: the norm that γ was reached with on the plant of the design, and the
     largest ‖S‖∞ and ‖GS‖∞ of its set."""
     figures = design.figures
@@ -81,7 +86,7 @@ def second_on_weighted(
 
 def second_on_set(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
-) -> Comparison:
+) -> EngineComparison:
     """Of a fixed structure: ‖S‖∞, and those of KS and T, of a continuous loop of GS too, on every
     plant that its certificate is of, as the loop runs."""
     judged, K = design.certificate, design.controller

@@ -9,7 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
+from ccd_casadi.codesign.formulation import (
+    FormulationResult,
+    FormulationRound,
+    KnownSamples,
+    iterate_of,
+)
 from ccd_casadi.codesign.gaussian_processes import best_left_out, interpolating, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -89,7 +94,7 @@ def solve_lifted(
     if len(samples) < n + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)
-    iterates: list[Iterate] = []
+    iterates: list[FormulationRound] = []
     incumbent: QuantitySample | None = None
     processes: tuple[GaussianProcess, ...] = ()
     solution: OuterSolution | None = None

@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
+from ccd_casadi.codesign.formulation import (
+    FormulationResult,
+    FormulationRound,
+    KnownSamples,
+    iterate_of,
+)
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -83,7 +88,7 @@ class NestedState:
         All true values.
     radius : float
         Of the region around the best of them, in shares of the box.
-    iterates : tuple of Iterate
+    iterates : tuple of FormulationRound
         The rounds so far.
     surrogate, solution : GaussianProcess, OuterSolution
         The last ones.
@@ -93,7 +98,7 @@ class NestedState:
 
     samples: tuple[InnerSample, ...]
     radius: float = 1.0
-    iterates: tuple[Iterate, ...] = ()
+    iterates: tuple[FormulationRound, ...] = ()
     surrogate: GaussianProcess | None = None
     solution: OuterSolution | None = None
     agreed: bool = False

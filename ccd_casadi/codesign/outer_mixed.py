@@ -15,7 +15,7 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.judgement import second_on_weighted
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
 from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
-from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, other_damping, survived
@@ -66,7 +66,7 @@ class MixedOuter(Outer):
         best = max(feasible, key=lambda sample: sample.bandwidth)
         return replace(outcome, x=best.joint, agreed=False)
 
-    def polished(self, x: Array) -> End:
+    def polished(self, x: Array) -> PolishedDesign:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
         sampler, truth = self.sampler, self.sampler.truth
         lower, upper = self.bounds
@@ -90,9 +90,9 @@ class MixedOuter(Outer):
                 break
             x = inner.joint
         J = end.objective if end.acceptable else np.inf
-        return End(end.x, bandwidth, J, end.kkt, float(gap))
+        return PolishedDesign(end.x, bandwidth, J, end.kkt, float(gap))
 
-    def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
+    def training_samples(self, end: PolishedDesign, inputs: int) -> tuple[Array, Array]:
         if inputs < end.x.size:
             return super().training_samples(end, inputs)
         found = self.sampler.quantities(end.x)[0]
@@ -116,7 +116,7 @@ class MixedOuter(Outer):
     def failure_reason(self, solution: Solution, share: float | None) -> str:
         return failure_words(self.sampler, solution, share)
 
-    def verified(self, end: End, rounds: int) -> VerifiedDesign:
+    def verified(self, end: PolishedDesign, rounds: int) -> VerifiedDesign:
         problem, sampler, x = self.problem, self.sampler, end.x
         here = TrueDesign(sampler.truth, x)
         theta = tuple(float(v) for v in self.theta_of(x))

@@ -59,7 +59,7 @@ class NonlinearProgram:
 
 
 @dataclass(frozen=True)
-class LocalOptimum:
+class OuterOptimum:
     """Where local solves from this number of `starts` ended."""
 
     x: Array
@@ -71,11 +71,11 @@ class LocalOptimum:
 class OuterSolution:
     """All distinct local optima, best first, and the number of starts that led to them."""
 
-    optima: tuple[LocalOptimum, ...]
+    optima: tuple[OuterOptimum, ...]
     starts: int
 
     @property
-    def best(self) -> LocalOptimum:
+    def best(self) -> OuterOptimum:
         """That of the least objective."""
         return self.optima[0]
 
@@ -180,12 +180,12 @@ def distinct(
 ) -> OuterSolution:
     """Ends (J, x) of local solves from this many starts; those closer than `apart` (shares of the
     box) are one optimum."""
-    optima: list[LocalOptimum] = []
+    optima: list[OuterOptimum] = []
     for objective, x in sorted(ends, key=lambda item: item[0]):
         near = (i for i, other in enumerate(optima) if bounds.away(x, other.x) < apart)
         same = next(near, None)
         if same is None:
-            optima.append(LocalOptimum(x, objective))
+            optima.append(OuterOptimum(x, objective))
         else:
             optima[same] = replace(optima[same], starts=optima[same].starts + 1)
     return OuterSolution(tuple(optima), starts)

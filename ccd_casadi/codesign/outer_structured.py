@@ -19,7 +19,7 @@ from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.joint_model import with_scenarios
 from ccd_casadi.codesign.judgement import second_on_set
-from ccd_casadi.codesign.outer import End, Place, is_expensive
+from ccd_casadi.codesign.outer import Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
@@ -69,7 +69,7 @@ class StructuredOuterOptions:
 
 
 @dataclass(frozen=True)
-class StructuredEnd(End):
+class PolishedStructured(PolishedDesign):
     """With the sampler of the problem that has it, its value and that one's design and gradients,
     a multi-start search there (None where plants are to be added first), the worst plant, and those
     to add."""
@@ -143,7 +143,7 @@ class StructuredOuter(ThetaOuter):
             self.sampler.value_from(best.theta, best.kappa)  # a polish there begins with it
         return Place(np.array(best.theta), J, ended)
 
-    def polished(self, x: Array) -> StructuredEnd:
+    def polished(self, x: Array) -> PolishedStructured:
         sampler, theta, options = self.sampler, self.theta_of(x), self.structured_options
         enough = NeighbourOptions().least_gain if self.retries_pay else options.better_at_elements
         for attempt in range(options.polishes):
@@ -159,23 +159,23 @@ class StructuredOuter(ThetaOuter):
                 break
             sampler.value_from(best.theta, multistart.design.kappa.tolist())
             theta = np.array(best.theta)
-        return StructuredEnd(
+        return PolishedStructured(
             np.array(best.theta), best.value, objective_of(problem, best),
             theta_kkt(problem, best, envelope=found.envelope), gap, sampler, best, found,
             multistart, worst, scenarios,
         )  # fmt: skip
 
-    def extended(self, end: End) -> "StructuredOuter | None":
+    def extended(self, end: PolishedDesign) -> "StructuredOuter | None":
         """With plants that it does not keep, searched for this alone: fresh ones judge the
         answer."""
-        end = cast(StructuredEnd, end)
+        end = cast(PolishedStructured, end)
         if not end.scenarios:
             return None
         anchored = with_warm_start(end.sampler.problem, end.inner.design.kappa)
         return StructuredOuter(with_scenarios(end.sampler.of(anchored), end.scenarios), ended=True)
 
-    def verified(self, end: End, rounds: int) -> VerifiedStructured:
-        end = cast(StructuredEnd, end)
+    def verified(self, end: PolishedDesign, rounds: int) -> VerifiedStructured:
+        end = cast(PolishedStructured, end)
         sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
         design = recertified(problem, best.theta, design)  # what a store holds is not relied on

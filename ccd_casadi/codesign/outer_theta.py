@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
@@ -51,14 +51,16 @@ class ThetaOuter(Outer, ABC):
         words = self.words if nearest is None else nearest.shortfall
         return replace(outcome, message=words or outcome.message)
 
-    def polished(self, x: Array) -> End:
+    def polished(self, x: Array) -> PolishedDesign:
         """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
         problem, sampler = self.problem, self.sampler
         with sampler.spent.on("polish"):
             best = sampler.values(self.theta_of(x), "polishing")[0]
             best = pieces_from(sampler, best, self.options.settled)
         kkt = theta_kkt(problem, best, sampler)
-        return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, np.nan)
+        return PolishedDesign(
+            np.array(best.theta), best.value, objective_of(problem, best), kkt, np.nan
+        )
 
     def local_solve(
         self, sample: InnerSample, known: Sequence[Place], settled: float | None = None

@@ -43,7 +43,7 @@ from ccd_casadi.support.terminal import Progress
 
 
 @dataclass(frozen=True)
-class Response:
+class OptimumResponse:
     """Derivatives of the optimum to one parameter of the case, per unit of it.
 
     Of J*, ω_b (rad/s), f, θ and (ln ω_S, ln ω_T). `value` is the parameter's own; bounds on ω_S
@@ -65,7 +65,7 @@ class PostOptimal:
 
     Attributes
     ----------
-    responses : tuple of Response
+    responses : tuple of OptimumResponse
         Derivatives, one per parameter.
     kkt : KktCertificate
         Of the optimality conditions on which they rest.
@@ -76,7 +76,7 @@ class PostOptimal:
         given.
     """
 
-    responses: tuple[Response, ...]
+    responses: tuple[OptimumResponse, ...]
     kkt: KktCertificate
     weak: tuple[str, ...]
     determined: bool
@@ -188,7 +188,7 @@ def _responses(
         dx = tuple(map(float, dz * width))
         change = sum(kkt.multipliers.get(name, 0.0) * d for name, d in parameter.levels.items())
         responses.append(
-            Response(
+            OptimumResponse(
                 parameter=parameter.name,
                 value=parameter.value,
                 objective=float(parameter.cost + change),

@@ -17,7 +17,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.result_entries import budget_entry, move_entry
@@ -42,7 +42,7 @@ FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or ch
 
 
 def result_dict(
-    terms: Terms,
+    terms: RunTerms,
     outcome: FormulationResult,
     verified: Verified,
     spent: Mapping[str, int],
@@ -131,13 +131,13 @@ def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float
     return value
 
 
-def infeasible_dict(terms: Terms, reason: str, spent: Mapping[str, int]) -> dict[str, Any]:
+def infeasible_dict(terms: RunTerms, reason: str, spent: Mapping[str, int]) -> dict[str, Any]:
     """result.json where no certified design meets the constraints."""
     head = {"status": "infeasible", "reason": reason, "formulation": terms.formulation}
     return head | run_entry(terms, spent)
 
 
-def run_entry(terms: Terms, spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
+def run_entry(terms: RunTerms, spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
     """What every result.json says of its run."""
     return {
         "format": FORMAT,

@@ -13,7 +13,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Terms, outputs_of
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, RunTerms, outputs_of
 from ccd_casadi.codesign.formulations import Direct, formulation_of
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
@@ -233,7 +233,7 @@ class Job:
         if known is not None:
             return known
         outer, sampler = self.outer, self.outer.sampler
-        terms = Terms(self.formulation, mark["tolerance"], self.seed)
+        terms = RunTerms(self.formulation, mark["tolerance"], self.seed)
         words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
         outcome = FormulationResult(message=words)
         if not words:

@@ -8,7 +8,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
-from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.formulations import (
     Formulation,
     formulation_of,
@@ -128,7 +128,7 @@ def co_design(
     """
     if sampler.problem.listed:
         return _of_lists(sampler, formulation, seed)
-    terms = Terms(type(formulation).__name__.lower(), formulation.tolerance, seed)
+    terms = RunTerms(type(formulation).__name__.lower(), formulation.tolerance, seed)
     require_solvable(sampler.problem)
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:

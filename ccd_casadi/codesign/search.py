@@ -6,10 +6,10 @@ from itertools import count
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
-from ccd_casadi.codesign.outer import End, Outer, Place, is_expensive
+from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.objective import objective_of, violated
@@ -40,7 +40,7 @@ class GlobalCheckOptions:
 
 def global_check(
     outer: Outer,
-    end: End,
+    end: PolishedDesign,
     points: int,
     seed: int,
     options: GlobalCheckOptions = GlobalCheckOptions(),
@@ -174,7 +174,7 @@ class SearchResult:
 
     outer: Outer
     outcome: FormulationResult
-    end: End | None
+    end: PolishedDesign | None
     rounds: int = 1
     look: GlobalCheck | None = None
 
@@ -210,8 +210,12 @@ def search_outer(
 
 
 def _looked(
-    outer: Outer, outcome: FormulationResult, end: End, formulation: Formulation, seed: int
-) -> tuple[FormulationResult, End, GlobalCheck]:
+    outer: Outer,
+    outcome: FormulationResult,
+    end: PolishedDesign,
+    formulation: Formulation,
+    seed: int,
+) -> tuple[FormulationResult, PolishedDesign, GlobalCheck]:
     """After the global check over the box, and a last try where the end is not stationary."""
     with outer.sampler.spent.on("box_look"):
         look = global_check(outer, end, formulation.box_points, seed)
@@ -232,7 +236,7 @@ def _looked(
     return outcome, end, look
 
 
-def best_end(ends: Sequence[End], level: float, tolerance: float) -> End:
+def best_end(ends: Sequence[PolishedDesign], level: float, tolerance: float) -> PolishedDesign:
     """The least J of those that are feasible; within the tolerance of it one that is stationary.
 
     A better design that is not stationary is kept: to call a worse one optimal would be untrue.
@@ -245,7 +249,7 @@ def best_end(ends: Sequence[End], level: float, tolerance: float) -> End:
     return min(stationary or near, key=lambda item: item.objective)
 
 
-def conclude(search: SearchResult, terms: Terms) -> Solution:
+def conclude(search: SearchResult, terms: RunTerms) -> Solution:
     """The design judged, and result.json."""
     outcome, sampler = search.outcome, search.outer.sampler
     spent = sampler.spent
@@ -260,7 +264,7 @@ def conclude(search: SearchResult, terms: Terms) -> Solution:
     return Solution(result, outcome, verified, quality)
 
 
-def conclude_at(outer: Outer, outcome: FormulationResult, terms: Terms) -> Solution:
+def conclude_at(outer: Outer, outcome: FormulationResult, terms: RunTerms) -> Solution:
     """An outcome polished and judged as it is, without a global check over the box."""
     end = None if outcome.x is None else outer.polished(outcome.x)
     return conclude(SearchResult(outer, outcome, end), terms)

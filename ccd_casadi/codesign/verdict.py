@@ -21,7 +21,7 @@ from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
 from ccd_casadi.optim.kkt import STEP, Kink, KktCertificate
 from ccd_casadi.support.text import counted, small_share, spoken, with_unit
-from ccd_casadi.synthesis.second_engine import Comparison
+from ccd_casadi.synthesis.second_engine import EngineComparison
 from surrogates import Quality
 
 
@@ -97,7 +97,7 @@ class VerdictLine:
         return {"state": self.state.value, "words": self.words, **self.figures}
 
 
-def confirmed(line: VerdictLine, second: Comparison) -> VerdictLine:
+def confirmed(line: VerdictLine, second: EngineComparison) -> VerdictLine:
     """`certified` with what a second engine says of the same loops."""
     state, words = line.state, f"{line.words}; {second.words}"
     if second.agrees is False:

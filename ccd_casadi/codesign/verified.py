@@ -26,7 +26,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import NotebookHtml
-from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison
+from ccd_casadi.synthesis.second_engine import NOT_COMPARED, EngineComparison
 from surrogates import GaussianProcess, Quality
 
 
@@ -54,7 +54,7 @@ class Verified(ABC):
         Certified, within its bounds, and λ(θ) <= 0.
     survival, damping : Survival, OtherDamping
         Off the model; None where the loop is not stable.
-    second : Comparison
+    second : EngineComparison
         Another engine on its loops.
     """
 
@@ -69,7 +69,7 @@ class Verified(ABC):
     feasible: bool
     survival: Survival | None
     damping: OtherDamping | None
-    second: Comparison = NOT_COMPARED
+    second: EngineComparison = NOT_COMPARED
 
     kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
     saddle: ClassVar[float] = VerdictOptions().saddle  # least curvature that is none downwards

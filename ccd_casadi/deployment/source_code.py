@@ -33,7 +33,6 @@ FILE = "controller.fmu"
 NAME = "controller"  # modelIdentifier
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
 _LIBRARY = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("win", ".dll")}
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same controller is the same file
 
 
 def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], title: str) -> bool:
@@ -61,7 +60,8 @@ def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], 
         content[f"binaries/{system}{bits}/{NAME}{ending}"] = library
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, data in content.items():
-            file.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
+            # of the format's first day: the same controller is the same file
+            file.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
     return library is not None
 
 

@@ -174,7 +174,7 @@ def _norm(system: StateSpace, options: SecondEngineOptions = SecondEngineOptions
 
 
 @dataclass(frozen=True)
-class Comparison:
+class EngineComparison:
     """A second engine on the loops of a design.
 
     Attributes
@@ -210,10 +210,10 @@ class Comparison:
                 "words": self.words}  # fmt: skip
 
 
-NOT_COMPARED = Comparison(0)
+NOT_COMPARED = EngineComparison(0)
 
 
-def compared(loops: Iterable[tuple[SecondOpinion, Mapping[str, float]]]) -> Comparison:
+def compared(loops: Iterable[tuple[SecondOpinion, Mapping[str, float]]]) -> EngineComparison:
     """Compare the opinion on each loop with another engine's claims on it.
 
     Parameters
@@ -223,7 +223,7 @@ def compared(loops: Iterable[tuple[SecondOpinion, Mapping[str, float]]]) -> Comp
 
     Returns
     -------
-    Comparison
+    EngineComparison
         The first contradiction.
     """
     denied, unknown, count = "", "", 0
@@ -232,4 +232,4 @@ def compared(loops: Iterable[tuple[SecondOpinion, Mapping[str, float]]]) -> Comp
         unknown = unknown or (f"{where}{opinion.reason}" if opinion.reason else "")
         found = () if opinion.reason else opinion.contradictions(**claims)
         denied = denied or (f"{where}{found[0]}" if found else "")
-    return Comparison(count, denied, unknown)
+    return EngineComparison(count, denied, unknown)

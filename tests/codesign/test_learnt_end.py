@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ccd_casadi.codesign import search
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.gaussian_processes import with_sample
-from ccd_casadi.codesign.outer import End, Outer
+from ccd_casadi.codesign.outer import Outer, PolishedDesign
 from ccd_casadi.codesign.result import predicted_value
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.samples import SynthesisCounts
@@ -49,7 +49,8 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     case allows none."""
     X = np.linspace(0.0, 1.0, 6)[:, None]
     process = fit(X, 1.0 + X[:, 0], lower=[0.0], upper=[1.0])
-    end = End(np.array([0.5]), 2.5, -1.0, KktCertificate(0.0, 0.0, 0.0, {}, (), None, ()), 0.0)
+    kkt = KktCertificate(0.0, 0.0, 0.0, {}, (), None, ())
+    end = PolishedDesign(np.array([0.5]), 2.5, -1.0, kkt, 0.0)
     spent = (SimpleNamespace(),) * (rounds + 1)
     outcome = FormulationResult(end.x, spent, (process,), None, False, "")  # type: ignore[arg-type]
     outer = SimpleNamespace(
