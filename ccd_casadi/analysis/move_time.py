@@ -49,7 +49,7 @@ class _Crossing:
 
     def __init__(
         self, G: StateSpace, K: StateSpace, r: Array, f: Array, window: float, period: float,
-        options: MoveTimeOptions,
+        options: MoveTimeOptions = MoveTimeOptions(),
     ) -> None:  # fmt: skip
         self.plant, self.r, self.f = G, r, f
         self.loop = loop = closed_loop(G, K)
