@@ -96,6 +96,8 @@ def fit(
         Standard deviation of Y, in output units; 0 interpolates, None estimates it.
     seed, starts : int
         Of the search for hyperparameters.
+    options : FitOptions
+        Numbers of the method.
 
     Returns
     -------
@@ -263,6 +265,8 @@ def calibrated(
         Of n samples.
     misses : (n,) array
         z, where they are known.
+    options : CalibrationOptions
+        Numbers of the method.
 
     Returns
     -------
@@ -296,6 +300,8 @@ def recalibrated(
         With its samples.
     seed : int
         Of the parts and the fits.
+    options : CalibrationOptions
+        Numbers of the method.
 
     Returns
     -------

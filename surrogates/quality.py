@@ -71,6 +71,8 @@ def extrapolation(
         Its samples, in input units.
     x : array (d,)
         The point.
+    options : ExtrapolationOptions
+        Numbers of the method.
 
     Returns
     -------

@@ -174,6 +174,8 @@ def loop_view(
         Of the grid; None: those of the options.
     peaks : tuple of (Hz, gain)
         Local maxima of σ_max(S) on the model; None: they are searched.
+    options : ViewOptions
+        Numbers of the method.
 
     Returns
     -------

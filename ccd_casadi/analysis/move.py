@@ -304,6 +304,8 @@ def moves(
         Feedforward as of `simulate`.
     profile, axis, window, bandwidth_hz
         As of `simulate`.
+    options : MoveOptions
+        Numbers of the method.
 
     Returns
     -------
@@ -340,6 +342,8 @@ def simulate(
         Where the error has settled, unit of y.
     bandwidth_hz : float
         Hz.
+    options : MoveOptions
+        Numbers of the method.
 
     Returns
     -------

@@ -117,6 +117,8 @@ def slow_words(
         With its plan of samples.
     parameters : int
         n_θ.
+    limits : SurrogateLimits
+        Up to where surrogates are fast.
 
     Returns
     -------

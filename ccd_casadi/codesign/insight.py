@@ -90,6 +90,8 @@ def pareto_front(
         At most.
     seed : int
         Of the θ whose hardware cost gives its range.
+    options : FrontOptions
+        Numbers of the method.
 
     Returns
     -------

@@ -217,6 +217,8 @@ def joint_search(
         digits to a polish.
     polls : bool
         Whether places further away are tried once, for plants with a reduced basis.
+    options : JointSearchOptions
+        Numbers of the method.
 
     Returns
     -------

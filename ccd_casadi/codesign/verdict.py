@@ -273,6 +273,8 @@ def survives(
         ‖S‖∞ on closer models of the plant.
     figures : mapping
         More of them.
+    options : VerdictOptions
+        Numbers of the method.
 
     Returns
     -------

@@ -87,6 +87,8 @@ def sections_of(
         K(s) in SI; K(0) is finite and not zero.
     bandwidth : float
         ω_b in rad/s, by which poles are slow.
+    options : SectionOptions
+        Numbers of the method.
 
     Returns
     -------

@@ -184,6 +184,8 @@ def on_hardware(
         None: ideal.
     progress : function of str
         Takes lines of progress.
+    options : SimulationOptions
+        Numbers of the method.
 
     Returns
     -------

@@ -101,6 +101,8 @@ def statics(
         The plant continuous; SI.
     bandwidth, omega_low : float
         ω_b and the lowest frequency that counts, rad/s.
+    options : StaticsOptions
+        Numbers of the method.
 
     Returns
     -------
