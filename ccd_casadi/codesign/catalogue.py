@@ -26,8 +26,8 @@ from ccd_casadi.codesign.design_plants import order
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import with_all_spent
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import duration, remark
 from ccd_casadi.support.text import counted

@@ -16,14 +16,14 @@ import numpy as np
 from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Outer
-from ccd_casadi.codesign.search import conclude_at
+from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import missed_bounds
 from ccd_casadi.plants.plant import named_values
+from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import with_all_spent
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 

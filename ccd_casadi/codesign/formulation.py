@@ -11,7 +11,7 @@ from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.sampling.samples import InnerSample, QuantitySample
+from ccd_casadi.sampling.inner_samples import InnerSample, QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.run_folder import sections_kappa
-from ccd_casadi.codesign.judgement import judge_on_model, second_on_set, second_on_weighted
+from ccd_casadi.codesign.final_judgement import judge_on_model, second_on_set, second_on_weighted
 from ccd_casadi.codesign.result_entries import (
     active_of,
     budget_entry,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.kkt import (
+from ccd_casadi.codesign.lifted_kkt import (
     LiftedKktOptions,
     TrueDesign,
     first_order,

@@ -25,8 +25,8 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.inner_problem.objective import constraint_shares, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.sampling.inner_samples import QuantitySample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design, fit_outputs, to_casadi
 

@@ -26,8 +26,8 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.inner_problem.objective import objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.optim.pieces import Box
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design, fit, to_casadi
 

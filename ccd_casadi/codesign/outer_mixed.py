@@ -11,10 +11,10 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
+from ccd_casadi.codesign.final_judgement import second_on_weighted
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.judgement import second_on_weighted
 from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
-from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
+from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.objective import final_design, objective
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 from surrogates import design

@@ -17,8 +17,8 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
+from ccd_casadi.codesign.final_judgement import second_on_set
 from ccd_casadi.codesign.joint_model import with_scenarios
-from ccd_casadi.codesign.judgement import second_on_set
 from ccd_casadi.codesign.outer import Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
@@ -46,8 +46,8 @@ from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertif
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.units import NeighbourOptions
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Workers, results

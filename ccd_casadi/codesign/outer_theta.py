@@ -19,8 +19,8 @@ from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.optim.pieces import FIRST, Local, descend
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 

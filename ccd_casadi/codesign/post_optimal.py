@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import null_space
 
-from ccd_casadi.codesign.kkt import (
+from ccd_casadi.codesign.lifted_kkt import (
     OTHER_PEAK,
     TrueDesign,
     active_at,
@@ -37,7 +37,7 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_
 from ccd_casadi.optim.kkt import ACTIVE, ActiveSet, KktCertificate
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 

@@ -31,7 +31,7 @@ from ccd_casadi.codesign.verdict import (
 )
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.sampling.samples import spent_entry
+from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values, write_json
 from ccd_casadi.support.text import versions

@@ -17,11 +17,16 @@ from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Run
 from ccd_casadi.codesign.formulations import Direct, formulation_of
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
-from ccd_casadi.codesign.search import conclude_at
+from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.optim.pieces import Box
-from ccd_casadi.sampling.samples import InnerSample, QuantitySample, quantity_sample, spent_entry
+from ccd_casadi.sampling.inner_samples import (
+    InnerSample,
+    QuantitySample,
+    quantity_sample,
+    spent_entry,
+)
 from ccd_casadi.sampling.store import Sample, SampleStore, hashes_of, problem_hash
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

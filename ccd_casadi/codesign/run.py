@@ -18,8 +18,8 @@ from ccd_casadi.codesign.formulations import (
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
+from ccd_casadi.codesign.outer_search import conclude, conclude_at, search_outer
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.search import conclude, conclude_at, search_outer
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem

@@ -45,8 +45,8 @@ from ccd_casadi.optim.kkt import (
     reduced_curvature,
 )
 from ccd_casadi.optim.pieces import Box
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 
 Beside = Callable[[Array], Array]

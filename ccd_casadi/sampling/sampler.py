@@ -14,7 +14,7 @@ import numpy as np
 
 from ccd_casadi.inner_problem.objective import TrueQuantities, objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.sampling.samples import (
+from ccd_casadi.sampling.inner_samples import (
     InnerSample,
     QuantitySample,
     SynthesisCounts,

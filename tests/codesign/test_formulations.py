@@ -25,7 +25,7 @@ from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
-from ccd_casadi.sampling.samples import InnerSample, SynthesisCounts
+from ccd_casadi.sampling.inner_samples import InnerSample, SynthesisCounts
 
 ROOT = Path(__file__).parents[2]
 LIMITS = SurrogateLimits()

@@ -11,10 +11,10 @@ from oracles.helpers import problem
 
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
-from ccd_casadi.codesign.search import _starts, global_check
+from ccd_casadi.codesign.outer_search import _starts, global_check
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from surrogates import design
 
 

@@ -36,7 +36,7 @@ from ccd_casadi.limitations.multiplier import MultiplierBasis
 from ccd_casadi.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.robustness import main as robustness_main
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.text import HZ, number
 from ccd_casadi.synthesis.closed_loop import measure

@@ -14,7 +14,7 @@ from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from surrogates import design
 from surrogates.fitting import recalibrated

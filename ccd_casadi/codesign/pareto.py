@@ -14,8 +14,8 @@ from ccd_casadi.codesign.result_entries import bound_words
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.text import HZ, versions
