@@ -101,9 +101,9 @@ def proposed(
 
 @dataclass(frozen=True, eq=False)
 class JointLoops:
-    """The loops of an iterate at κ (problem's units) and τ, with their assessment."""
+    """The loops of an iterate at κ (their units) and τ, with their assessment."""
 
-    problem: LoopProblem
+    loops: LoopProblem
     kappa: Array
     tau: float
     found: Assessment
@@ -111,7 +111,7 @@ class JointLoops:
     @cached_property
     def rows(self) -> Constraints:
         """Peaks and the grid near them."""
-        return all_rows(self.problem, self.kappa, self.tau, self.found)
+        return all_rows(self.loops, self.kappa, self.tau, self.found)
 
 
 class JointModel(Model[JointLoops]):
@@ -130,7 +130,7 @@ class JointModel(Model[JointLoops]):
         Whether the models' own curvature counts: only near an optimum, as a model may jump where a
         mode that it keeps meets another.
     ends_early : bool
-        Whether a search ends where its last trials gain little.
+        Whether a search ends where its last trials gain little: it counts the trials of one.
     """
 
     corrected = bending = True
@@ -179,9 +179,9 @@ class JointModel(Model[JointLoops]):
 
     def place(self, x: Array) -> JointPoint:
         """That of x."""
-        z, kappa, tau = self.parts(x)
+        z, scaled, tau = self.parts(x)
         loops = self.first_loops
-        kappa = loops.structure.in_units(kappa, loops.plants.omega_0, loops.plants.force)
+        kappa = loops.structure.in_units(scaled, loops.plants.omega_0, loops.plants.force)
         theta = np.clip(self.theta(z), *box(self.problem))
         omega_b = float(np.exp(tau) * loops.plants.omega_0)
         return JointPoint(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
@@ -254,7 +254,7 @@ class JointModel(Model[JointLoops]):
                 if self.curved_plants
                 else [to_first_order(one, self.width * step) for one in known]
             )
-            found.append(on_plants(here.data.problem, self.plants(z + step, moved), sampling))
+            found.append(on_plants(here.data.loops, self.plants(z + step, moved), sampling))
         return found
 
     def at(self, x: Array) -> Iterate[JointLoops] | None:
@@ -262,10 +262,10 @@ class JointModel(Model[JointLoops]):
         x = np.clip(x, self.low, self.high)
         z, kappa, tau = self.parts(x)
         try:
-            problem = self.loops(z)
+            loops = self.loops(z)
         except np.linalg.LinAlgError:  # placed masses move so far that M + ∂M Δθ is indefinite
             return None
-        found = assess(problem, kappa, tau)
+        found = assess(loops, kappa, tau)
         if not found.stable:
             return None
         own, worth = hardware_at(self.problem, self.theta(z)), float(np.exp(tau - self.tau))
@@ -273,12 +273,12 @@ class JointModel(Model[JointLoops]):
         slope = np.concatenate([own.cost_gradient / self.unit, np.zeros(len(kappa)), [-worth]])
         unmet = (own.constraints + self.options.constraint_margin) * self.weight
         violation = max(found.violation, float(unmet.max(initial=0.0)))
-        loops = JointLoops(problem, kappa, tau, found)
-        return Iterate(x, cost / self.unit - worth, slope, violation, loops)
+        data = JointLoops(loops, kappa, tau, found)
+        return Iterate(x, cost / self.unit - worth, slope, violation, data)
 
     def ended(self, here: Iterate[JointLoops], there: Iterate[Any]) -> bool:
         """Where the last trials gain little of what all have."""
-        if not (self.ends_early and self.beginning):
+        if not self.ends_early or self.beginning is None:
             return False
         merits, options = self._merits, self.options
         merits.append(here.value + options.penalty * here.violation)
@@ -289,7 +289,7 @@ class JointModel(Model[JointLoops]):
     def rows(self, here: Iterate[JointLoops], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""
         z, kappa, tau = self.parts(here.x)
-        problem, peaks = here.data.problem, here.data.found.peaks
+        loops, peaks = here.data.loops, here.data.found.peaks
         assert peaks is not None
         found, count = here.data.rows, len(z)
         steep = np.abs(found.to_kappa).sum(1) + np.abs(found.to_tau)
@@ -297,7 +297,7 @@ class JointModel(Model[JointLoops]):
             found.value + self.options.row_reach * radius * np.maximum(steep, 1.0) > 0.0
         )
         found = found.only(kept)
-        slopes = np.column_stack([to_theta(problem, kappa, found), found.to_kappa, found.to_tau])
+        slopes = np.column_stack([to_theta(loops, kappa, found), found.to_kappa, found.to_tau])
         own = hardware_at(self.problem, self.theta(z))
         unmet = (own.constraints + self.options.constraint_margin) * self.weight
         of_z = np.pad(self.weight[:, None] * own.slopes, ((0, 0), (0, len(here.x) - count)))
@@ -308,7 +308,7 @@ class JointModel(Model[JointLoops]):
                 beside = self.loops_beside(here)
             except np.linalg.LinAlgError:  # as in `at`: no curvature is known at the edge
                 return np.zeros((len(chosen.value), len(here.x), len(here.x)))
-            return hessians(problem, kappa, tau, chosen, beside)
+            return hessians(loops, kappa, tau, chosen, beside)
 
         return Rows(
             np.concatenate([found.value, unmet]), np.vstack([slopes, of_z]),
@@ -362,7 +362,7 @@ class WorkingSet:
         here = JointModel(problem, models, at, 0.0).beginning
         if here is None:
             return self
-        loops, peaks = here.data.problem, here.data.found.peaks
+        loops, peaks = here.data.loops, here.data.found.peaks
         assert peaks is not None
         near = np.flatnonzero(peaks.value > -options.near)
         rows = peaks.only(near[np.argsort(-peaks.value[near], kind="stable")])
