@@ -23,7 +23,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.interrupts import interrupts_kept, raise_dropped
 from surrogates import design
 
-OPTIONS: dict[str, Any] = {
+IPOPT: dict[str, Any] = {
     "print_time": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -156,7 +156,7 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
     z = ca.MX.sym("z", program.x.shape[0])
     inside = lower + width * z
     f, g = ca.substitute([program.f, program.g], [program.x], [inside])
-    options = OPTIONS.copy()
+    options = IPOPT.copy()
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
     solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)

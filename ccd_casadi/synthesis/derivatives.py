@@ -1,6 +1,7 @@
 """Total derivatives of a certified design's figures, and of every local peak of S."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -173,11 +174,29 @@ def sensitivities(
     )
 
 
-# Around each closed-loop pole in multiples of its width, and over the decades about ω₀: what no
-# pole of plant or loop points at is as broad as the distance between two of these.
-HALF = np.array([0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0])
-FLANKS = np.concatenate([-HALF[::-1], [0.0], HALF])
-BROAD = np.geomspace(1e-2, 1e2, 1201)
+@dataclass(frozen=True)
+class PeakGridOptions:
+    """Numbers of the grid on which local peaks are found.
+
+    It is around each closed-loop pole, and over the decades about ω₀: what no pole of plant or loop
+    points at is as broad as the distance between two of its points.
+    """
+
+    half_widths: tuple[float, ...] = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0)  # of a pole, either way
+    decades: float = 2.0  # about ω₀, either way
+    points: int = 1201
+    apart: float = 1e-7  # relative: closer points differ in gain by rounding alone
+
+    @cached_property
+    def flanks(self) -> Array:
+        """Around a pole, in its widths."""
+        half = np.array(self.half_widths)
+        return np.concatenate([-half[::-1], [0.0], half])
+
+    @cached_property
+    def broad(self) -> Array:
+        """ω over ω₀."""
+        return np.geomspace(10.0**-self.decades, 10.0**self.decades, self.points)
 
 
 @dataclass(frozen=True)
@@ -256,17 +275,19 @@ def local_peaks_with_gradients(
 
 
 def _peaks(
-    plant: ScaledPlant, controller: tuple[Array, Array, Array], least: float, apart: float = 1e-7
+    plant: ScaledPlant,
+    controller: tuple[Array, Array, Array],
+    least: float,
+    options: PeakGridOptions = PeakGridOptions(),
 ) -> list[tuple[float, float]]:
-    """Local maxima of σ_max(S) of at least `least`, (ω over ω₀, gain).
-
-    Points of the grid closer than `apart` (relative) differ in gain by rounding alone."""
+    """Local maxima of σ_max(S) of at least `least`, (ω over ω₀, gain)."""
     Ak, Bk, Ck = (np.ascontiguousarray(part) for part in controller)
     Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
     poles = closed_loop(plant.system, StateSpace(Ak, Bk, Ck, Dk)).S.poles
-    near = root_flanks(poles[poles.imag > 0.0], FLANKS)
+    near = root_flanks(poles[poles.imag > 0.0], options.flanks)
     low, high = float(plant.grid[0]), float(plant.grid[-1])
-    grid = np.ascontiguousarray(frequency_grid(low, high, 2, plant.grid, BROAD, near, apart=apart))
+    grid = frequency_grid(low, high, 2, plant.grid, options.broad, near, apart=options.apart)
+    grid = np.ascontiguousarray(grid)
     G, K = prepare(plant.A, plant.B, plant.C), prepare(Ak, Bk, Ck)
     gain = sensitivity_gains(G, K, Dk, grid)
     found = []
