@@ -199,7 +199,7 @@ def search_outer(
         end = outer.polished(outcome.x)
         more = None if rounds == most else outer.extended(end)
         if more is None:
-            outcome, found, look = _looked(outer, outcome, end, formulation, seed)
+            outcome, found, look = _after_global_check(outer, outcome, end, formulation, seed)
             moved = found is not end and rounds < most
             more, end = outer.extended(found) if moved else None, found
         if more is None:
@@ -209,7 +209,7 @@ def search_outer(
     return SearchResult(outer, outcome, end, rounds, look)
 
 
-def _looked(
+def _after_global_check(
     outer: Outer,
     outcome: FormulationResult,
     end: PolishedDesign,

@@ -45,6 +45,8 @@ class JointSearchOptions:
     least_reach: float = 1e-4
     good_share: float = 0.7  # of the promised gain: with more the reach grows
     poor_share: float = 0.3  # with less it shrinks
+    growth: float = 2.0  # factors of the reach
+    shrinkage: float = 0.3
     rounds: int = 25  # at most, each with plants evaluated anew
     excess_on_way: float = 1e-3  # ln: by how much a plant may exceed a bound before the end
     lattice_on_way: int = 50  # plants from which the worst are searched before the end
@@ -176,9 +178,9 @@ class JointState:
         there = replace(self, point=proposal.end, plants=plants).adapted(options)
         gained, reach = self.objective - there.objective, self.reach
         if gained > options.good_share * proposal.gain:
-            reach = min(2.0 * reach, options.largest_reach)
+            reach = min(options.growth * reach, options.largest_reach)
         elif not gained >= poor_share * proposal.gain:
-            reach *= 0.3
+            reach *= options.shrinkage
         return replace(there if gained > 0.0 else self, reach=reach)
 
 

@@ -60,7 +60,7 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     )  # fmt: skip
     monkeypatch.setattr(search, "global_check", lambda *_: SimpleNamespace(x=None))
     options = SimpleNamespace(box_points=0, max_refinements=rounds, tolerance=1e-3)
-    learnt_of, *_ = search._looked(outer, outcome, end, options, 0)
+    learnt_of, *_ = search._after_global_check(outer, outcome, end, options, 0)
     assert abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0) > 0.1
     learnt = abs(predicted_value(learnt_of, end.x, end.value) / end.value - 1.0) < 1e-3
     assert learnt is (rounds > 0)
