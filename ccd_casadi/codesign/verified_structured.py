@@ -67,11 +67,30 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
 class VerifiedStructured(Verified):
     """The design of a run, judged on its set and on the whole box of plants.
 
-    `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
-    the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
-    `worst` the worst plant that was found. `multistart` is a multi-start search at θ,
-    `costs` what easier problems have there, `prices` dω_b/d ln t (rad/s) of every tolerance t, and
-    `gap`, of ω_b, what no controller reaches; `told` the time of its move, where that counts.
+    Attributes
+    ----------
+    design : SectionsDesign
+        Certified anew on its set.
+    multistart : StructuredValue
+        A multi-start search at θ.
+    wide, checked : SetCertificate, int
+        The judge's certificate on a lattice of this number of plants of the box.
+    proof : Proof
+        For the whole box.
+    drawn : Yield or None
+        Where that is not proven: how many random plants of the box survive.
+    worst : Excess
+        The worst plant that was found.
+    rounds : int
+        Of the search.
+    costs : Costs
+        What easier problems reach at θ.
+    prices : mapping
+        dω_b/d ln t in rad/s of every tolerance t.
+    gap : Gap or None
+        Of ω_b: what no controller reaches.
+    told : (float, Yield) or None
+        The time of its move in s, where J counts it.
     """
 
     design: SectionsDesign

@@ -189,7 +189,7 @@ class TrustRegionModel(ABC, Generic[Data]):
     bending : bool
         A row that ends below its bound by little of what it moves counts with its curvature, as it
         may bend over it. Searches over K alone end in better optima without.
-    options : StepOptions
+    step_options : StepOptions
     """
 
     low: Array
@@ -199,7 +199,7 @@ class TrustRegionModel(ABC, Generic[Data]):
     growing = False
     restoring = False
     bending = False
-    options = StepOptions()
+    step_options = StepOptions()
 
     @abstractmethod
     def at(self, x: Array) -> Iterate[Data] | None:
@@ -306,7 +306,7 @@ def best_step(
     model: TrustRegionModel[Data], here: Iterate[Data], H: Array, radius: float, penalty: float
 ) -> Step | None:
     """The best step that the model knows; None where its programme has no answer."""
-    rows, options = model.rows(here, radius), model.options
+    rows, options = model.rows(here, radius), model.step_options
     margin = np.zeros(len(rows.value)) if rows.margin is None else rows.margin
     chosen = np.arange(len(rows.value))
     if not model.carried:  # a row that the step cannot lift over its bound is none of it

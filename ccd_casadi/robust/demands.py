@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import dataclass
 
-from ccd_casadi.analysis.move_limits import LIMITS, WINDOW, MoveLimits
+from ccd_casadi.analysis.move_limits import LIMITS, MoveLimits
 from ccd_casadi.support.options import positive, valued
 
 
@@ -30,7 +30,7 @@ class Demands:
     sensor: float = 1.0
     disturbance: float = 1.0
     limits: MoveLimits = LIMITS
-    window: float = WINDOW
+    window: float = LIMITS.window
     axis: int = 0
 
 

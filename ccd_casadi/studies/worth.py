@@ -34,8 +34,8 @@ from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics
 from ccd_casadi.reporting.facts import cost_words, theta_words
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.studies.steepest_descent import baseline_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback

@@ -9,7 +9,7 @@ from oracles.helpers import HZ, few, problem
 from test_kinks import pieces
 
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
+from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.optim import kkt
 from ccd_casadi.optim import pieces as of_pieces
@@ -115,7 +115,7 @@ def test_a_failed_programme_is_no_optimum_on_kinks(failing, count: int) -> None:
     start = np.array([60.0, 66.0, *np.log([500.0 * HZ, 45.0 * HZ])])
     failing(count)
     end = descend(quantities, start, steps=40)
-    assert TrueDesign(quantities, end).kkt.stationarity <= SMOOTH
+    assert TrueDesign(quantities, end).kkt.stationarity <= LiftedKktOptions().smooth
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -32,11 +32,11 @@ from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.limitations.limits import discs
-from ccd_casadi.limitations.multiplier import Basis
+from ccd_casadi.limitations.multiplier import MultiplierBasis
 from ccd_casadi.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.robustness import main as robustness_main
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.text import HZ, number
 from ccd_casadi.synthesis.closed_loop import measure
@@ -148,7 +148,7 @@ def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_
         centres, radii = discs(limits, v, v, bandwidth)
         share = (np.abs(T - centres) / radii)[:, below].max()
         assert 0.5 < share < 1.0 + 1e-3
-        basis = Basis((0.5 * at, 2.0 * at, 2.0 * at), (), 10.0 * at, 1, limits.beyond)
+        basis = MultiplierBasis((0.5 * at, 2.0 * at, 2.0 * at), (), 10.0 * at, 1, limits.beyond)
         h = basis.values(v)
         seen = np.trapezoid((h * T[:, None]).real, v, axis=0)
         assert np.abs(seen).max() < 1e-3 * np.trapezoid(np.abs(h * T[:, None]), v, axis=0).max()

@@ -16,8 +16,9 @@ from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE, Proof, ProofOutcome
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
-from ccd_casadi.synthesis.second_engine import AGREEMENT, compared, second_opinion
+from ccd_casadi.synthesis.second_engine import SecondEngineOptions, compared, second_opinion
 
+AGREEMENT = SecondEngineOptions().agreement
 WIDE = replace(BOUNDS, S_max=50.0, weighted_level=1e6, compliance_max=1.0)
 
 

@@ -21,7 +21,7 @@ from ccd_casadi.gap import main
 from ccd_casadi.inner_problem.problem import best_choice, scaled_plant
 from ccd_casadi.limitations.bound import lower_bound, rules_out, support, support_of, upper_bound
 from ccd_casadi.limitations.limits import circle, discs, limits_of, ratio, response_of
-from ccd_casadi.limitations.multiplier import Basis
+from ccd_casadi.limitations.multiplier import MultiplierBasis
 from ccd_casadi.limitations.of_problem import (
     gap_of,
     limits_of_problem,
@@ -37,7 +37,8 @@ from ccd_casadi.synthesis.synthesis import synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 ROOT = Path(__file__).resolve().parents[2]
-BASIS = Basis((3.0, 3.0, 0.5), (0.1 + 2.0j, 0.3 + 7.0j), 20.0, 1, (5.0 + 1.0j, 5.0 - 1.0j))
+PAIRS = (0.1 + 2.0j, 0.3 + 7.0j)
+BASIS = MultiplierBasis((3.0, 3.0, 0.5), PAIRS, 20.0, 1, (5.0 + 1.0j, 5.0 - 1.0j))
 finite = st.floats(-3.0, 3.0)
 
 
@@ -205,7 +206,7 @@ def test_no_multiplier_forbids_what_a_controller_does() -> None:
     reached = lower_bound(limits, most)
     assert 0.0 < reached < most
     start = np.geomspace(1e-2, 1e3, 200)
-    basis = Basis((10.0,) * 12, (), 100.0, 1, limits.beyond)
+    basis = MultiplierBasis((10.0,) * 12, (), 100.0, 1, limits.beyond)
     for _ in range(30):
         assert not rules_out(limits, basis, rng.normal(size=12), 0.99 * reached, start)
 
