@@ -24,7 +24,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.box_proof import SLACK_OF_MANY, prove
+from ccd_casadi.fixed_structure.box_proof import BoxProofOptions, prove
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
@@ -169,7 +169,7 @@ def main() -> None:
             top += list(zip(judge.peaks(points).tolist(), points, strict=True))
         top.sort(key=lambda item: -item[0])
         climbed = max([judge.climbed(point) for _, point in top[: given.climbs]], default=np.nan)
-        limit = 1.0 + SLACK_OF_MANY
+        limit = 1.0 + BoxProofOptions.slack_of_many
         refuted = sum(value > limit for value, _ in top) + (climbed > limit)
         print(f"option {option}: a figure of {len(top)} draws is {top[0][0]:.4f} of its bound at "
               f"most, of climbs {climbed:.4f}, proven {limit:.4f}: {refuted} refute it",

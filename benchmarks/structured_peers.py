@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ccd_casadi.fixed_structure import synthesise_sections
-from ccd_casadi.fixed_structure.design import MARGIN, DesignSearch, _pool, problem_for
+from ccd_casadi.fixed_structure.design import DesignOptions, DesignSearch, _pool, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
@@ -100,7 +100,7 @@ def by_slsqp(problem: LoopProblem, start: Point, until: float) -> Point | None:
     kappa = np.clip(best[:-1], *problem.box)
     end = Point(kappa, float(best[-1]), assess(problem, kappa, float(best[-1])))
     stable = end.assessment.stable
-    return at_its_bandwidth(problem, kappa, end.tau, MARGIN) if stable else None
+    return at_its_bandwidth(problem, kappa, end.tau, DesignOptions.margin) if stable else None
 
 
 def peer(

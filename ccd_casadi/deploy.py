@@ -53,7 +53,8 @@ def main(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import with_verdict_line
-    from ccd_casadi.deployment import files, source_code
+    from ccd_casadi.deployment import source_code
+    from ccd_casadi.deployment.deploy_files import DESIGN_FILES, write_files
     from ccd_casadi.deployment.on_hardware import Electronics, on_hardware
     from ccd_casadi.deployment.outcome import deployed_line
     from ccd_casadi.deployment.pipeline import deploy
@@ -91,9 +92,9 @@ def main(options: argparse.Namespace) -> ExitCode:
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
-    for name in (*files.DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, source_code.FILE):
+    for name in (*DESIGN_FILES, *source_code.C_FILES, source_code.ST_FILE, source_code.FILE):
         (folder / name).unlink(missing_ok=True)
-    files.write_files(folder, finished, found, options.seed, moved)
+    write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
         K, name = found.realisation, run_name(options.run)
         kind = kind_of(finished.problem).title

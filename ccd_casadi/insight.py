@@ -16,12 +16,12 @@ from ccd_casadi.support.terminal import inform
 @command(
     "ccd_casadi.insight", "Trade hardware cost against bandwidth.",
     valued("--points", "N", integer(2, 9999), "most points on the front", 20),
-    SCHEDULER, needs=["ccd_casadi.codesign.insight"], place=RUN,
+    SCHEDULER, needs=["ccd_casadi.codesign.pareto"], place=RUN,
 )  # fmt: skip
 def main(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.insight import insight_dict, pareto_front
+    from ccd_casadi.codesign.pareto import insight_dict, pareto_front
     from ccd_casadi.codesign.run import outer_of
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler

@@ -25,6 +25,7 @@ from ccd_casadi.support.terminal import inform, say
            help="of a measured plant (default: by the slope of the first lines)"),
     option("--least-damping", metavar="X", type=positive,
            help="damping ratio of a resonance that lines may hide, at least (default: 0.0005)"),
+    option("--rotary", action="store_true", help="the plant's output is in rad, its input in N m"),
     needs=["ccd_casadi.studies.tuning"],
     place=RUN | {"metavar": "DATA", "nargs": "+", "help": "responses (.csv, .mat, .npz) or models "
                  "(.mat with A, B, C, D); several are one set"},
@@ -56,7 +57,7 @@ def main(options: argparse.Namespace) -> ExitCode:
             options.run, rate_hz=options.rate_hz, delay=options.delay, S_max=options.s_max,
             shape=options.shape, effort=options.effort, structure=structure, seed=options.seed,
             unstable_poles=options.unstable_poles, poles_at_zero=options.poles_at_zero,
-            least_damping=options.least_damping,
+            least_damping=options.least_damping, rotary=options.rotary,
             progress=lambda words: inform(words, sys.stderr),
             workers=workers,
         )  # fmt: skip

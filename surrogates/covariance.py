@@ -81,14 +81,29 @@ def covariance(
     gradients_of_a: bool = False,
     gradients_of_b: bool = False,
 ) -> Array:
-    """Return the covariance at σ² = 1 of values, and gradients if asked, at A and B.
+    """The covariance at σ² = 1 of values, and of gradients where required, at A and B.
 
     With z = (a - b) / lengths the blocks are
     cov(f_a, f_b) = φ, cov(f_a, ∂_j f_b) = -2 z_j φ' / l_j,
     cov(∂_i f_a, f_b) = 2 z_i φ' / l_i,
     cov(∂_i f_a, ∂_j f_b) = -(2 δ_ij φ' + 4 z_i z_j φ'') / (l_i l_j).
     Rows and columns are ordered by component: all values, all ∂_1, all ∂_2, ...
-    Shape (a or a (1 + d), b or b (1 + d)).
+
+    Parameters
+    ----------
+    kernel : Kernel
+        The family.
+    A, B : (a, d), (b, d) array
+        Points of the unit box.
+    length_scales : (d,) array
+        Fractions of the box.
+    gradients_of_a, gradients_of_b : bool
+        Whether rows, and columns, of gradients are included.
+
+    Returns
+    -------
+    (a or a (1 + d), b or b (1 + d)) array
+        Scaled units.
     """
     z = separations(A, B, length_scales)
     phi = radial(kernel, np.einsum("jab,jab->ab", z, z), int(gradients_of_a) + int(gradients_of_b))
@@ -134,16 +149,6 @@ def observed_covariance(
     return K
 
 
-# Scaled units. Samples of a unit box do not tell shorter length scales apart, nor longer
-# ones from that of an input without influence (a bound of 100 costs a tenth in error on
-# the OTL circuit function); a signal far above the sample variance is what smooth
-# functions ask for.
-LENGTH_BOUNDS = (1e-2, 1e3)
-SIGNAL_BOUNDS = (1e-3, 1e6)
-NOISE_BOUNDS = (1e-12, 1e0)
-JITTERS = (0.0, *(10.0**k for k in range(-15, -5)))
-
-
 def factorise(
     kernel: Kernel,
     X: Array,
@@ -160,7 +165,8 @@ def factorise(
     """
     lengths = parameters.length_scales
     C = covariance(kernel, X, X, lengths, gradients_of_a=gradients, gradients_of_b=gradients)
-    for jitter in (j for j in JITTERS if j >= least):
+    jitters = (0.0, *(10.0**k for k in range(-15, -5)))
+    for jitter in (j for j in jitters if j >= least):
         K = observed_covariance(C, len(X), parameters, jitter, sample_noise)
         try:
             return cholesky(K, lower=True, overwrite_a=True), jitter

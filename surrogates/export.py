@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 
 from surrogates.covariance import ROOT5, Kernel
 from surrogates.files import write_whole
-from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
+from surrogates.gaussian_process import GaussianProcess
 
 SCHEMA = "surrogates/2"
 READABLE = (SCHEMA, "surrogates/1")
@@ -116,13 +116,6 @@ def _refuse(constant: str) -> float:
     raise ValueError(f"{constant} is not a number")
 
 
-# Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
-# polynomial of degree 9, whose remainder (√5 r)^10 · 10⁻⁵ is below 1e-20 there.
-NEAR = 1e-2
-# Added to s under the root of the odd terms, which start at r³: AD finds 0 · 1e15 and not 0 · inf.
-UNDER_ROOT = 1e-30
-
-
 def to_casadi(
     surrogate: GaussianProcess | Sequence[GaussianProcess],
     name: str = "surrogate",
@@ -188,22 +181,28 @@ def expression(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ..
     factor = process.factor
     half = p.signal_variance * solve_triangular(factor, np.eye(len(factor)), lower=True)
     variance = p.signal_variance - ca.sumsqr(ca.mtimes(ca.DM(half), k))
-    floor = VARIANCE_FLOOR * p.signal_variance
+    floor = process.variance_floor * p.signal_variance
     return mean, process.band * process.output_scale * ca.sqrt(ca.fmax(variance, floor))
 
 
-def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:
+def radial_expression(
+    kernel: Kernel, s: ca.MX, order: int, close: float = 1e-2, offset: float = 1e-30
+) -> list[ca.MX]:
     """Return [φ, φ'](s) up to `order` <= 1, differentiable twice at s = 0 as well.
 
     AD differentiates r = √s as 1/(2r): at a sample that is 0 · inf, and just beside
     it the 1 - 1 that cancels in φ' is divided by r and by r³. So near a sample the
     Matérn kernel is its Taylor polynomial in s and s^(m/2), where nothing cancels,
     and the closed form is kept off zero by fmax, whose derivative there is 0.
+
+    `close`, in length scales: below it the Taylor polynomial is of degree 9, whose remainder
+    (√5 r)^10 · 10⁻⁵ is below 1e-20 there. `offset` is added to s under the root of the odd terms,
+    which start at r³: AD finds 0 · 1e15 and not 0 · inf.
     """
     if kernel is Kernel.RBF:
         e = ca.exp(-0.5 * s)
         return [e, -0.5 * e][: order + 1]
-    far, near = ca.fmax(s, NEAR**2), ca.sqrt(s + UNDER_ROOT)
+    far, near = ca.fmax(s, close**2), ca.sqrt(s + offset)
     r = ca.sqrt(far)
     e = ca.exp(-ROOT5 * r)
     closed = [(1.0 + ROOT5 * r + (5.0 / 3.0) * far) * e, (-5.0 / 6.0) * (1.0 + ROOT5 * r) * e]
@@ -214,7 +213,7 @@ def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:
     c1 = [0.5 * (m + 2) * c[m + 2] for m in range(len(c) - 2)]
     taylor = [even_odd(c, 5, s, near), even_odd(c1, 3, s, near)]
     return [
-        ca.if_else(s < NEAR**2, inner, outer)
+        ca.if_else(s < close**2, inner, outer)
         for inner, outer in zip(taylor[: order + 1], closed, strict=False)
     ]
 

@@ -11,13 +11,22 @@ LOCAL = ("*.sqlite", "*.sqlite-wal", "*.sqlite-shm")  # copied otherwise
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Replace a file in one step, text as UTF-8: a kill or a full disk leaves the old one.
+    """Replace a file in one step: a kill or a full disk leaves the old one.
 
-    Raises:
-        OSError: the folder cannot be written, or the disk is full.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    content : str or bytes
+        Text as UTF-8.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written, or the disk is full.
     """
-    # In the same folder, since a rename is atomic only within one file system; under a name of
-    # its own, since several jobs may write the same file.
+    # In the same folder, since a rename is atomic only within one file system; under a name that
+    # no other job has, since several may write the same file.
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         with draft.open("wb") as stream:
@@ -30,14 +39,19 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def copy_run(run: Path, out: Path) -> None:
-    """Copy a run folder to `out`, unless something is there already: then it is gone on with.
+    """Copy a run folder, unless something is there already, which is then resumed.
 
     Databases go by SQLite's own backup, whole even in the middle of a transaction and while
     somebody writes into them.
+
+    Parameters
+    ----------
+    run, out : Path
+        From where, and to where.
     """
     if out.exists() and any(out.iterdir()):
         return
-    draft = out.with_name(out.name + ".part")  # a kill must not leave half a run to go on with
+    draft = out.with_name(out.name + ".part")  # a kill must not leave half a run
     shutil.rmtree(draft, ignore_errors=True)
     shutil.copytree(run, draft, ignore=shutil.ignore_patterns(*LOCAL))
     for path in run.glob("*.sqlite"):

@@ -2,38 +2,69 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError
 
-from surrogates.covariance import (
-    LENGTH_BOUNDS,
-    NOISE_BOUNDS,
-    SIGNAL_BOUNDS,
-    Hyperparameters,
-    Kernel,
-    log_likelihood,
-)
+from surrogates.covariance import Hyperparameters, Kernel, log_likelihood
 from surrogates.gaussian_process import GaussianProcess, conditioned, loo_errors
 from surrogates.samples import Array, Samples, SurrogateFitError, checked
 
 Noise = ArrayLike | None
-# Observations that an exact process holds: 200 MB and some ten seconds to factorise.
-EXACT_LIMIT = 5000
-# The likelihood costs O(N³) a look. Several starts are tried on at most START_ORDER
-# observations, the best polished on at most POLISH_ORDER: hyperparameters hardly
-# move beyond that, while all samples are kept in the process itself.
-START_ORDER = 200
-POLISH_ORDER = 600
-# Relative jitter during the search, so that no trial point is lost to rounding.
-SEARCH_JITTER = 1e-15
-SINGULAR = 1e10  # -log p where K is: a wall, flat, so that the line search backs off
-LEAST_TO_CALIBRATE = 5  # samples: fewer left out say nothing of how a function goes on
-REFITTED, FOLDS = 100, 8  # observations up to which samples are left out of fits; these parts
-NORMAL_SHARES = (0.6827, 0.9545, 0.9973)  # within 1, 2 and 3 deviations
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Numbers of a fit.
+
+    Attributes
+    ----------
+    most_observations : int
+        That an exact process holds: 200 MB and some ten seconds to factorise.
+    start_observations, polish_observations : int
+        The likelihood costs O(N³) an evaluation: several starts are tried on the first number, the
+        best is polished on the second. Hyperparameters hardly move beyond that.
+    search_jitter : float
+        Relative, during the search, so that no trial point is lost to rounding.
+    singular : float
+        -log p where K is singular: flat, so that the line search backs off.
+    length_bounds, signal_bounds, noise_bounds : (float, float)
+        Of hyperparameters, scaled units. Samples of a unit box do not distinguish shorter length
+        scales, nor longer ones from that of an input without influence (a bound of 100 costs a
+        tenth in error on the OTL circuit function); smooth functions need a signal far above the
+        sample variance.
+    """
+
+    most_observations: int = 5000
+    start_observations: int = 200
+    polish_observations: int = 600
+    search_jitter: float = 1e-15
+    singular: float = 1e10
+    length_bounds: tuple[float, float] = (1e-2, 1e3)
+    signal_bounds: tuple[float, float] = (1e-3, 1e6)
+    noise_bounds: tuple[float, float] = (1e-12, 1e0)
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Numbers of the calibration of deviations.
+
+    Attributes
+    ----------
+    least_samples : int
+        Fewer left out do not show how a function continues.
+    refitted : int
+        Observations up to which samples are left out of fits.
+    folds : int
+        In this number of parts.
+    """
+
+    least_samples: int = 5
+    refitted: int = 100
+    folds: int = 8
 
 
 def fit(
@@ -47,6 +78,7 @@ def fit(
     noise: Noise = None,
     seed: int = 0,
     starts: int = 5,
+    options: FitOptions = FitOptions(),
 ) -> GaussianProcess:
     """Fit a process to samples of one output, with gradients if there are any.
 
@@ -64,6 +96,8 @@ def fit(
         Standard deviation of Y, in output units; 0 interpolates, None estimates it.
     seed, starts : int
         Of the search for hyperparameters.
+    options : FitOptions
+        Numbers of the method.
 
     Returns
     -------
@@ -84,12 +118,12 @@ def fit(
     except ValueError:
         known = ", ".join(Kernel)
         raise SurrogateFitError(f"unknown kernel {kernel!r}; it is one of: {known}") from None
-    if samples.observations > EXACT_LIMIT:
+    if samples.observations > options.most_observations:
         raise SurrogateFitError(
-            f"{samples.observations} observations are more than the {EXACT_LIMIT} an exact "
-            "Gaussian process holds: take fewer samples, or leave gradients out"
+            f"{samples.observations} observations are more than the {options.most_observations} "
+            "an exact Gaussian process holds: take fewer samples, or leave gradients out"
         )
-    parameters = estimate(samples, family, seed, starts)
+    parameters = estimate(samples, family, seed, starts, options)
     return calibrated(conditioned(parameters, samples, family, uneven_noise(samples)))
 
 
@@ -136,11 +170,13 @@ def fit_outputs(
     return tuple(fit(X, y, slope, kernel=kernel, noise=own, **options) for y, slope, own in each)
 
 
-def estimate(samples: Samples, kernel: Kernel, seed: int, starts: int) -> Hyperparameters:
+def estimate(
+    samples: Samples, kernel: Kernel, seed: int, starts: int, options: FitOptions = FitOptions()
+) -> Hyperparameters:
     """Return the hyperparameters that maximise log p(Y, dY | X) (R & W eq. 5.8).
 
     Length scales, signal and, where it is not given, noise variance, from `starts` seeded starts on
-    at most 600 of the observations; that of gradients is estimated always.
+    at most `polish_observations`; that of gradients is estimated always.
     """
     from scipy.optimize import minimize  # slow to import, and only fitting needs it
 
@@ -150,8 +186,9 @@ def estimate(samples: Samples, kernel: Kernel, seed: int, starts: int) -> Hyperp
         fixed[0] = 0.0 if own.size else float(samples.noise_variances[0])
     rng, X = np.random.default_rng(seed), samples.unit
     n, d = X.shape
-    bounds = [LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS]
-    bounds += [NOISE_BOUNDS if noise is None else (max(noise, 1e-300),) * 2 for noise in fixed]
+    bounds = [options.length_bounds] * d + [options.signal_bounds]
+    free = options.noise_bounds
+    bounds += [free if noise is None else (max(noise, 1e-300),) * 2 for noise in fixed]
     limits = np.log(bounds)
     order = rng.permutation(n)
     by_component = samples.targets.reshape(-1, n)
@@ -166,10 +203,10 @@ def estimate(samples: Samples, kernel: Kernel, seed: int, starts: int) -> Hyperp
             parameters = _parameters(np.exp(logarithms))
             try:
                 value, slope = log_likelihood(
-                    kernel, X[rows], observed, parameters, SEARCH_JITTER, own_here
+                    kernel, X[rows], observed, parameters, options.search_jitter, own_here
                 )
             except LinAlgError:
-                return SINGULAR, np.zeros_like(logarithms)
+                return options.singular, np.zeros_like(logarithms)
             return -value, -slope
 
         ends = [
@@ -185,9 +222,9 @@ def estimate(samples: Samples, kernel: Kernel, seed: int, starts: int) -> Hyperp
     first = np.array([0.5] * d + [1.0, 1e-6, 1e-6])
     spread = np.array([4.0] * d + [10.0, 100.0, 100.0])
     drawn = [first * spread ** rng.uniform(-1.0, 1.0, d + 3) for _ in range(starts - 2)]
-    natural = search([first, 10.0 * first, *drawn][:starts], START_ORDER, 100)
-    if samples.observations > START_ORDER:
-        natural = search([natural], POLISH_ORDER, 60)
+    natural = search([first, 10.0 * first, *drawn][:starts], options.start_observations, 100)
+    if samples.observations > options.start_observations:
+        natural = search([natural], options.polish_observations, 60)
     for place, known in enumerate(fixed, d + 1):
         if known is not None:  # exactly, and 0 too
             natural[place] = known
@@ -207,7 +244,11 @@ def _parameters(natural: Array) -> Hyperparameters:
     return Hyperparameters(natural[:-3], signal, noise, gradient_noise)
 
 
-def calibrated(process: GaussianProcess, misses: Array | None = None) -> GaussianProcess:
+def calibrated(
+    process: GaussianProcess,
+    misses: Array | None = None,
+    options: CalibrationOptions = CalibrationOptions(),
+) -> GaussianProcess:
     """Return the process with its deviation stretched until its samples fit in their bands.
 
     Each of n samples is left out in turn: z_i = |y_i - μ_{-i}|/σ_{-i}, the `misses` where these are
@@ -217,35 +258,66 @@ def calibrated(process: GaussianProcess, misses: Array | None = None) -> Gaussia
         band = max(1, z_(⌈(n + 1) p_k⌉)/k,  k = 1, 2, 3),   p_k of k deviations of a normal one,
 
     the largest z where n is too small for p_k. It never narrows, the samples being few.
+
+    Parameters
+    ----------
+    process : GaussianProcess
+        Of n samples.
+    misses : (n,) array
+        z, where they are known.
+    options : CalibrationOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    GaussianProcess
+        With its `band`.
     """
     n = len(process.X)
-    if n < LEAST_TO_CALIBRATE:
+    if n < options.least_samples:
         return process
     if misses is None:
         residuals, deviations = loo_errors(process)
         misses = np.abs(residuals) / deviations
     z = np.sort(misses)
-    places = [min(math.ceil((n + 1) * share), n) - 1 for share in NORMAL_SHARES]
+    places = [min(math.ceil((n + 1) * share), n) - 1 for share in (0.6827, 0.9545, 0.9973)]
     ratios = [z[place] / k for k, place in enumerate(places, 1)]
     return replace(process, band=max(1.0, *map(float, ratios)))
 
 
-def recalibrated(process: GaussianProcess, seed: int = 0) -> GaussianProcess:
-    """Return the process with the band of samples that are left out of fits, in `FOLDS` parts.
+def recalibrated(
+    process: GaussianProcess, seed: int = 0, options: CalibrationOptions = CalibrationOptions()
+) -> GaussianProcess:
+    """Return the process with the band of samples that are left out of fits, in parts.
 
     Hyperparameters that were found with a sample know it: kept, as `calibrated` alone keeps them,
     they make few samples much surer of themselves than fresh points bear out. It takes as many
     fits; the process as it is where it has so many observations that this matters little.
+
+    Parameters
+    ----------
+    process : GaussianProcess
+        With its samples.
+    seed : int
+        Of the parts and the fits.
+    options : CalibrationOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    GaussianProcess
+        With its `band`.
     """
     n = len(process.X)
-    if process.targets.size > REFITTED or n < LEAST_TO_CALIBRATE or process.sample_noise.size:
+    few = process.targets.size <= options.refitted and n >= options.least_samples
+    if not few or process.sample_noise.size:
         return process
     width, scaled = process.upper - process.lower, process.targets.reshape(-1, n)
     noise = process.output_scale * math.sqrt(process.hyperparameters.noise_variance)
     X, Y = process.lower + width * process.X, process.output_mean + process.output_scale * scaled[0]
     dY = process.output_scale * scaled[1:].T / width if len(scaled) > 1 else None
-    fold, misses = np.random.default_rng(seed).permutation(n) % FOLDS, np.empty(n)
-    for number in range(FOLDS):
+    fold, misses = np.random.default_rng(seed).permutation(n) % options.folds, np.empty(n)
+    for number in range(options.folds):
         out = fold == number
         part = checked(X[~out], Y[~out], process.lower, process.upper,
                        None if dY is None else dY[~out], noise)  # fmt: skip
@@ -253,4 +325,4 @@ def recalibrated(process: GaussianProcess, seed: int = 0) -> GaussianProcess:
         other = conditioned(hyperparameters, part, process.kernel, np.empty(0))
         mean, deviation = other.predict(X[out], return_std=True)
         misses[out] = np.abs(Y[out] - mean) / deviation
-    return calibrated(process, misses)
+    return calibrated(process, misses, options)

@@ -6,7 +6,7 @@ algorithm 2.1 (prediction), section 9.4 (derivatives), eq. 5.12 (leave one out).
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, overload
+from typing import ClassVar, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,10 +15,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from surrogates.covariance import Hyperparameters, Kernel, covariance, factorise, symmetric_inverse
 from surrogates.samples import Array, Errors, Samples, box, checked, errors, freeze
 
-# Rounding leaves the predictive variance at noise-free samples anywhere within a
-# few eps of zero, of either sign; below this share of σ² it is taken as the floor.
-VARIANCE_FLOOR = 1e-20
-TWO_SIDED_95 = 1.959963984540054
+TWO_SIDED_95 = 1.959963984540054  # standard deviations: quantile 0.975 of the normal distribution
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +40,10 @@ class GaussianProcess:
         Scaled variances (n,) of samples that differ in their noise, on top of the one in the
         hyperparameters, else empty; factor on the deviation that `fitting.calibrated` found.
     """
+
+    # Rounding leaves the predictive variance at noise-free samples anywhere within a few eps of
+    # zero, of either sign; below this share of σ² it is taken as the floor.
+    variance_floor: ClassVar[float] = 1e-20
 
     kernel: Kernel
     lower: Array
@@ -123,7 +124,7 @@ class GaussianProcess:
             return mean
         v = solve_triangular(self.factor, k.T, lower=True)
         variance = p.signal_variance - np.einsum("ab,ab->b", v, v)
-        floor = VARIANCE_FLOOR * p.signal_variance
+        floor = self.variance_floor * p.signal_variance
         return mean, self.band * self.output_scale * np.sqrt(np.maximum(variance, floor))
 
 
@@ -217,5 +218,5 @@ def loo_errors(process: GaussianProcess) -> tuple[Array, Array]:
     selected = np.linalg.inv(own)[:, 0, :]
     residuals = np.einsum("ai,ia->a", selected, process.weights.reshape(c, n))
     # Positive in exact arithmetic; a nearly singular K may round it below zero.
-    variance = np.maximum(selected[:, 0], VARIANCE_FLOOR)
+    variance = np.maximum(selected[:, 0], process.variance_floor)
     return process.output_scale * residuals, process.output_scale * np.sqrt(variance)

@@ -29,7 +29,18 @@ class _Package(ModuleType):
 
 
 def from_stub(package: str) -> list[str]:
-    """Give a package that is being imported the names of its stub; they are returned, sorted."""
+    """Give a package that is being imported the names of its stub.
+
+    Parameters
+    ----------
+    package : str
+        Its name, in `sys.modules`.
+
+    Returns
+    -------
+    list of str
+        The names, sorted.
+    """
     module = sys.modules[package]
     with open(f"{str(module.__file__).removesuffix('.py')}.pyi", encoding="utf-8") as stub:
         lines = [line.split() for line in stub if line.startswith("from ")]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,13 +10,16 @@ from numpy.typing import ArrayLike
 from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, loo_errors
 from surrogates.samples import Array, Errors, errors
 
-# Samples nearest to the point that enter the hull: those beyond seldom change it.
-NEAREST = 500
-# A point this many typical spacings outside the hull, or with this many times the
-# deviation that is met one spacing away from the samples, is not supported by them.
-SPACINGS = 1.0
-DEVIATIONS = 2.0
-OUTSIDE = 1e-9
+
+@dataclass(frozen=True)
+class ExtrapolationOptions:
+    """Limits beyond which samples do not support a point."""
+
+    nearest: int = 500  # samples nearest to it that enter the hull: others seldom change it
+    spacings: float = 1.0  # typical spacings outside of the hull
+    widest_gaps: float = 2.0  # between samples: distance to the nearest
+    deviations: float = 2.0  # over the deviation that is met one spacing away from the samples
+    rounding: float = 1e-9  # outside of the unit box
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,12 @@ class Extrapolation:
         return bool(self.reasons)
 
 
-def extrapolation(surrogate: GaussianProcess, X: ArrayLike, x: ArrayLike) -> Extrapolation:
+def extrapolation(
+    surrogate: GaussianProcess,
+    X: ArrayLike,
+    x: ArrayLike,
+    options: ExtrapolationOptions = ExtrapolationOptions(),
+) -> Extrapolation:
     """Compare a point with the samples that a surrogate was fitted to.
 
     Flagged are points outside the box, further outside the convex hull of the samples
@@ -62,6 +71,8 @@ def extrapolation(surrogate: GaussianProcess, X: ArrayLike, x: ArrayLike) -> Ext
         Its samples, in input units.
     x : array (d,)
         The point.
+    options : ExtrapolationOptions
+        Numbers of the method.
 
     Returns
     -------
@@ -81,29 +92,29 @@ def extrapolation(surrogate: GaussianProcess, X: ArrayLike, x: ArrayLike) -> Ext
     spacing = float(np.median(near))
     distances = np.linalg.norm(samples - point, axis=1)
     nearest = float(distances.min())
-    hull = hull_distance(samples[np.argsort(distances)[:NEAREST]], point)
+    hull = hull_distance(samples[np.argsort(distances)[: options.nearest]], point)
     reasons = []
-    beyond = np.flatnonzero((point < -OUTSIDE) | (point > 1.0 + OUTSIDE))
+    beyond = np.flatnonzero((point < -options.rounding) | (point > 1.0 + options.rounding))
     if beyond.size:
         reasons.append(f"input {', '.join(map(str, beyond))} is outside the sampled box")
-    if hull > SPACINGS * spacing:
+    if hull > options.spacings * spacing:
         reasons.append(
             f"the point lies {hull:.3g} box widths outside the hull of the samples, which are "
             f"{spacing:.3g} apart"
         )
-    if nearest > 2.0 * float(near.max()):
+    if nearest > options.widest_gaps * float(near.max()):
         reasons.append(
             f"the nearest sample is {nearest:.3g} box widths away, where samples are "
             f"{spacing:.3g} apart"
         )
     rng = np.random.default_rng(0)
-    step = rng.standard_normal(samples[:NEAREST].shape)
+    step = rng.standard_normal(samples[: options.nearest].shape)
     step *= spacing / np.linalg.norm(step, axis=1, keepdims=True)
-    around = low + span * np.clip(samples[:NEAREST] + step, 0.0, 1.0)
+    around = low + span * np.clip(samples[: options.nearest] + step, 0.0, 1.0)
     usual = float(np.quantile(surrogate.predict(around, return_std=True)[1], 0.95))
     here = float(surrogate.predict(low + span * point, return_std=True)[1][0])
     deviation = here / usual if usual > 0.0 else None
-    if deviation is not None and deviation > DEVIATIONS:
+    if deviation is not None and deviation > options.deviations:
         reasons.append(
             f"the predicted deviation is {deviation:.3g} times what is usual "
             "one spacing from a sample"
@@ -120,22 +131,25 @@ def hull_distance(samples: Array, point: Array) -> float:
     """
     from scipy.optimize import nnls  # 0.3 s to import
 
-    # The sum as one more, heavy equation; what it is missed by is mended afterwards.
+    # The sum as one more, heavy equation; what it is missed by is corrected afterwards.
     heavy = 1e3
     A = np.vstack([samples.T, np.full(len(samples), heavy)])
     w, _ = nnls(A, np.append(point, heavy))
     return float(np.linalg.norm(samples.T @ (w / w.sum()) - point))
 
 
-# Q² of left-out samples above which the surrogate follows them, and below which it does poorly.
-FOLLOWED = 0.995
-POOR = 0.9
-# A sample this close to the point of interest (share of the box) is that point. Left out, it may be
-# off by so many of its deviations, or by so much of the samples' range, before the others miss it.
-SAME = 1e-6
-SIGMAS = 3.0
-SHARE = 1e-3
-NEAR = 0.05  # share of the box: samples this close to the point of interest are around it
+@dataclass(frozen=True)
+class QualityOptions:
+    """Limits of the quality of a surrogate."""
+
+    followed: float = 0.995  # Q² of left-out samples above which the surrogate follows them
+    poor: float = 0.9  # below which it does poorly
+    same: float = 1e-6  # of the box: a sample this close to the point of interest is that point
+    near: float = 0.05  # of the box: samples this close are around it
+    # Left out, such a sample may be off by this many of its deviations, or by this share of the
+    # samples' range, before the others miss it.
+    sigmas: float = 3.0
+    share: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -168,6 +182,8 @@ class Quality:
     .. [1] Rasmussen & Williams (2006), 5.4.2.
     """
 
+    options: ClassVar[QualityOptions] = QualityOptions()
+
     name: str
     unit: str
     true: Array
@@ -187,7 +203,8 @@ class Quality:
     def missed(self) -> Missed | None:
         """The worst sample at or around the point that the others miss by more than they say."""
         span = 100.0 if self.unit == "%" else float(np.ptp(self.true))
-        bad = [m for m in self.around if m.sigmas > SIGMAS and abs(m.error) > SHARE * span]
+        sigmas, least = self.options.sigmas, self.options.share * span
+        bad = [m for m in self.around if m.sigmas > sigmas and abs(m.error) > least]
         return max(bad, key=lambda m: (m.at_point, abs(m.error)), default=None)
 
     @property
@@ -197,7 +214,7 @@ class Quality:
             return self.unsupported
         most = max((abs(m.error) for m in self.around), default=0.0)
         sigmas = max((m.sigmas for m in self.around), default=0.0)
-        if sigmas <= SIGMAS:
+        if sigmas <= self.options.sigmas:
             return "supported"
         return (
             f"supported to {most:.2g} {self.unit}, but bands too narrow ({sigmas:.0f} deviations)"
@@ -206,12 +223,12 @@ class Quality:
     @property
     def poor(self) -> bool:
         """Whether left-out samples are predicted too badly to speak of support."""
-        return not self.loo.q2 >= POOR
+        return not self.loo.q2 >= self.options.poor
 
     @property
     def followed(self) -> bool:
         """Whether one smooth surrogate suits the samples."""
-        return self.loo.q2 >= FOLLOWED
+        return self.loo.q2 >= self.options.followed
 
     @property
     def samples_are(self) -> str:
@@ -274,8 +291,8 @@ def quality_of(
     around = tuple(
         # By the deviations before they were stretched: a wide band excuses no error here.
         Missed(float(factor * residuals[i]), float(abs(residuals[i] / deviations[i])),
-               bool(away[i] <= SAME))
-        for i in np.flatnonzero(away <= NEAR)
+               bool(away[i] <= Quality.options.same))
+        for i in np.flatnonzero(away <= Quality.options.near)
     )  # fmt: skip
     return Quality(
         name=name,

@@ -22,18 +22,67 @@ from ccd_casadi.synthesis.closed_loop import (
     least_of,
 )
 
-PERIODS = 160.0  # of ω_b that a step is followed for closely
-COARSER, FEWER = 16, 4  # times as far apart beyond, and as few
-LEFT = 1e-3  # of the slowest part of a loop that counts as at rest
-AROUND = 2.0 ** np.linspace(-1.0, 1.0, 201)  # ω/ω_b, 0.7 % apart
-PER_PERIOD = 100  # points of a continuous loop's step
-BAND = 0.02  # about its end, in which a step has settled
-SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
-OCTAVE = 0.1
-LIGHT = 0.1 * (1.0 - 1e-6)  # damping of a root of K worth a word within NEAR of ω_b; not a bound
-NEAR = 0.2
-BOUGHT = 0.03  # of ω_b that a dip of |S| is worth a word for
-RINGING = 0.05  # damping of a root of the loop within an octave of ω_b: 2 % left after 12 periods
+
+@dataclass(frozen=True)
+class LoopFigureOptions:
+    """Numbers of steps and warnings.
+
+    Attributes
+    ----------
+    periods : float
+        Of ω_b that a step is followed for closely.
+    coarser, fewer : int
+        Beyond, instants are this many times as far apart, and as few.
+    at_rest : float
+        Of the slowest part of a loop, what counts as at rest.
+    per_period : int
+        Points of a continuous loop's step in a period of ω_b.
+    band : float
+        About its end, in which a step has settled.
+    octaves : float
+        Above ω_b, within which growth of |S| is a warning.
+    growth : float
+        That growth.
+    dip : float
+        Of ω_b, that a dip of |S| adds: a warning.
+    light : float
+        Damping of a root of K within `near` of ω_b that is a warning; less than the bound 0.1.
+    near : float
+        Relative.
+    ringing : float
+        Damping of a root of the loop within an octave of ω_b: 2 % are left after 12 periods.
+    around : int
+        Points within an octave of ω_b, on both sides: 0.7 % apart.
+    """
+
+    periods: float = 160.0
+    coarser: int = 16
+    fewer: int = 4
+    at_rest: float = 1e-3
+    per_period: int = 100
+    band: float = 0.02
+    octaves: float = 0.1
+    growth: float = 1.5
+    dip: float = 0.03
+    light: float = 0.1 * (1.0 - 1e-6)
+    near: float = 0.2
+    ringing: float = 0.05
+    around: int = 201
+
+    @property
+    def closely(self) -> int:
+        """Instants that follow one another."""
+        return int(self.periods * self.per_period)
+
+    @property
+    def places(self) -> Array:
+        """ω/ω_b around the bandwidth."""
+        return np.asarray(2.0 ** np.linspace(-1.0, 1.0, self.around))
+
+    @property
+    def above(self) -> Array:
+        """ω/ω_b where growth of |S| is measured."""
+        return np.asarray(2.0 ** np.linspace(0.0, self.octaves, 30))
 
 
 @dataclass(frozen=True)
@@ -58,14 +107,17 @@ class ForceStep:
         return {"seconds": self.seconds, "plant": self.plant + 1, **pair}
 
 
-def until_rest(loop: Loop, longest: float, seconds: float, drives: Array) -> tuple[Array, Array]:
+def until_rest(
+    loop: Loop, longest: float, seconds: float, drives: Array,
+    options: LoopFigureOptions = LoopFigureOptions(),
+) -> tuple[Array, Array]:  # fmt: skip
     """Times (k,) in s and y (m, p, k) from rest under each of the constant inputs `drives` (n, m),
     B_r or B_d of the loop over `longest` s; exact at the instants.
 
-    The first `PERIODS` times `PER_PERIOD` instants follow one another; from there on, to `seconds`,
-    they are `COARSER` as far apart, and so on: what is fast has decayed by then.
+    The first instants follow one another, as the options have it; from there on, to `seconds`, they
+    are `coarser` times as far apart, and so on: what is fast has decayed by then.
     """
-    steps, count = loop.over_a_step(longest), int(PERIODS * PER_PERIOD)
+    steps, count = loop.over_a_step(longest), options.closely
     n, period, first = len(steps.A), steps.period or longest, 0
     P = np.eye(n + drives.shape[1])
     P[:n, :n], P[:n, n:] = steps.A, drives
@@ -77,84 +129,156 @@ def until_rest(loop: Loop, longest: float, seconds: float, drives: Array) -> tup
         found.append(y[:, :, first:])
         if period * count >= seconds:
             return np.concatenate(times), np.concatenate(found, axis=2)
-        reached, count = period * count, int(PERIODS * PER_PERIOD) // FEWER
-        P, period = np.linalg.matrix_power(P, COARSER), COARSER * period
+        reached, count = period * count, options.closely // options.fewer
+        P, period = np.linalg.matrix_power(P, options.coarser), options.coarser * period
         first = int(reached / period + 0.5) + 1
 
 
-def rest_time(loop: Loop) -> float:
-    """Seconds after which `LEFT` of the slowest part of a stable loop is left."""
-    return float(np.log(1.0 / LEFT) / max(-loop.poles.real.max(), 1e-300))
+def rest_time(loop: Loop, options: LoopFigureOptions = LoopFigureOptions()) -> float:
+    """Time after which a stable loop is at rest, by its slowest part.
+
+    Parameters
+    ----------
+    loop : Loop
+        Closed.
+    options : LoopFigureOptions
+        Which share of it is at rest.
+
+    Returns
+    -------
+    float
+        s.
+    """
+    return float(np.log(1.0 / options.at_rest) / max(-loop.poles.real.max(), 1e-300))
 
 
-def step_figures(loop: Loop, bandwidth: float) -> tuple[float, float]:
+def step_figures(
+    loop: Loop, bandwidth: float, options: LoopFigureOptions = LoopFigureOptions()
+) -> tuple[float, float]:
     """Of a unit step of each reference in turn the worst: the overshoot, and the last time outside
     2 % in s (inf: it ends there)."""
-    longest = HZ / bandwidth / PER_PERIOD
+    longest = HZ / bandwidth / options.per_period
     drives = loop.over_a_step(longest).B_r
-    times, found = until_rest(loop, longest, rest_time(loop), drives)
+    times, found = until_rest(loop, longest, rest_time(loop, options), drives, options)
     own = np.array([y[i] for i, y in enumerate(found)])
-    last = [np.flatnonzero(np.abs(y - 1.0) > BAND) for y in own]
+    last = [np.flatnonzero(np.abs(y - 1.0) > options.band) for y in own]
     ends = np.append(times, np.inf)
     settling = max(float(ends[outside[-1] + 1]) if len(outside) else 0.0 for outside in last)
     return float(own.max()) - 1.0, settling
 
 
-def force_response(loop: Loop, bandwidth: float, seconds: float) -> tuple[Array, Array]:
-    """`until_rest` after 1 N at each actuator, in m."""
-    longest = HZ / bandwidth / PER_PERIOD
-    return until_rest(loop, longest, seconds, loop.over_a_step(longest).B_d)
+def force_response(
+    loop: Loop, bandwidth: float, seconds: float,
+    options: LoopFigureOptions = LoopFigureOptions(),
+) -> tuple[Array, Array]:  # fmt: skip
+    """Displacement after a step of 1 N at each actuator in turn.
+
+    Parameters
+    ----------
+    loop : Loop
+        Closed, SI.
+    bandwidth, seconds : float
+        ω_b in rad/s, and how long.
+    options : LoopFigureOptions
+        Its instants.
+
+    Returns
+    -------
+    times, y : (k,), (m, p, k) array
+        s and m.
+    """
+    longest = HZ / bandwidth / options.per_period
+    return until_rest(loop, longest, seconds, loop.over_a_step(longest).B_d, options)
 
 
-def largest_force_step(loops: Sequence[Loop], bandwidth: float) -> ForceStep:
-    """Of every plant, actuator and output, until the loop is at rest."""
+def largest_force_step(
+    loops: Sequence[Loop], bandwidth: float, options: LoopFigureOptions = LoopFigureOptions()
+) -> ForceStep:
+    """The largest displacement by a step of 1 N, of every plant, actuator and output.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+        Closed and stable, SI, one for each plant.
+    bandwidth : float
+        ω_b in rad/s.
+    options : LoopFigureOptions
+        Instants, and when a loop is at rest.
+
+    Returns
+    -------
+    ForceStep
+        Until the loop is at rest.
+    """
     found = []
     for plant, loop in enumerate(loops):
-        times, y = force_response(loop, bandwidth, rest_time(loop))
+        times, y = force_response(loop, bandwidth, rest_time(loop, options), options)
         actuator, output, k = map(int, np.unravel_index(np.abs(y).argmax(), y.shape))
         size = abs(float(y[actuator, output, k]))
         found.append(ForceStep(size, float(times[k]), output, actuator, plant))
     return max(found, key=lambda step: step.size)
 
 
-def ringing(poles: np.ndarray, bandwidth: float) -> tuple[float, float] | None:
+def ringing(
+    poles: np.ndarray, bandwidth: float, least: float = LoopFigureOptions().ringing
+) -> tuple[float, float] | None:
     """Frequency in rad/s and damping of the least damped of `poles` within an octave of ω_b, if
-    that damping is below 0.05."""
+    that damping is below the `least`."""
     found = zip(*frequency_and_damping(poles), strict=True)
     near = [(float(w), float(d)) for w, d in found if bandwidth <= 2.0 * w <= 4.0 * bandwidth]
-    return min((root for root in near if root[1] < RINGING), key=lambda r: r[1], default=None)
+    return min((root for root in near if root[1] < least), key=lambda r: r[1], default=None)
 
 
-def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, float, str], ...]:
-    """Poles and zeros of K with damping below 0.1 within 20 % of ω_b, ascending."""
+def light_roots(
+    controller: StateSpace, bandwidth: float, options: LoopFigureOptions = LoopFigureOptions()
+) -> tuple[tuple[float, float, str], ...]:
+    """Poles and zeros of K that are lightly damped and near ω_b, ascending."""
     return tuple(sorted(
         (float(w), float(d), word)
         for word, roots in (("zero", controller.zeros(bandwidth)), ("pole", controller.poles))
         for w, d in zip(*frequency_and_damping(roots), strict=True)
-        if abs(w / bandwidth - 1.0) <= NEAR and abs(d) < LIGHT
+        if abs(w / bandwidth - 1.0) <= options.near and abs(d) < options.light
     ))  # fmt: skip
 
 
-def bandwidth_dip(loops: Sequence[Loop], bandwidth: float) -> float:
+def bandwidth_dip(
+    loops: Sequence[Loop], bandwidth: float, options: LoopFigureOptions = LoopFigureOptions()
+) -> float:
     """By which factor the largest σ_max(S) is above the line ω/(√2 ω_b) on both sides of it, within
     an octave; at least 1."""
-    return _dip([np.linalg.norm(one.sensitivity(bandwidth * AROUND), 2, (1, 2)) for one in loops])
+    places = bandwidth * options.places
+    return _dip([np.linalg.norm(one.sensitivity(places), 2, (1, 2)) for one in loops], options)
 
 
-def _dip(sizes: Sequence[Array]) -> float:
-    """The same of σ_max(S) of every loop `AROUND` ω_b.
+def _dip(sizes: Sequence[Array], options: LoopFigureOptions = LoopFigureOptions()) -> float:
+    """The same of σ_max(S) of every loop at the `places` around ω_b.
 
     A pair of a zero and a pole beside ω_b makes such a dip: without it ω_b is lower by about that
     factor. |S| that rises more slowly than ω throughout, or faster, has none.
     """
-    slope, middle = np.sqrt(2.0) * np.max(sizes, axis=0) / AROUND, len(AROUND) // 2
+    slope = np.sqrt(2.0) * np.max(sizes, axis=0) / options.places
+    middle = options.around // 2
     return max(1.0, min(float(slope[:middle].max()), float(slope[middle + 1 :].max())))
 
 
 def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> tuple[Array, Array]:
-    """Times (k,) in s and y (k, p) after a unit step of the reference in `direction` (p,).
+    """The response to a unit step of the reference, exact at the instants.
 
-    Exact at the instants: those of a sampled loop, or `points` of a continuous one.
+    Parameters
+    ----------
+    loop : Loop
+        Closed, SI.
+    direction : (p,) array
+        Of the reference.
+    seconds : float
+        How long.
+    points : int
+        Of a continuous loop; a sampled one has its own instants.
+
+    Returns
+    -------
+    times, y : (k,), (k, p) array
+        s and the unit of y.
     """
     steps = loop.over_a_step(seconds / (points - 1))
     count = points if loop.sampling is None else int(np.ceil(seconds / steps.period)) + 1
@@ -165,20 +289,21 @@ def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> 
 def loop_warnings(
     growth: float, dip: float, controller: StateSpace, bandwidth: float,
     rings: tuple[float, float] | None = None,
+    options: LoopFigureOptions = LoopFigureOptions(),
 ) -> list[str]:  # fmt: skip
-    """By name, what an engineer would not build: ω_b that is held by something narrow, or rings.
+    """What an engineer would not build, in words: ω_b that is held by something narrow, or rings.
 
     `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
     `dip`: as `bandwidth_dip` has it.
     """
     hz = bandwidth / HZ
     words = []
-    if growth > SHARP:
+    if growth > options.growth:
         words.append(
             f"|S| grows by a factor of {growth:.3g} within a tenth of an octave above "
             f"{hz:.4g} Hz: the bandwidth is held by something narrow"
         )
-    if dip > 1.0 + BOUGHT:
+    if dip > 1.0 + options.dip:
         words.append(
             f"|S|/frequency dips by {100.0 * (1.0 - 1.0 / dip):.2g} % at the bandwidth: a filter "
             f"there buys it, and {hz / dip:.4g} Hz would be left without"
@@ -186,7 +311,7 @@ def loop_warnings(
     words += [
         f"the controller has a {word} at {w / HZ:.4g} Hz with damping {d:.3g}, within 20 % of the "
         f"bandwidth"
-        for w, d, word in light_roots(controller, bandwidth)
+        for w, d, word in light_roots(controller, bandwidth, options)
     ]
     if rings is not None:
         words.append(
@@ -198,10 +323,28 @@ def loop_warnings(
 
 def measured_entry(
     loops: Sequence[tuple[Array, np.ndarray]], controller: StateSpace, bandwidth: float,
-    sensitivity_peak: float,
+    sensitivity_peak: float, options: LoopFigureOptions = LoopFigureOptions(),
 ) -> dict[str, Any]:  # fmt: skip
-    """The same of loops L (k,) known on lines ω (k,) in rad/s: between them ln|L| and its phase are
-    straight over ln ω. There are no steps."""
+    """As `loop_entry`, of loops that are known on lines of frequency; without steps.
+
+    Between lines ln|L| and its phase are straight over ln ω.
+
+    Parameters
+    ----------
+    loops : sequence of (ω, L)
+        (k,) in rad/s, and L (k,) there.
+    controller : StateSpace
+        SI.
+    bandwidth, sensitivity_peak : float
+        ω_b in rad/s, and ‖S‖∞.
+    options : LoopFigureOptions
+        Of steps and warnings.
+
+    Returns
+    -------
+    dict
+        Keys of result.json.
+    """
     margins, growth, sizes = [], 1.0, []
     for omega, L in loops:
         x, ln_L = np.log(omega), np.log(np.abs(L)) + 1j * np.unwrap(np.angle(L))
@@ -210,11 +353,13 @@ def measured_entry(
             return np.exp(np.interp(np.log(w), x, ln_L))
 
         margins.append(classical_margins(response, omega))
-        S = np.abs(1.0 / (1.0 + response(bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30))))
+        S = np.abs(1.0 / (1.0 + response(bandwidth * options.above)))
         growth = max(growth, float((S / S[0]).max()))
-        sizes.append(np.abs(1.0 / (1.0 + response(bandwidth * AROUND))))
+        sizes.append(np.abs(1.0 / (1.0 + response(bandwidth * options.places))))
     return _entry(least_of(margins), sensitivity_peak) | {
-        "loop_warnings": loop_warnings(growth, _dip(sizes), controller, bandwidth)
+        "loop_warnings": loop_warnings(
+            growth, _dip(sizes, options), controller, bandwidth, options=options
+        )
     }
 
 
@@ -239,28 +384,49 @@ def loop_entry(
     sampling: Sampling | None,
     bandwidth: float,
     sensitivity_peak: float,
+    options: LoopFigureOptions = LoopFigureOptions(),
 ) -> dict[str, Any]:
-    """Of a stable loop on every plant, the model first, under the keys of `result.json`; SI, ω_b
-    in rad/s. The least margins of all plants, with the crossover of the model, and 1/‖S‖∞ as the
-    modulus margin; the worst step of a reference where they are least, that of a force of all."""
+    """Margins, steps and warnings of a stable loop under the keys of result.json.
+
+    The least margins of all plants, with the crossover of the model, and 1/‖S‖∞ as the modulus
+    margin; the worst step of a reference where they are least, that of a force of all.
+
+    Parameters
+    ----------
+    plants : sequence of StateSpace
+        The model first, SI.
+    controller : StateSpace
+        e in, u out, SI.
+    sampling : Sampling or None
+        How the loop runs.
+    bandwidth, sensitivity_peak : float
+        ω_b in rad/s, and ‖S‖∞.
+    options : LoopFigureOptions
+        Of steps and warnings.
+
+    Returns
+    -------
+    dict
+        JSON values.
+    """
     loops = [Loop(plant, controller, sampling) for plant in plants]
     margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
     gain = [gain_margin(m) for m in margins]
     worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
-    steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
+    steps = [step_figures(loops[i], bandwidth, options) for i in sorted(worst)]
     overshoot, settling = map(max, zip(*steps, strict=True))
-    force = largest_force_step(loops, bandwidth)
-    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
+    force = largest_force_step(loops, bandwidth, options)
+    above = bandwidth * options.above
     sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
     growth = max(float((size / size[0]).max()) for size in sizes)
-    rings = ringing(np.concatenate([loop.poles for loop in loops]), bandwidth)
+    poles = np.concatenate([loop.poles for loop in loops])
+    rings = ringing(poles, bandwidth, options.ringing)
+    dip = bandwidth_dip(loops, bandwidth, options)
     least = replace(least_of(margins), crossover=margins[0].crossover)
     return _entry(least, sensitivity_peak) | {
         "step_overshoot": overshoot,
         "settling_ms": 1e3 * settling,
         "force_step_max": force.size,
         "force_step_at": force.entry(loops[0].plant.D.shape == (1, 1)),
-        "loop_warnings": loop_warnings(
-            growth, bandwidth_dip(loops, bandwidth), controller, bandwidth, rings
-        ),
+        "loop_warnings": loop_warnings(growth, dip, controller, bandwidth, rings, options),
     }

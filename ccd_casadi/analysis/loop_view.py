@@ -21,21 +21,41 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import ClassicalMargins, least_margins
 
-POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
-# In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot is round.
-FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))
-END = 0.98  # of half the sampling rate
-SAME = 1e-9  # relative distance of two frequencies below which they are one
-FINE = 0.1  # of the least damping ratio: width of what one frequency of the other plants stands for
 NAMES = ("S", "KS", "T")
 
 
 @dataclass(frozen=True)
-class Bounded:
-    """What a loop has to keep: S_max, S_low up to `low_hz`, and bounds of S, KS, T over Hz.
+class ViewOptions:
+    """Numbers of the frequency grid of a view."""
 
-    `over` gives (3, k) at frequencies (k,), NaN where nothing is asked; `words` say what they are;
-    `compliance_max` (m/N) is for GS. `asked`: the case asks for them; else they are what came out.
+    points: int = 500  # besides those around lightly damped poles and zeros
+    rate_share: float = 0.98  # of half the sampling rate, where it ends
+    same: float = 1e-9  # relative distance of two frequencies below which they are one
+    other_plants: float = 0.1  # of their least damping ratio: how far apart frequencies are
+
+    @property
+    def flanks(self) -> Array:
+        """In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot
+        is round."""
+        return np.asarray(np.tan(np.radians(np.linspace(-86.0, 86.0, 27))))
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """What a loop has to keep.
+
+    Attributes
+    ----------
+    S_max, S_low, low_hz : float
+        Of |S| everywhere, and up to a frequency in Hz.
+    over : function of (k,) array
+        Bounds of S, KS, T (3, k) at frequencies in Hz; NaN where there is none.
+    words : tuple of str
+        What these bounds are.
+    compliance_max : float or None
+        Of |GS|, m/N.
+    asked : bool
+        Whether the case has these bounds; else they are what was reached.
     """
 
     S_max: float
@@ -49,11 +69,30 @@ class Bounded:
 
 @dataclass(frozen=True)
 class LoopView:
-    """σ_max of S, KS (N/m), T and GS (m/N) of every plant, the model first, (4, P, k) over Hz.
+    """One controller on P plants over frequency, the model first.
 
-    G (k, p, m), K (k, m, p) as they run and `peaks`, local maxima of σ_max(S) above 1 as
-    (Hz, gain), are the model's; `open` is L = GK of every plant (P, k, p, p), of several channels
-    of the model alone. `bounds` (3, k) of S, KS, T: NaN where nothing is asked.
+    Attributes
+    ----------
+    label : str
+        Of the controller.
+    loops : tuple of Loop
+        SI.
+    hz : (k,) array
+        Hz.
+    plant, controller : (k, p, m), (k, m, p) array
+        G and K of the model, as they run.
+    sizes : (4, P, k) array
+        σ_max of S, KS (N/m), T and GS (m/N).
+    open : (P, k, p, p) array
+        L = GK; of several channels of the model alone.
+    bounds : (3, k) array
+        Of S, KS, T; NaN where there is none.
+    bounded, bandwidth_hz : Bounded, float
+        What the loop has to keep, and ω_b in Hz.
+    peaks : tuple of (Hz, gain)
+        Local maxima of σ_max(S) above 1 on the model.
+    resonances_hz, antiresonances_hz : tuple of float
+        Of the model, Hz.
     """
 
     label: str
@@ -112,30 +151,52 @@ def loop_view(
     *,
     bandwidth_hz: float,
     label: str = "",
-    points: int = POINTS,
+    points: int | None = None,
     peaks: tuple[tuple[float, float], ...] | None = None,
+    options: ViewOptions = ViewOptions(),
 ) -> LoopView:
-    """The loops of one controller on plants in SI, the model first, on one grid.
+    """Evaluate the loops of one controller on one frequency grid.
 
     It reaches from below ω_low and ω_b to beyond the modes, of a sampled loop to half its rate,
-    and is fine around light poles and zeros of every plant and of K, with `peaks`: local maxima of
-    σ_max(S) on the model that are known; by default they are searched.
+    and is fine around light poles and zeros of every plant and of K.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+        One for each plant, the model first, SI.
+    bounded : Bounded
+        What they have to keep.
+    bandwidth_hz : float
+        Hz.
+    label : str
+        Of the controller.
+    points : int
+        Of the grid; None: those of the options.
+    peaks : tuple of (Hz, gain)
+        Local maxima of σ_max(S) on the model; None: they are searched.
+    options : ViewOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    LoopView
+        On the grid.
     """
-    model = loops[0]
+    model, points = loops[0], options.points if points is None else points
     poles, zeros = (_hz(of) for of in (model.plant.poles, model.plant.zeros(_unit(model))))
     found = peaks_of(model) if peaks is None else peaks
     tops = [hz for hz, gain in found if gain > 1.05]
     low = min(bounded.low_hz, bandwidth_hz / 10.0) / 5.0
     high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
     if model.sampling is not None:
-        high = END * 0.5 / model.sampling.period
+        high = options.rate_share * 0.5 / model.sampling.period
     light = (model.plant.poles, model.controller.rates, model.plant.zeros(_unit(model)))
-    near = root_flanks(np.concatenate([resonant(roots) for roots in light]), FLANKS) / HZ
+    near = root_flanks(np.concatenate([resonant(roots) for roots in light]), options.flanks) / HZ
     worst = [max(peaks_of(loop), key=lambda peak: peak[1], default=(bandwidth_hz, 0.0))[0]
              for loop in loops[1:]]  # fmt: skip
     places = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found), *worst])
-    others = _of_others([resonant(loop.plant.poles) for loop in loops[1:]])
-    hz = frequency_grid(low, high, points, near, places, others, apart=SAME)
+    others = _of_others([resonant(loop.plant.poles) for loop in loops[1:]], options)
+    hz = frequency_grid(low, high, points, near, places, others, apart=options.same)
     G, K = model.responses(HZ * hz)
     sizes, opened = np.empty((1 + len(NAMES), len(loops), len(hz))), []
     for i, loop in enumerate(loops):  # of one plant at a time: responses are large
@@ -150,16 +211,28 @@ def loop_view(
     )  # fmt: skip
 
 
-def _of_others(roots: Sequence[np.ndarray]) -> Array:
+def _of_others(roots: Sequence[np.ndarray], options: ViewOptions) -> Array:
     """Frequencies in Hz on the flanks of resonances of plants that are much alike: one of those
     that differ by a tenth of a half width."""
     every = np.concatenate([*roots, np.empty(0, complex)])
     least = np.min(np.abs(every.real / every), initial=1.0)
-    return thinned(root_flanks(every, FLANKS) / HZ, max(FINE * float(least), SAME))
+    apart = max(options.other_plants * float(least), options.same)
+    return thinned(root_flanks(every, options.flanks) / HZ, apart)
 
 
 def peaks_of(loop: Loop) -> tuple[tuple[float, float], ...]:
-    """Local maxima of σ_max(S) above 1 as (Hz, gain), ascending."""
+    """Local maxima of σ_max(S) above 1.
+
+    Parameters
+    ----------
+    loop : Loop
+        Closed.
+
+    Returns
+    -------
+    tuple of (Hz, gain)
+        Ascending.
+    """
 
     def gain(omega: Array) -> Array:
         return sigma_max(loop.sensitivity(omega))
@@ -182,7 +255,18 @@ def _hz(roots: np.ndarray) -> tuple[float, ...]:
 
 
 def frequency_and_damping(poles: np.ndarray) -> tuple[Array, Array]:
-    """|p| and -Re p/|p|, a conjugate pair once, in rising order."""
+    """Natural frequency |p| and damping ratio -Re p/|p| of poles, a conjugate pair once.
+
+    Parameters
+    ----------
+    poles : (n,) array
+        rad/s.
+
+    Returns
+    -------
+    frequency, damping : (k,) array
+        rad/s, ascending, and ratios.
+    """
     upper = poles[poles.imag >= 0.0]
     upper = upper[np.argsort(np.abs(upper))]
     size = np.abs(upper)
@@ -190,6 +274,17 @@ def frequency_and_damping(poles: np.ndarray) -> tuple[Array, Array]:
 
 
 def phase_deg(response: np.ndarray) -> Array:
-    """Without jumps along the first axis, from within ±180° on."""
+    """The phase of a response, without jumps along the first axis, from within ±180° on.
+
+    Parameters
+    ----------
+    response : (k, ...) array
+        Complex.
+
+    Returns
+    -------
+    (k, ...) array
+        Degrees.
+    """
     phase = np.degrees(np.unwrap(np.angle(response), axis=0))
     return phase - 360.0 * np.round(phase[0] / 360.0)

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.analysis.setpoint import UNLIMITED, Motion, MotionAt, Setpoint, motion_at
+from ccd_casadi.analysis.setpoint import Motion, MotionAt, Motor, Setpoint, motion_at
 from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.plants.differenced import reparametrised
 from ccd_casadi.plants.modal import FREE, ModalPlant, modal_plant, without_hidden_rigid_modes
@@ -20,11 +20,21 @@ from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.arrays import Array, states
 from ccd_casadi.support.casadi_callback import VectorCallback
 
-REMEMBERED = 64  # θ whose figures are kept
-
 
 class DrivenMechanics:
-    """θ -> Mechanics of a plant with the motors' mass, which is a parameter of θ or fixed."""
+    """θ to the matrices of a plant with the motors' mass: M + m B Bᵀ.
+
+    Parameters
+    ----------
+    evaluate : Evaluate
+        The plant alone.
+    motion : Motion
+        What moves.
+    place : int or None
+        Of the mass among the parameters of θ; None: it is fixed.
+    fixed : float
+        Then this, kg.
+    """
 
     keep: Any = None  # what CasADi does not keep
 
@@ -62,8 +72,24 @@ class DrivenMechanics:
 def with_motion(
     plant: Plant, motion: Motion, names: Sequence[str], held: Mapping[str, float]
 ) -> Plant:
-    """A plant with as many inputs as outputs, as a function of θ `names`: its own parameters and
-    the motor's size where that is one. `held`: fixed parameters, the motor's size among them."""
+    """A plant with the mass, the power and the peak force of its motors.
+
+    Parameters
+    ----------
+    plant : Plant
+        With as many inputs as outputs.
+    motion : Motion
+        With a motor or without.
+    names : sequence of str
+        Of θ: the plant's own parameters and the motor's size where that is one.
+    held : mapping
+        Fixed parameters by name, SI; the motor's size may be among them.
+
+    Returns
+    -------
+    Plant
+        As a function of θ, with constraints of the motors.
+    """
     motor = motion.motor
     size = "" if motor is None else motor.size
     place = names.index(size) if size in names else None
@@ -92,11 +118,11 @@ def _hardware(
     f, lam = plant.hardware(ca.vertcat(*(theta[i] for i in range(len(names)) if i != own.place)))
     limits: dict[str, str] = {}
     if motor is not None and own.motion.required:
-        limits = {"peak force": "peak_share"} if motor.peak_current[0] < UNLIMITED else {}
+        limits = {"peak force": "peak_share"} if motor.peak_current[0] < Motor.unlimited else {}
         limits |= {} if motor.rms_power is None else {"motor power": "heat_share"}
     if not limits:
         return ca.Function("hardware", [theta], [f, lam]), []
-    at = lru_cache(maxsize=REMEMBERED)(own.at)
+    at = lru_cache(maxsize=64)(own.at)  # f and λ of one θ, and slopes
     figures = [attrgetter(name) for name in limits.values()]
 
     def values(x: Array) -> Array:
@@ -110,19 +136,51 @@ def _hardware(
     return ca.Function("hardware", [theta], [f, lam]), list(limits)
 
 
-STEPS = np.array([500.0, 50.0])  # of a continuous loop in a period of ω_b, most and least
-PER_MOVE = 400  # and in a move
-TAIL = 8.0  # periods of the bandwidth after the move, doubled until it has settled
-DOUBLINGS = 7
+@dataclass(frozen=True)
+class MoveOptions:
+    """Numbers of a simulated move.
+
+    Attributes
+    ----------
+    least_steps, most_steps : float
+        Of a continuous loop, in a period of ω_b.
+    steps_per_move : int
+        Between these.
+    tail : float
+        Periods of ω_b after the move, doubled until it has settled.
+    doublings : int
+        At most.
+    """
+
+    least_steps: float = 50.0
+    most_steps: float = 500.0
+    steps_per_move: int = 400
+    tail: float = 8.0
+    doublings: int = 7
 
 
 @dataclass(frozen=True)
 class Move:
-    """Time (k,) in s, setpoint (k,), its acceleration (k,), error and forces (k, m).
+    """A simulated move.
 
-    The error is of the moving output (k,), or of all (k, p). The setpoint ends at `duration`.
-    `saturated`: share of the instants at a limit. `rest`: the error of the moving output that stays
-    for ever, NaN where it is not known.
+    Attributes
+    ----------
+    time : (k,) array
+        s.
+    position, acceleration : (k,) array
+        Of the setpoint, unit of y and s.
+    error : (k,) or (k, p) array
+        Of the moving output, or of all.
+    force : (k, m) array
+        N.
+    feedforward : bool
+        Whether there is any.
+    duration, window : float
+        When the setpoint ends, s, and where the error has settled, unit of y.
+    saturated : float
+        Share of the instants at a limit.
+    rest : float
+        Error of the moving output that stays for ever; NaN where it is not known.
     """
 
     time: Array
@@ -163,7 +221,7 @@ class Move:
         return float(self._size.max())
 
     def last_error(self, share: float) -> float:
-        """The largest over the last share of what was watched: of a limit cycle its amplitude."""
+        """The largest over the last share of the time: of a limit cycle its amplitude."""
         return float(self._size[-max(int(len(self.time) * share), 1) :].max())
 
     @property
@@ -206,7 +264,20 @@ class Move:
 
 
 def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
-    """Forces (m,) per unit acceleration of output `axis`; None where no rigid body moves it so."""
+    """Forces that accelerate one output alone, by the rigid bodies.
+
+    Parameters
+    ----------
+    modal : ModalPlant
+        SI.
+    axis : int
+        The output, from 0.
+
+    Returns
+    -------
+    (m,) array or None
+        N per unit acceleration; None where no rigid body moves it so.
+    """
     R = modal.C[:, modal.rigid] @ modal.B[modal.rigid]
     wanted = np.eye(len(R))[axis]
     forces = np.linalg.pinv(R) @ wanted if R.size else np.zeros(modal.B.shape[1])
@@ -221,13 +292,30 @@ def moves(
     axis: int,
     window: float,
     bandwidth_hz: float,
-    doublings: int = DOUBLINGS,
+    options: MoveOptions = MoveOptions(),
 ) -> list[list[Move]]:
-    """A move of each loop (inner lists) in each way (forces of `mass_feedforward`, or None)."""
+    """A move of each loop in each way.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+        Closed, SI.
+    ways : sequence of arrays or None
+        Feedforward as of `simulate`.
+    profile, axis, window, bandwidth_hz
+        As of `simulate`.
+    options : MoveOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    list of list of Move
+        One list a way, with a move of each loop.
+    """
     return [
         [
             simulate(loop, profile, axis=axis, forces=forces, window=window,
-                     bandwidth_hz=bandwidth_hz, doublings=doublings)
+                     bandwidth_hz=bandwidth_hz, options=options)
             for loop in loops
         ]
         for forces in ways
@@ -236,22 +324,40 @@ def moves(
 
 def simulate(
     loop: Loop, profile: Setpoint, *, axis: int, forces: Array | None, window: float,
-    bandwidth_hz: float, doublings: int = DOUBLINGS,
+    bandwidth_hz: float, options: MoveOptions = MoveOptions(),
 ) -> Move:  # fmt: skip
-    """The move of output `axis`, the others told to stay.
+    """Simulate the move of one output, the others with a setpoint of 0, until it has settled.
 
-    `forces` (m,) of `mass_feedforward`, or (5, m) of `feedforward`, by derivative of the setpoint.
+    Parameters
+    ----------
+    loop : Loop
+        Closed, SI.
+    profile : Setpoint
+        Of the output `axis`, from 0.
+    axis : int
+        See there.
+    forces : array or None
+        (m,) of `mass_feedforward`, or (5, m) of `feedforward`, by derivative of the setpoint.
+    window : float
+        Where the error has settled, unit of y.
+    bandwidth_hz : float
+        Hz.
+    options : MoveOptions
+        Numbers of the method.
 
-    It is watched until it has settled, for a tail of `TAIL` periods of the bandwidth, doubled so
-    often at most.
+    Returns
+    -------
+    Move
+        Up to the last tail.
     """
     ahead = np.zeros((5, loop.plant.B.shape[1]))
     if forces is not None:
         ahead[2 if forces.ndim == 1 else slice(None)] = forces
-    closed, tail = loop.closed, TAIL / bandwidth_hz
-    step = loop.period or float(np.clip(profile.duration / PER_MOVE, *1.0 / STEPS / bandwidth_hz))
+    closed, tail = loop.closed, options.tail / bandwidth_hz
+    ends = 1.0 / np.array([options.most_steps, options.least_steps]) / bandwidth_hz
+    step = loop.period or float(np.clip(profile.duration / options.steps_per_move, *ends))
     A, drive = _over(loop, ahead, axis, step)
-    for _ in range(doublings):
+    for _ in range(options.doublings):
         time = np.arange(np.ceil((profile.duration + tail) / step) + 1) * step
         r = profile.at(time) if loop.period is None else held_setpoint(profile, time, step)
         driven = r.T @ drive.T

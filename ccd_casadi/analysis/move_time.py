@@ -25,25 +25,32 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.analysis.move import forward_force
-from ccd_casadi.analysis.setpoint import STEP, MotionAt
+from ccd_casadi.analysis.setpoint import MotionAt, MotionOptions
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array, states
 
-SHARPNESS = 200.0  # of the largest of the plants: twelve that are equally late add 1.3 %
-ROUNDED, MOST_ROUNDED = 0.005, 0.1  # r: of the window, for each mode; and for all together
-NOTHING = 1e-30  # share of the envelope: a mode with less has died out
-NEWTON = 50  # steps at most
+
+@dataclass(frozen=True)
+class MoveTimeOptions:
+    """Numbers of the time of a move."""
+
+    sharpness: float = 200.0  # of the largest of the plants: twelve equally late ones add 1.3 %
+    rounded: float = 0.005  # of the window, for each mode: r
+    most_rounded: float = 0.1  # of the window, for all modes together
+    nothing: float = 1e-30  # share of the envelope: a mode with less has died out
+    newton_steps: int = 50  # at most
 
 
 class _Crossing:
     """When the envelope of one plant's error crosses the window, s, and its slopes."""
 
     def __init__(
-        self, G: StateSpace, K: StateSpace, r: Array, f: Array, window: float, period: float
-    ) -> None:
+        self, G: StateSpace, K: StateSpace, r: Array, f: Array, window: float, period: float,
+        options: MoveTimeOptions = MoveTimeOptions(),
+    ) -> None:  # fmt: skip
         self.plant, self.r, self.f = G, r, f
         self.loop = loop = closed_loop(G, K)
         self.poles, self.V = np.linalg.eig(loop.A)
@@ -63,10 +70,10 @@ class _Crossing:
         size, rate = self.logs
         # E is convex: Newton's steps from where one mode alone is in the window go up to it
         k = float(np.max(-size / rate))
-        for _ in range(NEWTON):
+        for _ in range(options.newton_steps):
             alone = np.exp(size + k * rate)
-            rounded = np.hypot(alone, min(ROUNDED, MOST_ROUNDED / len(alone)))
-            self.shares = np.where(alone > NOTHING, alone**2 / rounded, 0.0)  # d ln of each
+            rounded = np.hypot(alone, min(options.rounded, options.most_rounded / len(alone)))
+            self.shares = np.where(alone > options.nothing, alone**2 / rounded, 0.0)  # d ln of each
             step = float((1.0 - rounded.sum()) / (self.shares @ np.maximum(rate, -1e3)))
             if abs(step) < 1e-12 * len(r):
                 break
@@ -106,17 +113,32 @@ class _Crossing:
         found += self.to_B @ moved.B_r[:, 0].imag
         if inputs is not None:
             found += self.to_input @ inputs[:, 0].imag
-        return float(found / STEP)
+        return float(found / MotionOptions().complex_step)
 
 
 @dataclass(frozen=True)
 class MoveTime:
-    """v of a controller on SISO plants whose rigid bodies are free, with derivatives to κ and θ."""
+    """v of a controller on SISO plants, with derivatives to κ and θ.
+
+    Attributes
+    ----------
+    plants : tuple of ScaledPlant
+        With free rigid bodies.
+    structure : Structure
+        Of the controller.
+    hold : Sampling
+        Of the loop.
+    motion : MotionAt
+        The move at θ.
+    options : MoveTimeOptions
+        Numbers of the method.
+    """
 
     plants: tuple[ScaledPlant, ...]
     structure: Structure
     hold: Sampling
     motion: MotionAt
+    options: MoveTimeOptions = MoveTimeOptions()
 
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln v (s) at κ in SI, and its gradient; infinite where a loop is unstable."""
@@ -124,7 +146,8 @@ class MoveTime:
         found = self._crossings(kappa)
         if not all(each.stable for each in found):
             return np.inf, np.full(len(kappa), np.nan)
-        stepped = self.structure.state_spaces(kappa + 1j * STEP * np.eye(len(kappa)))
+        step = 1j * MotionOptions().complex_step
+        stepped = self.structure.state_spaces(kappa + step * np.eye(len(kappa)))
         moved = [
             tustin(StateSpace(*(part[i] for part in stepped)), self.hold.period)
             for i in range(len(kappa))
@@ -132,7 +155,7 @@ class MoveTime:
         value, weights, _ = self._together(found)
         gradient = np.zeros(len(kappa))
         for weight, each in zip(weights, found, strict=True):
-            if weight > NOTHING:
+            if weight > self.options.nothing:
                 back = each.pulled()
                 slopes = [back.along(closed_loop(back.plant, K)) for K in moved]
                 gradient += weight * np.array(slopes)
@@ -140,7 +163,9 @@ class MoveTime:
 
     def to_theta(self, kappa: Array) -> Array:
         """∂ ln v/∂θ at a fixed κ."""
-        found, motion, step = self._crossings(np.asarray(kappa, float)), self.motion, 1j * STEP
+        found, motion = self._crossings(np.asarray(kappa, float)), self.motion
+        size = MotionOptions().complex_step
+        step = 1j * size
         T, tau = self.hold.period, self.hold.delay
         value, weights, by_duration = self._together(found)
         K = tustin(self.structure.state_space(kappa), T)
@@ -150,14 +175,14 @@ class MoveTime:
             for item, slope in zip(motion.stepped, motion.forward_slopes, strict=True)
         ]
         for weight, each, plant in zip(weights, found, self.plants, strict=True):
-            if not weight > NOTHING:
+            if not weight > self.options.nothing:
                 continue
             back, G = each.pulled(), plant.plant_si()
             for i, (dA, dB, dC) in enumerate(plant.changes_si()):
                 moved = sampled(
                     StateSpace(G.A + step * dA, G.B + step * dB, G.C + step * dC, G.D), T, tau
                 )
-                r, f = (signal.imag / STEP for signal in signals[i])
+                r, f = (signal.imag / size for signal in signals[i])
                 dt = back.along(closed_loop(moved, K), moved.B)
                 gradient[i] += weight * (dt + back.to_r @ r + back.to_f @ f[:, 0])
         return np.asarray(gradient / value)
@@ -185,15 +210,16 @@ class MoveTime:
         T, motion = self.hold.period, self.motion
         K = tustin(self.structure.state_space(kappa), T)
         r, f = forward_force(motion.cycle.profile, motion.forward, self._time, T)
-        return [_Crossing(G, K, r, f, motion.motion.window, T) for G in self._sampled]
+        window, options = motion.motion.window, self.options
+        return [_Crossing(G, K, r, f, window, T, options) for G in self._sampled]
 
     def _together(self, found: Sequence[_Crossing]) -> tuple[float, Array, float]:
         """v, ∂v/∂t_i and ∂v/∂t_0."""
-        t_0 = self.motion.cycle.profile.duration
+        t_0, sharpness = self.motion.cycle.profile.duration, self.options.sharpness
         late = np.array([each.time for each in found]) / t_0
         top = max(1.0, float(late.max()))
-        shares = np.exp(SHARPNESS * (late - top))
-        whole = np.exp(SHARPNESS * (1.0 - top)) + shares.sum()
-        value = t_0 * (top + np.log(whole) / SHARPNESS)
+        shares = np.exp(sharpness * (late - top))
+        whole = np.exp(sharpness * (1.0 - top)) + shares.sum()
+        value = t_0 * (top + np.log(whole) / sharpness)
         weights = shares / whole
         return float(value), weights, float(value / t_0 - weights @ late)

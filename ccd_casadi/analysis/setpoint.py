@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -17,7 +17,15 @@ from ccd_casadi.support.errors import UserError
 
 @dataclass(frozen=True)
 class Setpoint:
-    """Snap values over 15 intervals, `durations` (15,) in s; what the move reaches."""
+    """A symmetric fourth-order move: constant snap over each of 15 intervals.
+
+    Attributes
+    ----------
+    durations, snaps : (15,) array
+        Of the intervals, s, and snap there, unit of y per s⁴.
+    velocity, acceleration, jerk : float
+        The largest that the move reaches.
+    """
 
     durations: Array
     snaps: Array
@@ -71,9 +79,19 @@ def _advanced(state: Array, snap: float | Array, t: Array) -> Array:
 
 
 def setpoint(limits: MoveLimits) -> Setpoint:
-    """The shortest symmetric fourth-order move; all limits positive.
+    """The shortest symmetric fourth-order move.
 
     Analytic in the limits, which may be complex: a step along the imaginary axis gives derivatives.
+
+    Parameters
+    ----------
+    limits : MoveLimits
+        All positive.
+
+    Returns
+    -------
+    Setpoint
+        At rest before its start and after its end.
     """
     stroke, v, a, j, s = (getattr(limits, item.name) for item in fields(limits))
     t4 = _longest(j / s, (a / s) ** 0.5, (v / (2 * s)) ** (1 / 3), (stroke / (8 * s)) ** 0.25)
@@ -103,52 +121,90 @@ def _longest(*bounds: Any) -> Any:
     return time if np.real(time) > 0.0 else 0.0 * time
 
 
-ORDER = 4  # highest derivative of the setpoint
-POINTS = 64  # on the circle of Cauchy's integral
-RADIUS = 0.25  # of the nearest singularity of the inverse
-ROUNDING = 1e-11  # of the inverse on the circle: what a coefficient has by rounding there is none
+@dataclass(frozen=True)
+class FeedforwardOptions:
+    """Numbers of the feedforward.
+
+    Attributes
+    ----------
+    order : int
+        Highest derivative of the setpoint.
+    points : int
+        On the circle of Cauchy's integral.
+    radius : float
+        Of the circle, over the nearest singularity of the inverse.
+    rounding : float
+        Of the inverse on the circle: a coefficient that is less there is 0.
+    """
+
+    order: int = 4
+    points: int = 64
+    radius: float = 0.25
+    rounding: float = 1e-11
 
 
 def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
-    """F (ORDER + 1, m, p) in N per unit of y and s, of a stable plant; T and τ in s.
+    """Gains of the feedforward of a setpoint, u = Σ_i F_i r^(i).
 
-    Taylor coefficients by Cauchy's integral on a circle within which the inverse is analytic: its
-    aliasing error is RADIUS^(POINTS - ORDER). Raises UserError where the plant has a zero at s = 0,
-    so that no finite force holds a position. Free bodies have F_0 = 0, without dampers F_1 = 0.
+    Taylor coefficients of the inverse of the plant behind hold and delay, by Cauchy's integral on a
+    circle within which it is analytic: its aliasing error is radius^(points - order). Free bodies
+    have F_0 = 0, without dampers F_1 = 0.
+
+    Parameters
+    ----------
+    plant : StateSpace
+        Stable, m inputs and p outputs, SI.
+    period, delay : float
+        s.
+
+    Returns
+    -------
+    (order + 1, m, p) array
+        N per unit of y and s.
+
+    Raises
+    ------
+    UserError
+        The plant has a zero at s = 0: no finite force holds a position.
     """
     return feedforward_slopes(plant, (), period, delay)[0]
 
 
 def feedforward_slopes(
-    plant: StateSpace, changes: Sequence[tuple[Array, Array, Array]], period: float, delay: float
+    plant: StateSpace,
+    changes: Sequence[tuple[Array, Array, Array]],
+    period: float,
+    delay: float,
+    options: FeedforwardOptions = FeedforwardOptions(),
 ) -> tuple[Array, Array]:
-    """F, and dF (k, ORDER + 1, m, p) of k changes (dA, dB, dC) of a square plant.
+    """F, and dF (k, order + 1, m, p) of k changes (dA, dB, dC) of a square plant.
 
     dG⁻¹ = -G⁻¹ dG G⁻¹
     """
+    count, terms = options.points, options.order + 1
     poles = np.abs(plant.poles)
     zeros = plant.zeros(float(poles.max()))
     nearest = min([*np.abs(zeros), poles.max()])
     if not nearest > 1e-9 * poles.max():
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
     late = delay + 0.5 * period
-    radius = RADIUS * nearest
+    radius = options.radius * nearest
     if radius * late > 1.0:  # where exp stays of size one
         radius = 1.0 / late
-    s = radius * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
+    s = radius * np.exp(2j * np.pi * np.arange(count) / count)
     X = np.linalg.solve(s[:, None, None] * np.eye(len(poles)) - plant.A, plant.B + 0j)
     G = plant.C @ X + plant.D
     inverse = np.linalg.inv(G) if G.shape[1] == G.shape[2] else np.linalg.pinv(G)
     ahead = np.exp(s * late)[:, None, None]
 
     def series(values: np.ndarray) -> Array:
-        found = np.fft.fft(ahead * values, axis=0).real[: ORDER + 1] / POINTS
+        found = np.fft.fft(ahead * values, axis=0).real[:terms] / count
         size = np.abs(values).max(axis=0)
         size = np.minimum(size.max(axis=0), size.max(axis=1)[:, None])  # whatever the units
-        found[np.abs(found) <= ROUNDING * size] = 0.0
-        return np.asarray(found / radius ** np.arange(ORDER + 1)[:, None, None])
+        found[np.abs(found) <= options.rounding * size] = 0.0
+        return np.asarray(found / radius ** np.arange(terms)[:, None, None])
 
-    F, dF = series(inverse), np.zeros((len(changes), ORDER + 1, *inverse.shape[1:]))
+    F, dF = series(inverse), np.zeros((len(changes), terms, *inverse.shape[1:]))
     for i, (dA, dB, dC) in enumerate(changes):
         whole = s[:, None, None] * np.eye(len(poles)) - plant.A
         dG = dC @ X + plant.C @ np.linalg.solve(whole, dA @ X + dB)
@@ -156,22 +212,43 @@ def feedforward_slopes(
     return F, dF
 
 
-STEP = 1e-30  # along the imaginary axis
-UNLIMITED = 1e12  # A: a peak current that is none
-HELD = 1e-6  # of the moving force: a plant that holds its output by more has a spring
+@dataclass(frozen=True)
+class MotionOptions:
+    """Numbers of a motion and its derivatives.
+
+    Attributes
+    ----------
+    complex_step : float
+        Along the imaginary axis: derivatives of analytic functions, exact to rounding.
+    spring : float
+        Of the moving force: a plant that holds its output by more has a spring.
+    """
+
+    complex_step: float = 1e-30
+    spring: float = 1e-6
 
 
 @dataclass(frozen=True)
 class Motor:
-    """One motor, or a catalogue in rising order of the moving mass: N/A, ohm, A, kg.
+    """One motor, or a catalogue in rising order of the moving mass.
 
-    `rms_power` in W of all motors together, None: any. `size` names the parameter of θ that is the
-    moving mass, which is added to the plant at every input: M + mass b bᵀ.
+    Attributes
+    ----------
+    force_constant, resistance, peak_current, moving_mass : tuple of float
+        N/A, ohm, A and kg of each; the mass is added to the plant at every input: M + mass b bᵀ.
+    rms_power : float or None
+        Of all motors together, W; None: any.
+    size : str
+        Names the parameter of θ that is the moving mass.
+    unlimited : float
+        A peak current that does not limit, A.
     """
+
+    unlimited: ClassVar[float] = 1e12
 
     force_constant: tuple[float, ...]
     resistance: tuple[float, ...]
-    peak_current: tuple[float, ...] = (UNLIMITED,)
+    peak_current: tuple[float, ...] = (unlimited,)
     moving_mass: tuple[float, ...] = (0.0,)
     rms_power: float | None = None
     size: str = ""
@@ -190,8 +267,19 @@ class Motor:
 
 @dataclass(frozen=True)
 class Motion:
-    """A move in SI and its motor: `limits` (acceleration inf: what the motor allows), `window` in
-    which it has settled, `dwell` from its end to the next. The first output moves."""
+    """A move of the first output and its motor.
+
+    Attributes
+    ----------
+    limits : MoveLimits
+        SI; an infinite acceleration is what the motor allows.
+    window : float
+        In which the move has settled, m.
+    dwell : float
+        From its end to the next, s.
+    motor : Motor or None
+        None: it does not limit.
+    """
 
     limits: MoveLimits
     window: float
@@ -221,7 +309,22 @@ class Cycle:
 
 
 def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
-    """The cycle with `forces` g (m,) per unit acceleration and a motor of this moving mass."""
+    """The cycle of a motion within what its motor allows.
+
+    Parameters
+    ----------
+    motion : Motion
+        With its limits.
+    forces : (m,) array
+        g per unit acceleration, kg.
+    mass : float
+        Moving mass of the motor, kg; complex for derivatives.
+
+    Returns
+    -------
+    Cycle
+        With the largest acceleration.
+    """
     allowed, motor = motion.limits, motion.motor
     acceleration, why = allowed.acceleration, "acceleration"
     if motor is not None and not motion.required:
@@ -240,7 +343,7 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
 
 
 def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle:
-    """With an acceleration of so much at most."""
+    """With this acceleration at most."""
     profile, motor = setpoint(replace(motion.limits, acceleration=acceleration)), motion.motor
     mean = profile.squared_acceleration / (profile.durations.sum() + motion.dwell)
     largest = _largest(forces)
@@ -273,15 +376,24 @@ def _heated(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
     while np.real(share(low)) > 1.0:
         low *= 0.1
     a = float(scipy.optimize.brentq(lambda a: np.real(share(a)) - 1.0, low, most, xtol=1e-14 * low))
-    slope = np.imag(share(a + 1j * STEP)) / STEP
+    step = MotionOptions().complex_step
+    slope = np.imag(share(a + 1j * step)) / step
     return a - (_cycle(motion, a, forces, mass).heat_share - 1.0) / slope
 
 
 @dataclass(frozen=True)
 class MotionAt:
-    """A move of a plant at one θ, with a motor of this `mass`: its cycle, those with each parameter
-    a `STEP` along the imaginary axis away, and the feedforward F (5, m) per derivative of the
-    setpoint with its slopes."""
+    """A move of a plant at one θ.
+
+    Attributes
+    ----------
+    motion, mass : Motion, float
+        What moves, and the moving mass of its motor, kg.
+    cycle, stepped : Cycle, tuple of Cycle
+        Its cycle, and those with each parameter a step along the imaginary axis away.
+    forward, forward_slopes : (5, m), (n_θ, 5, m) array
+        Feedforward per derivative of the setpoint, and its derivatives to θ.
+    """
 
     motion: Motion
     mass: float
@@ -292,12 +404,15 @@ class MotionAt:
 
     def slopes(self, read: Callable[[Cycle], Any]) -> Array:
         """Derivatives (n,) of a figure of the cycle."""
-        return np.array([np.imag(read(item)) / STEP for item in self.stepped], float)
+        return np.array(
+            [np.imag(read(item)) / MotionOptions().complex_step for item in self.stepped], float
+        )
 
 
 def motion_at(
-    motion: Motion, free: ScaledPlant, mass: float, place: int | None, sampling: Sampling | None
-) -> MotionAt:
+    motion: Motion, free: ScaledPlant, mass: float, place: int | None, sampling: Sampling | None,
+    options: MotionOptions = MotionOptions(),
+) -> MotionAt:  # fmt: skip
     """Of a plant with its rigid bodies free, square; `mass` of the motor is parameter `place` of θ.
 
     Raises UserError where a spring holds the output.
@@ -306,10 +421,11 @@ def motion_at(
     F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
     ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
     found = cycle_of(motion, ahead[2], mass)
-    if np.abs(ahead[0]).max() * motion.limits.stroke > HELD * found.peak_force:
+    if np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
         raise UserError("move: a spring holds the output that moves, and its force is not counted")
+    step = 1j * options.complex_step
     stepped = tuple(
-        cycle_of(motion, ahead[2] + 1j * STEP * slope[2], mass + 1j * STEP * (i == place))
+        cycle_of(motion, ahead[2] + step * slope[2], mass + step * (i == place))
         for i, slope in enumerate(slopes)
     )
     return MotionAt(motion, mass, found, stepped, ahead, slopes)

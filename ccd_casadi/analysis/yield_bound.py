@@ -4,10 +4,16 @@ from dataclasses import dataclass
 
 import scipy
 
-CONFIDENCE, CONFIDENCE_WORDS = 1.0 - 1e-6, "1 - 1e-6"
+
+@dataclass(frozen=True)
+class YieldOptions:
+    """Of a yield by random plants."""
+
+    confidence: float = 1.0 - 1e-6
+    words: str = "1 - 1e-6"
 
 
-def yield_bound(survived: int, draws: int, confidence: float = CONFIDENCE) -> float:
+def yield_bound(survived: int, draws: int, confidence: float = YieldOptions().confidence) -> float:
     """The least share of all plants that survive, by independent draws: exact for the binomial.
 
     The q with P(at least `survived` of `draws` | q) = 1 - confidence (Clopper and Pearson 1934):
@@ -31,14 +37,20 @@ def yield_bound(survived: int, draws: int, confidence: float = CONFIDENCE) -> fl
 
 @dataclass(frozen=True)
 class Yield:
-    """How many of so many fresh draws survived."""
+    """How many fresh random plants survived.
+
+    Attributes
+    ----------
+    survived, draws : int
+        Of these draws.
+    """
 
     survived: int
     draws: int
 
     @property
     def least(self) -> float:
-        """The share of all that survives, at least, at `CONFIDENCE`."""
+        """The share of all that survives, at least, at the confidence of `YieldOptions`."""
         return yield_bound(self.survived, self.draws)
 
     @property
@@ -47,7 +59,7 @@ class Yield:
         percent = int(1e4 * self.least) / 100.0
         return (
             f"{self.survived} of {self.draws} fresh random plants survive: at least {percent:g} % "
-            f"of all, at confidence {CONFIDENCE_WORDS}"
+            f"of all, at confidence {YieldOptions().words}"
         )
 
     @property
@@ -55,5 +67,5 @@ class Yield:
         """Of result.json."""
         return {
             "survived": self.survived, "draws": self.draws, "least": self.least,
-            "confidence": CONFIDENCE,
+            "confidence": YieldOptions().confidence,
         }  # fmt: skip

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from ccd_casadi.analysis.move_limits import MoveLimits
-from ccd_casadi.analysis.setpoint import UNLIMITED, Motion, Motor
+from ccd_casadi.analysis.setpoint import Motion, Motor
 from ccd_casadi.cases import checks
 from ccd_casadi.cases.checks import NOT_NEGATIVE, Fail, key, one_or_more
 
@@ -101,7 +101,7 @@ def motion_problem(
     )  # fmt: skip
     k, current = _listed(motor.force_constant), _listed(motor.peak_current)
     made = None if motor == MotorTable() else Motor(
-        k, _listed(motor.resistance), current or (UNLIMITED,) * len(k),
+        k, _listed(motor.resistance), current or (Motor.unlimited,) * len(k),
         _listed(motor.moving_mass) or (0.0,), motor.rms_power, motor.size,
     )  # fmt: skip
     return Motion(limits, given["settle_band"], move.dwell, made)

@@ -9,6 +9,7 @@ least_damping = 0.0005        # of a resonance that lines may hide, at least
 
 with [inner], [controller] structure = "sections", [weights] where weighted_level is given, and
 [loop] rate_hz: then the response was measured as the controller sees it, hold and delay in it.
+[units] names what its outputs and inputs are where these are not m and N.
 """
 
 from collections.abc import Mapping
@@ -29,10 +30,10 @@ from ccd_casadi.cases.tables import TABLES, BudgetTable, ObjectiveTable, RobustT
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.plants.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text import HZ, use_units
 
 MODEL = "measured"
-_TABLES = ("weights", "inner", "controller", "loop")
+_TABLES = ("weights", "inner", "controller", "loop", "units")
 _PLANT = {
     "model": text,
     "file": text,
@@ -107,6 +108,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
     }
     _check(tables, fail)
     inner, controller, loop = (tables[name] for name in ("inner", "controller", "loop"))
+    use_units(tables["units"].output, tables["units"].input)
     weights = None
     if controller.weighted_level is not None:
         weights = weights_of(controller, tables["weights"], inner)

@@ -26,8 +26,8 @@ from ccd_casadi.codesign.design_plants import order
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import with_all_spent
 from ccd_casadi.support.json_files import json_values
 from ccd_casadi.support.terminal import duration, remark
 from ccd_casadi.support.text import counted
@@ -35,9 +35,15 @@ from ccd_casadi.support.text import counted
 Lists = dict[str, tuple[float, ...]]
 Search = Callable[[Sampler, Solution | None], Solution]
 Judge = Callable[[Sampler, Solution], Solution]
-AT = 1e-6  # of a range: this close to a value of its list an optimum is on it
-NO_BETTER = 1e-6  # of the terms of J: a bound that is lower by less is cut
-FEW = 4  # combinations that are searched one by one: bounds for some of them would save no search
+
+
+@dataclass(frozen=True)
+class BranchOptions:
+    """Numbers of branch and bound over lists."""
+
+    on_value: float = 1e-6  # of a range: this close to a value of its list an optimum is on it
+    no_better: float = 1e-6  # of the terms of J: a bound that is lower by less is cut
+    few: int = 4  # combinations up to which all are searched: bounds would save no search
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,11 @@ def restricted(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]])
 
 
 def best_of_lists(
-    sampler: Sampler, between: Search, at: Search, judge: Judge | None = None
+    sampler: Sampler,
+    between: Search,
+    at: Search,
+    judge: Judge | None = None,
+    options: BranchOptions = BranchOptions(),
 ) -> Solution:
     """The best co-design with every listed parameter on a value of its list.
 
@@ -119,12 +129,12 @@ def best_of_lists(
     known: list[Solution] = []
     best: Solution | None = None
     judged, count = 0, open_[0].count
-    most = count // 2 if count > FEW else 0
+    most = count // 2 if count > options.few else 0
     while open_:
         part = min(open_, key=lambda p: (p.lost, p.bound, p.count > 1, away(p.lists, p.theta)))
         least = np.inf  # a design that is not verified cuts nothing
         if best is not None and best.result["status"] == "verified":
-            least = best.result["objective"] - _same(problem, best)
+            least = best.result["objective"] - _same(problem, best, options.no_better)
         if part.bound >= least or (part.lost and np.isfinite(least)):
             break
         open_.remove(part)
@@ -144,7 +154,7 @@ def best_of_lists(
         node = Node(part.lists, found.result["status"], J, _made_of(problem, found.result))
         nodes[tuple(part.lists.values())] = node
         gained = part.bound - J if node.status != "not_verified" else 0.0
-        same = _same(problem, found)
+        same = _same(problem, found, options.no_better)
         if gained > same:  # as little as that bound are other ends the least of their parts
             known.clear()
         known += [found] if np.isfinite(J) else []
@@ -157,7 +167,10 @@ def best_of_lists(
             best = found if best is None else min(best, found, key=order)
         elif np.isfinite(J):
             theta = _point(found)
-            open_ += [_Part(child, J, theta) for child in _children(width, part.lists, theta)]
+            open_ += [
+                _Part(child, J, theta)
+                for child in _children(width, part.lists, theta, options.on_value)
+            ]
         else:
             open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
         remark(_progress(count, list(nodes.values()), open_, began), sampler.quiet)
@@ -190,14 +203,16 @@ def _point(solution: Solution) -> dict[str, float]:
     return solution.problem.source.held | solution.result["theta"]
 
 
-def _same(problem: CoDesignProblem, solution: Solution) -> float:
-    """By how much J may differ and count as the same."""
+def _same(problem: CoDesignProblem, solution: Solution, share: float) -> float:
+    """By how much J may differ and count as the same: a share of its terms."""
     cost, J = (float(solution.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
-    share = problem.w1 * cost
-    return NO_BETTER * (abs(share) + abs(J - share)) if np.isfinite(J) else 0.0
+    hardware = problem.w1 * cost
+    return share * (abs(hardware) + abs(J - hardware)) if np.isfinite(J) else 0.0
 
 
-def _children(width: Mapping[str, float], lists: Lists, theta: Mapping[str, float]) -> list[Lists]:
+def _children(
+    width: Mapping[str, float], lists: Lists, theta: Mapping[str, float], on_value: float
+) -> list[Lists]:
     """The parts of a part: on both sides of θ in the list whose values are furthest from it.
 
     Where all of θ is on values these are a part, and what is beside them are others.
@@ -206,7 +221,7 @@ def _children(width: Mapping[str, float], lists: Lists, theta: Mapping[str, floa
     nearest = {name: min(lists[name], key=lambda v: abs(v - theta[name])) for name in several}
     away = {name: abs(nearest[name] - theta[name]) / width[name] for name in several}
     furthest = max(several, key=lambda item: (away[item], len(lists[item])))
-    on_values = away[furthest] <= AT
+    on_values = away[furthest] <= on_value
     held: Lists = {}
     parts: list[Lists] = []
     for name in several if on_values else [furthest]:

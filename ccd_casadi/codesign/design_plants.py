@@ -7,43 +7,51 @@ the plant alone the set is widened step by step, each design polished on the pro
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import cast
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Outer
-from ccd_casadi.codesign.search import conclude_at
+from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import missed_bounds
 from ccd_casadi.plants.plant import named_values
+from ccd_casadi.sampling.inner_samples import with_all_spent
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import with_all_spent
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 
-FIRST = 0.25  # share of the range of the first step of a continuation
-POLISHES = 5  # at most in a continuation
 CONTINUED = "reached by continuation from narrower ranges"
-TOLD = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
-LEAST = 1.0 / 16.0  # share of the range under which a step is given up
+REPORTED = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
 
 
-def widen(sampler: Sampler, x: Array) -> tuple[Array, float]:
+@dataclass(frozen=True)
+class ContinuationOptions:
+    """Numbers of the continuation from the plant alone to its set, shares of the range."""
+
+    first_step: float = 0.25
+    least_step: float = 1.0 / 16.0  # a smaller one is not tried
+    polishes: int = 5  # at most
+
+
+def widen(
+    sampler: Sampler, x: Array, options: ContinuationOptions = ContinuationOptions()
+) -> tuple[Array, float]:
     """From a design of the plant alone towards the whole set of a problem with one design plant.
 
     x = (θ, ln ω_S, ln ω_T) and the share of the range held there.
     """
     problem = sampler.problem
     assert problem.robust is not None
-    x, held, step = np.asarray(x, float), 0.0, FIRST
-    for _ in range(POLISHES):
-        if held >= 1.0 or step < LEAST:
+    x, held, step = np.asarray(x, float), 0.0, options.first_step
+    for _ in range(options.polishes):
+        if held >= 1.0 or step < options.least_step:
             break
         share = min(1.0, held + step)
         narrower = replace(problem, robust=problem.robust.scaled(share))
@@ -59,7 +67,7 @@ def best_over_design_plants(
     sampler: Sampler,
     outer_of: Callable[[Sampler], Outer],
     solve: Callable[[Outer], Solution],
-    terms: Terms,
+    terms: RunTerms,
 ) -> Solution:
     """The best of a problem's solutions over its design plants, by `solve` and continuation.
 
@@ -87,7 +95,7 @@ def best_over_design_plants(
     result["seconds"] = perf_counter() - terms.began
     if problem.robust is not None:
         names = [choice.robust.design_at for choice in choices if choice.robust]
-        told = [{key: item.result[key] for key in TOLD if key in item.result} for item in found]
+        told = [{key: item.result[key] for key in REPORTED if key in item.result} for item in found]
         tried = dict(zip(names, told, strict=True))
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     sampler.nearest = samplers[best].nearest

@@ -11,17 +11,27 @@ from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.sampling.samples import InnerSample, QuantitySample
+from ccd_casadi.sampling.inner_samples import InnerSample, QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
 
 
 @dataclass(frozen=True)
-class Iterate:
+class FormulationRound:
     """One round: what the surrogate promised at θ and what the true inner problem gave.
 
-    Bandwidths in rad/s; `truth` NaN where θ is infeasible; `radius` of the trust region as a
-    share of the box; `step` from the incumbent, likewise.
+    Attributes
+    ----------
+    theta : tuple of float
+        SI.
+    predicted, truth : float
+        ω_b in rad/s, or another figure in SI; `truth` NaN where θ is infeasible.
+    predicted_objective, objective : float
+        J of both.
+    error : float
+        Relative.
+    step, radius : float
+        From the incumbent, and of the trust region, in shares of the box.
     """
 
     theta: tuple[float, ...]
@@ -37,11 +47,11 @@ class Iterate:
 def iterate_of(
     problem: CoDesignProblem, theta: tuple[float, ...], predicted: float, truth: float,
     *, error: float, step: float, radius: float = 1.0,
-) -> Iterate:  # fmt: skip
+) -> FormulationRound:  # fmt: skip
     """A round with J as it was promised and as it is, infinite where there is no true value."""
     promised, J = (objective(problem, theta, value) for value in (predicted, truth))
     J = J if np.isfinite(truth) else np.inf
-    return Iterate(theta, predicted, truth, promised, J, error, step, radius)
+    return FormulationRound(theta, predicted, truth, promised, J, error, step, radius)
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,7 @@ class FormulationResult:
     """
 
     x: Array | None = None
-    iterates: tuple[Iterate, ...] = ()
+    iterates: tuple[FormulationRound, ...] = ()
     surrogates: tuple[GaussianProcess, ...] = ()
     outer: OuterSolution | None = None
     agreed: bool = False
@@ -73,7 +83,7 @@ KnownSamples = Sequence[InnerSample | QuantitySample]
 
 
 @dataclass(frozen=True)
-class Terms:
+class RunTerms:
     """By which formulation, to what relative tolerance and from which seed a run goes; `began` on
     the clock of `perf_counter`."""
 
@@ -85,7 +95,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class GlobalCheck:
-    """What was looked at: true inner problems at `points` θ, `feasible` of these with a design.
+    """What was evaluated: true inner problems at `points` θ, `feasible` of these with a design.
 
     `fresh`: those that were solved for it; the run had solved the rest on its way.
     `better`: how many of them beat the J that the formulation came `before` with; `starts` local

@@ -9,8 +9,13 @@ from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 
-MANY = 12  # parameters up to which surrogates pay for their fit: docs/development/method.md
-SAMPLES = 1000  # inner problems of a plan over θ, some minutes
+
+@dataclass(frozen=True)
+class SurrogateLimits:
+    """Up to where surrogates are fast: docs/development/method.md."""
+
+    parameters: int = 12  # that a fit pays for
+    samples: int = 1000  # inner problems of a plan over θ, some minutes
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,20 @@ Formulation = Nested | Lifted | Direct
 
 
 def formulation_of(case: Case | None, name: str) -> Formulation:
-    """The formulation of that name with the options of a case file, or the default ones."""
+    """The formulation of that name.
+
+    Parameters
+    ----------
+    case : Case or None
+        Whose [sampling] and [outer] give the options; without one they are the defaults.
+    name : str
+        "nested", "lifted" or "direct".
+
+    Returns
+    -------
+    Nested, Lifted or Direct
+        The options by which it is solved.
+    """
     outer = OuterTable() if case is None else case.outer
     sampling = SamplingTable() if case is None else case.sampling
     rounds = (outer.starts, outer.tolerance, outer.max_refinements, outer.surrogate)
@@ -52,10 +70,22 @@ def formulation_of(case: Case | None, name: str) -> Formulation:
 
 
 def usual_name(case: Case, parameters: int) -> str:
-    """The formulation where the user names none: nested, or direct where nested has no end.
+    """The formulation where the user names none: nested, or direct where nested is too slow.
 
     With sections, of which each θ takes a second, it is lifted where that samples fewer θ;
-    `direct_starts = 1` says that each θ is dear: none is sampled.
+    `direct_starts = 1` says that each θ is expensive: none is sampled.
+
+    Parameters
+    ----------
+    case : Case
+        The case file.
+    parameters : int
+        n_θ.
+
+    Returns
+    -------
+    str
+        "nested", "lifted" or "direct".
     """
     listed = any(len(one.values) > 1 for one in case.theta)
     return _usual(case, parameters, case.controller.structure == "sections", listed)
@@ -76,15 +106,32 @@ def _usual(case: Case | None, parameters: int, sections: bool, listed: bool) -> 
     return "lifted" if sections and fewer else "nested"
 
 
-def slow_words(formulation: Formulation, parameters: int) -> str:
-    """Why a formulation is slow with so many parameters, in one line; empty where it is not."""
+def slow_words(
+    formulation: Formulation, parameters: int, limits: SurrogateLimits = SurrogateLimits()
+) -> str:
+    """Explain why a formulation is slow.
+
+    Parameters
+    ----------
+    formulation : Nested, Lifted or Direct
+        With its plan of samples.
+    parameters : int
+        n_θ.
+    limits : SurrogateLimits
+        Up to where surrogates are fast.
+
+    Returns
+    -------
+    str
+        One line; empty where it is not slow.
+    """
     why = ""
     if isinstance(formulation, Direct):
         return why
     if isinstance(formulation, Nested) and formulation.plan == "grid":
         count = formulation.sampled(parameters)
-        why = f"its grid is {count:.3g} inner problems" if count > SAMPLES else ""
-    if not why and parameters > MANY:
-        why = f"its surrogates are for {MANY} at most"
+        why = f"its grid is {count:.3g} inner problems" if count > limits.samples else ""
+    if not why and parameters > limits.parameters:
+        why = f"its surrogates are for {limits.parameters} at most"
     name = type(formulation).__name__.lower()
     return f"{name} is slow with {parameters} parameters: {why}; direct is not" if why else ""

@@ -15,9 +15,7 @@ from ccd_casadi.support.terminal import Progress
 from surrogates import GaussianProcess, Kernel, Quality, SurrogateFitError, condition, quality_of
 from surrogates.fitting import calibrated
 
-TAKEN = 1e-6  # relative: an error at a sample that is rounding
 BOUNDED = ("sensitivity_peak", "sensitivity_low", "compliance")  # whose logarithms are fitted
-SAME = 1e-6  # of the box: samples that are closer are of one place
 
 
 def kernels_of(kind: str) -> tuple[Kernel, ...]:
@@ -52,18 +50,27 @@ def interpolating(
     return calibrated(condition(exact, X, Y, **ends, kernel=process.kernel, dY=dY))
 
 
-def with_sample(process: GaussianProcess, x: Array, value: float, slope: Array) -> GaussianProcess:
+def with_sample(
+    process: GaussianProcess,
+    x: Array,
+    value: float,
+    slope: Array,
+    *,
+    same: float = 1e-6,
+    rounding: float = 1e-6,
+) -> GaussianProcess:
     """The process with one more sample (d,), its slope (d,) too where it has those of the others.
 
-    It takes the place of samples at the same x. The process as it is where it cannot take it, or
-    would say no better there.
+    It replaces samples at the same x, closer than `same` in shares of the box. The process as it is
+    where it cannot take it, or would predict no better there; a relative error up to `rounding`
+    is good enough.
     """
     n = len(process.X)
     sloped = process.targets.size > n
     width = process.upper - process.lower
     if sloped and not np.isfinite(slope).all():
         return process
-    others = np.abs(process.X - (x - process.lower) / width).max(axis=1) > SAME
+    others = np.abs(process.X - (x - process.lower) / width).max(axis=1) > same
     targets = process.output_scale * process.targets.reshape(-1, n)[:, others]
     dY = np.vstack([targets[1:].T / width, slope]) if sloped else None
     X = np.vstack([process.lower + width * process.X[others], x])
@@ -78,7 +85,7 @@ def with_sample(process: GaussianProcess, x: Array, value: float, slope: Array) 
             best = min(best, interpolating(process, X, Y, dY, longest), key=missed)
         except SurrogateFitError:
             continue
-        if missed(best) <= TAKEN * abs(value):
+        if missed(best) <= rounding * abs(value):
             break
     return best
 
@@ -99,7 +106,18 @@ def surrogate_quality(
 
 
 def recommendation(qualities: Sequence[Quality]) -> str:
-    """What follows from them, in one or two sentences; nothing where there is no surrogate."""
+    """What follows from the quality of surrogates.
+
+    Parameters
+    ----------
+    qualities : sequence of Quality
+        Of all surrogates of a run.
+
+    Returns
+    -------
+    str
+        One or two sentences; empty where there is no surrogate.
+    """
     if not qualities:
         return ""
     said, names = [], {q.name: q.name.replace("_", " ") for q in qualities}

@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.run_folder import sections_kappa
-from ccd_casadi.codesign.judgement import judge_on_model, second_on_set, second_on_weighted
+from ccd_casadi.codesign.final_judgement import judge_on_model, second_on_set, second_on_weighted
 from ccd_casadi.codesign.result_entries import (
     active_of,
     budget_entry,
@@ -47,9 +47,18 @@ from ccd_casadi.synthesis.synthesis import DesignFigures
 
 @dataclass(frozen=True)
 class InnerAnswer:
-    """What `inner` prints, and controller.json; `status` says "verified" or why there is none.
+    """What the command `inner` prints and writes.
 
-    `controller` is None where the problem is infeasible; `rows` are the figures of a sweep.
+    Attributes
+    ----------
+    status : str
+        "verified", "not_verified" or "infeasible".
+    figures : dict
+        JSON values by the keys of result.json.
+    controller : dict or None
+        controller.json; None where the problem is infeasible.
+    rows : tuple of DesignFigures
+        Of a sweep over (ω_S, ω_T).
     """
 
     status: str
@@ -60,10 +69,18 @@ class InnerAnswer:
 
 @dataclass(frozen=True)
 class InnerOptions:
-    """How an inner problem is searched: seed and processes, and what one kind only knows.
+    """How an inner problem is searched.
 
-    `point`: (ω_S, ω_T) in rad/s of a single synthesis. `begin_at`: a run folder whose controller
-    the search goes on from.
+    Attributes
+    ----------
+    seed, workers : int, Pool
+        Of random choices, and the processes.
+    tell : function of str
+        Takes lines of progress.
+    point : tuple of float or None
+        (ω_S, ω_T) in rad/s of a single mixed-sensitivity synthesis.
+    begin_at : Path or None
+        A run folder with whose controller of fixed structure the search starts.
     """
 
     seed: int
@@ -85,7 +102,27 @@ def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
 def mixed_answer(
     problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
 ) -> InnerAnswer:
-    """The true ω_b*(θ) by mixed sensitivity; at `options.point` that synthesis alone."""
+    """The true ω_b*(θ) by mixed sensitivity; at `options.point` that synthesis alone.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With mixed-sensitivity controllers.
+    theta : tuple of float
+        SI.
+    options : InnerOptions
+        How it is searched.
+
+    Returns
+    -------
+    InnerAnswer
+        With the best design, judged.
+
+    Raises
+    ------
+    UserError
+        `options.begin_at` is given.
+    """
     if options.begin_at is not None:
         raise UserError('--begin-at is for structure = "sections"; leave it out')
     point = options.point
@@ -138,7 +175,24 @@ def structured_answer(
 ) -> InnerAnswer:
     """The largest bandwidth (or least of another figure) at θ, judged over its box.
 
-    From the controller of the folder `options.begin_at` alone, where there is one.
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With controllers of fixed structure.
+    theta : tuple of float
+        SI.
+    options : InnerOptions
+        With `begin_at` that controller is the only start.
+
+    Returns
+    -------
+    InnerAnswer
+        With the best design, judged.
+
+    Raises
+    ------
+    UserError
+        `options.point` is given.
     """
     if options.point is not None:
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,11 @@ import numpy as np
 from ccd_casadi.fixed_structure.channel_structure import in_units_of
 from ccd_casadi.fixed_structure.composite import on_plants
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
+from ccd_casadi.fixed_structure.figures import HessianOptions, assess, hessians, to_theta
 from ccd_casadi.fixed_structure.local_search import Point, all_rows, ascend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import LATTICE
+from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
 from ccd_casadi.inner_problem.objective import hardware_at
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_plant_set import (
@@ -27,27 +27,44 @@ from ccd_casadi.inner_problem.structured_plant_set import (
 )
 from ccd_casadi.inner_problem.structured_problem import Scenario
 from ccd_casadi.inner_problem.structured_robustness import violations
-from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, minimise
+from ccd_casadi.optim.trust_region import (
+    Iterate,
+    Radius,
+    Rows,
+    StepOptions,
+    TrustRegionModel,
+    minimise,
+)
 from ccd_casadi.plants.plant import Evaluate, Mechanics, hardware_cost, to_first_order
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 
-# A few times the sum of multipliers: less, and a violation of second order counts less.
-PENALTY = 6.0
-STEPS, ADAPTING = 60, 15  # of a search, and of the controller alone at its end
-FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
-LEAST_GAIN = 1e-7  # of w2 ω_b
-LAST, FADED = 12, 0.15  # trials that gain less of all that was gained: made anew, plants tell more
-SETTLED = 3e-4  # of J: less is not worth another set of plants
-INSIDE = 1e-8  # of λ's size: what rounding leaves of an elastic row must not break it
-FLAT = 1e-3  # slope of λ per box, over its size: less is none
-FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
+
+@dataclass(frozen=True)
+class JointModelOptions:
+    """Numbers of one search over θ, controller and ω_b on models of the plants."""
+
+    penalty: float = (
+        6.0  # a few times the sum of multipliers, or second-order violation counts less
+    )
+    steps: int = 60
+    adapting_steps: int = 15  # of the controller alone, at the end
+    first_radius: float = 0.05  # of κ and z, in shares of their ranges
+    largest_radius: float = 0.5
+    least_radius: float = 1e-7
+    least_gain: float = 1e-7  # of w2 ω_b: a step that promises less is the last
+    late_trials: int = 12  # with little gained by these the plants are evaluated anew
+    late_share: float = 0.15  # of all that was gained: less is little
+    settled: float = 3e-4  # of J: less is not worth another evaluation of the plants
+    constraint_margin: float = 1e-8  # of λ's size: rounding of an elastic row must not break it
+    least_slope: float = 1e-3  # of λ per box, over its size: less counts as this
+    row_reach: float = 3.0  # radii of κ and τ by which a row that counts may be below its bound
 
 
 @dataclass(frozen=True)
 class JointPoint:
-    """θ, κ (SI) and ω_b in rad/s, which may exceed the bounds a little."""
+    """θ, κ (SI) and ω_b in rad/s, at which rows may exceed their bounds a little."""
 
     theta: tuple[float, ...]
     kappa: tuple[float, ...]
@@ -67,38 +84,76 @@ def proposed(
     models: Sequence[Evaluate],
     at: JointPoint,
     reach: float,
-    least_gain: float = LEAST_GAIN,
-    bent: bool = False,
+    least_gain: float | None = None,
+    curved_plants: bool = False,
+    options: JointModelOptions = JointModelOptions(),
 ) -> Proposal:
-    """The end of one search around a place, on the plants of these models; see `JointModel`."""
-    model = JointModel(problem, models, at, reach)
-    model.bent = bent
-    start = model.at(model.start)
+    """The end of one search around a place, on the plants of these models; see `JointModel`.
+
+    With `least_gain` (of w2 ω_b) it goes on to there; without, it ends where it gains slowly."""
+    model = JointModel(problem, models, at, reach, curved_plants, least_gain is None, options)
+    start = model.beginning
     if start is None:
         return Proposal(at, 0.0)
-    if least_gain == LEAST_GAIN:
-        model.enough = SETTLED * abs(start.value)
-    n, radius = len(start.x), Radius(min(FIRST, reach), NARROWEST, WIDEST)
+    least = options.least_gain if least_gain is None else least_gain
+    first = min(options.first_radius, reach)
+    radius = Radius(first, options.least_radius, options.largest_radius)
+    H = np.zeros((len(start.x), len(start.x)))
     end = minimise(
-        model, start, np.zeros((n, n)), radius, steps=STEPS, penalty=PENALTY, least_gain=least_gain
+        model, start, H, radius, steps=options.steps, penalty=options.penalty, least_gain=least
     ).best
-    gain = start.value - end.value + PENALTY * (start.violation - end.violation)
+    gain = start.value - end.value + options.penalty * (start.violation - end.violation)
     return Proposal(model.place(end.x), model.unit * float(gain))
 
 
-class JointModel(Model[tuple[LoopProblem, Assessment]]):
+@dataclass(frozen=True, eq=False)
+class JointLoops:
+    """The loops of an iterate at κ (their units) and τ, with their assessment."""
+
+    loops: LoopProblem
+    kappa: Array
+    tau: float
+    found: Assessment
+
+    @cached_property
+    def rows(self) -> Constraints:
+        """Peaks and the grid near them."""
+        return all_rows(self.loops, self.kappa, self.tau, self.found)
+
+
+class JointModel(TrustRegionModel[JointLoops]):
     """J over its `unit`, w2 ω_b in the middle, around a place; over x = (z, κ, τ), with the loops
-    at x. With `bent` the plants' own curvature counts: not far from an optimum, as a model may jump
-    where a mode that it keeps meets another."""
+    at x.
+
+    Parameters
+    ----------
+    problem, models : CoDesignProblem, sequence of Evaluate
+        J, and the plants by θ.
+    place : JointPoint
+        The middle.
+    reach : float
+        How far z may go from it, in shares of the box of θ.
+    curved_plants : bool
+        Whether the models' own curvature counts: only near an optimum, as a model may jump where a
+        mode that it keeps meets another.
+    ends_early : bool
+        Whether a search ends where its last trials gain little: it counts the trials of one.
+    """
 
     corrected = bending = True
-    programmes, little = 60, 1e-3  # that cost little beside a trial
-    bent = False
-    enough = np.inf  # of what is minimised: with less gained no search ends before its optimum
+    step_options = StepOptions(programmes=60, little=1e-3)  # they cost little beside a trial
 
     def __init__(
-        self, problem: CoDesignProblem, models: Sequence[Evaluate], place: JointPoint, reach: float
+        self,
+        problem: CoDesignProblem,
+        models: Sequence[Evaluate],
+        place: JointPoint,
+        reach: float,
+        curved_plants: bool = False,
+        ends_early: bool = False,
+        options: JointModelOptions = JointModelOptions(),
     ) -> None:
+        self.curved_plants, self.ends_early, self.options = curved_plants, ends_early, options
         self.problem, self.models, self.middle = problem, models, np.array(place.theta)
         structured = structured_of(problem)
         known = [(option, np.array(point)) for option, point in structured.scenarios]
@@ -113,14 +168,10 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         # λ in units in which the penalty exceeds what breaking it saves of the hardware.
         own = hardware_at(problem, self.middle)
         saved = np.abs(own.cost_gradient).max(initial=0.0) / self.unit
-        steep = np.maximum(np.abs(own.slopes).max(axis=1, initial=0.0), FLAT)
-        self.weight = np.maximum(1.0, 2.0 * saved / (PENALTY * steep))
-        self.merits: list[float] = []  # before every trial
-        # A step that fails is followed by one from the same place.
-        self.loops_beside = lru_cache(1)(self._loops_beside)
-        self.all_rows = lru_cache(2)(
-            lambda here: all_rows(here.data[0], *self.parts(here.x)[1:], here.data[1])
-        )
+        steep = np.maximum(np.abs(own.slopes).max(axis=1, initial=0.0), options.least_slope)
+        self.weight = np.maximum(1.0, 2.0 * saved / (options.penalty * steep))
+        self._merits: list[float] = []  # before every trial of a search
+        self._beside: tuple[JointLoops, list[LoopProblem]] | None = None  # the last ones
         self.tau = float(np.log(place.bandwidth / loops.plants.omega_0))
         kappa = np.clip(in_problem_units(loops, np.array(place.kappa)), *loops.box)
         self.start = np.concatenate([middle, kappa, [self.tau]])
@@ -128,28 +179,35 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
         self.low = np.concatenate([low, loops.box[0], [-np.inf]])
         self.high = np.concatenate([high, loops.box[1], [np.inf]])
 
+    @cached_property
+    def beginning(self) -> Iterate[JointLoops] | None:
+        """The iterate in the middle."""
+        return self.at(self.start)
+
     def place(self, x: Array) -> JointPoint:
         """That of x."""
-        z, kappa, tau = self.parts(x)
+        z, scaled, tau = self.parts(x)
         loops = self.first_loops
-        kappa = loops.structure.in_units(kappa, loops.plants.omega_0, loops.plants.force)
+        kappa = loops.structure.in_units(scaled, loops.plants.omega_0, loops.plants.force)
         theta = np.clip(self.theta(z), *box(self.problem))
         omega_b = float(np.exp(tau) * loops.plants.omega_0)
         return JointPoint(tuple(map(float, theta)), tuple(map(float, kappa)), omega_b)
 
-    def adapted(self, steps: int = ADAPTING) -> tuple[JointPoint, float]:
-        """The middle after a few steps of the controller alone, and J there with what is left of a
-        violation; infinite where a loop is unstable."""
+    def adapted(self, steps: int | None = None) -> tuple[JointPoint, float]:
+        """The middle after a few steps of the controller alone, and J there with the penalty of
+        the violation that is left; infinite where a loop is unstable."""
+        options, steps = self.options, self.options.adapting_steps if steps is None else steps
         z, kappa, tau = self.parts(self.start)
         found = assess(self.first_loops, kappa, tau)
         if not found.stable:
             return self.place(self.start), np.inf
-        point = ascend(self.first_loops, Point(kappa, tau, found), iterations=steps,
-                       radius=FIRST).point  # fmt: skip
+        begun = Point(kappa, tau, found)
+        radius = options.first_radius
+        point = ascend(self.first_loops, begun, iterations=steps, radius=radius).point
         x = np.concatenate([z, point.kappa, [point.tau]])
         unmet = hardware_at(self.problem, self.middle).constraints * self.weight
         worth = np.exp(point.tau - self.tau)
-        worth -= PENALTY * max(point.assessment.violation, float(unmet.max(initial=0.0)))
+        worth -= options.penalty * max(point.assessment.violation, float(unmet.max(initial=0.0)))
         cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.middle)
         return self.place(x), float(cost - self.unit * worth)
 
@@ -187,55 +245,68 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
             structured.sampling, structured.frequencies,
         )  # fmt: skip
 
-    def _loops_beside(self, here: Iterate[tuple[LoopProblem, Assessment]]) -> list[LoopProblem]:
+    def loops_beside(self, here: Iterate[JointLoops]) -> list[LoopProblem]:
+        """The loops a small step of each z away. A step that fails is followed by one from the same
+        place: the last ones are kept."""
+        if self._beside is None or self._beside[0] is not here.data:
+            self._beside = here.data, self._loops_beside(here)
+        return self._beside[1]
+
+    def _loops_beside(self, here: Iterate[JointLoops]) -> list[LoopProblem]:
         z, sampling = self.parts(here.x)[0], structured_of(self.problem).sampling
         known, found = self.known(z), []
-        for step in BESIDE * np.eye(len(z)):
+        for step in HessianOptions.parameter_step * np.eye(len(z)):
             moved = (
                 self.known(z + step)
-                if self.bent
+                if self.curved_plants
                 else [to_first_order(one, self.width * step) for one in known]
             )
-            found.append(on_plants(here.data[0], self.plants(z + step, moved), sampling))
+            found.append(on_plants(here.data.loops, self.plants(z + step, moved), sampling))
         return found
 
-    def at(self, x: Array) -> Iterate[tuple[LoopProblem, Assessment]] | None:
+    def at(self, x: Array) -> Iterate[JointLoops] | None:
         """With every loop stable, and masses that are positive to first order."""
         x = np.clip(x, self.low, self.high)
         z, kappa, tau = self.parts(x)
         try:
-            problem = self.loops(z)
+            loops = self.loops(z)
         except np.linalg.LinAlgError:  # placed masses move so far that M + ∂M Δθ is indefinite
             return None
-        found = assess(problem, kappa, tau)
+        found = assess(loops, kappa, tau)
         if not found.stable:
             return None
         own, worth = hardware_at(self.problem, self.theta(z)), float(np.exp(tau - self.tau))
         cost = self.problem.w1 * hardware_cost(plant_of(self.problem), self.theta(z))
         slope = np.concatenate([own.cost_gradient / self.unit, np.zeros(len(kappa)), [-worth]])
-        unmet = (own.constraints + INSIDE) * self.weight
+        unmet = (own.constraints + self.options.constraint_margin) * self.weight
         violation = max(found.violation, float(unmet.max(initial=0.0)))
-        return Iterate(x, cost / self.unit - worth, slope, violation, (problem, found))
+        data = JointLoops(loops, kappa, tau, found)
+        return Iterate(x, cost / self.unit - worth, slope, violation, data)
 
-    def ended(self, here: Iterate[tuple[LoopProblem, Assessment]], there: Iterate[Any]) -> bool:
+    def ended(self, here: Iterate[JointLoops], there: Iterate[Any]) -> bool:
         """Where the last trials gain little of what all have."""
-        self.merits.append(here.value + PENALTY * here.violation)
-        gained = self.merits[0] - self.merits[-1]
-        late = self.merits[-LAST:][0] - self.merits[-1]
-        return len(self.merits) > LAST and gained > self.enough and late < FADED * gained
+        if not self.ends_early or self.beginning is None:
+            return False
+        merits, options = self._merits, self.options
+        merits.append(here.value + options.penalty * here.violation)
+        gained, late = merits[0] - merits[-1], merits[-options.late_trials :][0] - merits[-1]
+        enough = gained > options.settled * abs(self.beginning.value)
+        return len(merits) > options.late_trials and enough and late < options.late_share * gained
 
-    def rows(self, here: Iterate[tuple[LoopProblem, Assessment]], radius: float) -> Rows:
+    def rows(self, here: Iterate[JointLoops], radius: float) -> Rows:
         """Peaks, the grid near them, and λ."""
         z, kappa, tau = self.parts(here.x)
-        problem, assessment = here.data
-        assert assessment.peaks is not None
-        found, count, peaks = self.all_rows(here), len(z), len(assessment.peaks.v)
+        loops, peaks = here.data.loops, here.data.found.peaks
+        assert peaks is not None
+        found, count = here.data.rows, len(z)
         steep = np.abs(found.to_kappa).sum(1) + np.abs(found.to_tau)
-        kept = np.flatnonzero(found.value + FAR * radius * np.maximum(steep, 1.0) > 0.0)
+        kept = np.flatnonzero(
+            found.value + self.options.row_reach * radius * np.maximum(steep, 1.0) > 0.0
+        )
         found = found.only(kept)
-        slopes = np.column_stack([to_theta(problem, kappa, found), found.to_kappa, found.to_tau])
+        slopes = np.column_stack([to_theta(loops, kappa, found), found.to_kappa, found.to_tau])
         own = hardware_at(self.problem, self.theta(z))
-        unmet = (own.constraints + INSIDE) * self.weight
+        unmet = (own.constraints + self.options.constraint_margin) * self.weight
         of_z = np.pad(self.weight[:, None] * own.slopes, ((0, 0), (0, len(here.x) - count)))
 
         def second(index: np.ndarray) -> Array:
@@ -244,23 +315,36 @@ class JointModel(Model[tuple[LoopProblem, Assessment]]):
                 beside = self.loops_beside(here)
             except np.linalg.LinAlgError:  # as in `at`: no curvature is known at the edge
                 return np.zeros((len(chosen.value), len(here.x), len(here.x)))
-            return hessians(problem, kappa, tau, chosen, beside)
+            return hessians(loops, kappa, tau, chosen, beside)
 
         return Rows(
             np.concatenate([found.value, unmet]), np.vstack([slopes, of_z]),
-            hessians=second, curved=int((kept < peaks).sum()),
+            hessians=second, curved=int((kept < len(peaks.v)).sum()),
         )  # fmt: skip
 
 
-MANY = 12  # plants up to which all stay
-NEAR = 0.1  # ln: below its bound, where a row counts, and between frequencies of one peak
-EQUAL = 1e-6  # ln: rows that differ by rounding, as of rigid bodies alike
+@dataclass(frozen=True)
+class WorkingSetOptions:
+    """Numbers by which plants leave a working set."""
+
+    most_plants: int = 12  # up to which all stay
+    near: float = 0.1  # ln: below its bound, where a row counts, and between frequencies of a peak
+    equal: float = 1e-6  # ln: rows that differ by rounding, as of rigid bodies alike
 
 
 @dataclass(frozen=True)
 class WorkingSet:
-    """The sampler of the problem with the plants that count, those that are aside, and those that
-    came back from there: they stay."""
+    """The plants of a set that count in a search.
+
+    Attributes
+    ----------
+    sampler : Sampler
+        Of the problem with the plants that count.
+    aside : tuple of Scenario
+        Plants that were left out, as others hold the controller.
+    back : frozenset of Scenario
+        Plants that came back from there: they stay.
+    """
 
     sampler: Sampler
     aside: tuple[Scenario, ...] = ()
@@ -271,22 +355,28 @@ class WorkingSet:
         """With those aside too: at an end plants that bind in turns would bring each other back."""
         return WorkingSet(with_scenarios(self.sampler, self.aside)) if self.aside else self
 
-    def reduced(self, models: Sequence[Evaluate], at: JointPoint) -> "WorkingSet":
+    def reduced(
+        self,
+        models: Sequence[Evaluate],
+        at: JointPoint,
+        options: WorkingSetOptions = WorkingSetOptions(),
+    ) -> "WorkingSet":
         """Without the plants that do not hold the controller there."""
         problem = self.sampler.problem
         scenarios = structured_of(problem).scenarios
-        if len(scenarios) <= MANY:
+        if len(scenarios) <= options.most_plants:
             return self
-        model = JointModel(problem, models, at, 0.0)
-        here = model.at(model.start)
+        here = JointModel(problem, models, at, 0.0).beginning
         if here is None:
             return self
-        loops, peaks = here.data[0], here.data[1].peaks
+        loops, peaks = here.data.loops, here.data.found.peaks
         assert peaks is not None
-        near = np.flatnonzero(peaks.value > -NEAR)
+        near = np.flatnonzero(peaks.value > -options.near)
         rows = peaks.only(near[np.argsort(-peaks.value[near], kind="stable")])
         gains = np.column_stack([rows.curve, loops.gains_of(rows)]).tolist()
-        kept = holding(loops.plants_of(rows), list(map(tuple, gains)), np.log(rows.v), rows.value)
+        kept = holding(
+            loops.plants_of(rows), list(map(tuple, gains)), np.log(rows.v), rows.value, options
+        )
         kept |= {number for number, one in enumerate(scenarios) if one in self.back}
         counted = tuple(one for number, one in enumerate(scenarios) if number in kept)
         aside = (one for number, one in enumerate(scenarios) if number not in kept)
@@ -297,26 +387,30 @@ class WorkingSet:
         self,
         models: Sequence[Evaluate],
         best: JointPoint,
-        looks: Sequence[int],
+        seeds: Sequence[int],
         within: float,
-        tell: Callable[[str], None] | None,
-        count: int = LATTICE,
+        report: Callable[[str], None] | None,
+        count: int = WorstPlantOptions.lattice,
+        options: JointModelOptions = JointModelOptions(),
     ) -> tuple["WorkingSet", JointPoint, float]:
         """With the plants on which the controller exceeds a bound, the controller adapted to them,
-        and J there; `looks`: the searches for worse plants, one after the other, each elsewhere in
-        the box, from a lattice of `count`."""
+        and J there.
+
+        `seeds`: the numbers of the searches for worse plants, one after the other, each elsewhere
+        in the box, from a lattice of `count`; `within`: ln, by how much a plant may exceed."""
         sampler, aside, back, J = self.sampler, self.aside, self.back, np.inf
-        for look in looks:
+        for seed in seeds:
             problem, known = sampler.problem, [model(best.theta) for model in models]
             uncertain, kappa = uncertain_plant(problem, best.theta, known), np.array(best.kappa)
             scenarios = violations(
-                problem, uncertain, kappa, best.bandwidth, look, tell, within, aside, count
+                problem, uncertain, kappa, best.bandwidth, seed, report, within, aside, count
             )[1]
             if scenarios:
                 sampler = with_scenarios(sampler, scenarios)
                 back |= set(aside) & set(scenarios)
                 aside = tuple(one for one in aside if one not in scenarios)
-            best, J = JointModel(sampler.problem, models, best, 0.0).adapted()
+            model = JointModel(sampler.problem, models, best, 0.0, options=options)
+            best, J = model.adapted()
             if not np.isfinite(J):
                 break
         working = self if sampler is self.sampler else WorkingSet(sampler, aside, back)
@@ -324,8 +418,20 @@ class WorkingSet:
 
 
 def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:
-    """The sampler of the problem with more plants: on these what was found before is worth
-    nothing."""
+    """Add plants to the problem: on these what was found before is worth nothing.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the problem without them; its trace loses its values of J.
+    scenarios : sequence of Scenario
+        Plants by option and what differs, SI.
+
+    Returns
+    -------
+    Sampler
+        Of the problem that has them.
+    """
     trace = sampler.trace
     trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
     known = structured_of(sampler.problem).scenarios
@@ -333,15 +439,19 @@ def with_scenarios(sampler: Sampler, scenarios: Sequence[Scenario]) -> Sampler:
 
 
 def holding(
-    plants: np.ndarray, gains: Sequence[tuple[int, ...]], log_v: Array, value: Array
+    plants: np.ndarray,
+    gains: Sequence[tuple[int, ...]],
+    log_v: Array,
+    value: Array,
+    options: WorkingSetOptions = WorkingSetOptions(),
 ) -> set[int]:
-    """Plants of rows, the largest first, without those whose every row lies below one of a plant
-    before it: of one gain, within `NEAR` in ln of frequency."""
+    """Plants of rows, the largest first, without those whose every row is below one of a plant
+    before it: of one gain, at a frequency that is `near`."""
     kept, seen = set[int](), defaultdict[tuple[int, ...], list[int]](list)
     of = [np.flatnonzero(plants == plant) for plant in range(plants.max(initial=-1) + 1)]
     for row, (plant, gain) in enumerate(zip(plants.tolist(), gains, strict=True)):
-        above = [i for i in seen[gain] if value[i] >= value[row] - EQUAL]
-        if plant in kept or (np.abs(log_v[above] - log_v[row]) < NEAR).any():
+        above = [i for i in seen[gain] if value[i] >= value[row] - options.equal]
+        if plant in kept or (np.abs(log_v[above] - log_v[row]) < options.near).any():
             continue
         kept.add(plant)
         for i in of[plant].tolist():

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.kkt import (
-    INSIDE,
-    SAME_PEAK,
+from ccd_casadi.codesign.lifted_kkt import (
+    LiftedKktOptions,
     TrueDesign,
     first_order,
     newton_step,
@@ -26,18 +25,31 @@ from ccd_casadi.codesign.kkt import (
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.optim.kkt import damped_bfgs
-from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, minimise
+from ccd_casadi.optim.trust_region import Iterate, Radius, Rows, Step, TrustRegionModel, minimise
 from ccd_casadi.support.arrays import Array
 
-BAND = 0.25  # ln: peaks this close to their bound are constraints of a step
-FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
-SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
-SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from where ω_b jumps
-FLATTEST = 1e-3  # the least it comes down to, where a shelf turns out to be straight
-BASIN = 1e-2  # of the box: this close to an end that is known, and no lower, is its basin
-ON_EDGE = 1e-4  # ln: so close to a kink or a jump the Hessian at a design is not that beside it
-STATIONARY = 1e-7  # scaled KKT residual below which a descent has nothing to do
-NEWTON, EXACT = 1e-4, 1e-9  # stationarity from which Newton's steps start, and where they end
+
+@dataclass(frozen=True)
+class PeakDescentOptions:
+    """Numbers of the descent on the true problem and of the polish after it."""
+
+    band: float = 0.25  # ln: peaks this close to their bound are constraints of a step
+    first_radius: float = 0.1  # of the box
+    largest_radius: float = 0.4
+    least_radius: float = 1e-9
+    steps: int = 30
+    settled: float = 1e-9  # of J: a model that promises less ends the descent
+    polish_steps: int = 80
+    polish_settled: float = 1e-13  # of J
+    # ln per (share of the box)²: how far a peak below -3 dB may depart from its slope
+    first_curvature: float = 10.0
+    least_curvature: float = 1e-3
+    basin: float = 1e-2  # of the box: this close to an end that is known, and no lower, is one
+    at_kink: float = 1e-4  # ln: so close to a kink or a jump the Hessian is not that beside it
+    stationary: float = 1e-7  # scaled KKT residual below which a descent has nothing to do
+    newton_from: float = 1e-4  # stationarity from which Newton's steps start
+    newton_to: float = 1e-9  # and where they end
+    newton_steps: int = 3
 
 
 @dataclass(frozen=True)
@@ -56,45 +68,56 @@ class _Design:
         if not rows:
             return None
         nearest = min(rows, key=lambda i: abs(self.tags[i][1] - place))
-        return nearest if abs(self.tags[nearest][1] - place) <= SAME_PEAK else None
+        return (
+            nearest if abs(self.tags[nearest][1] - place) <= LiftedKktOptions().same_peak else None
+        )
 
 
 def descend(
     truth: TrueQuantities,
     x: Array,
     *,
-    steps: int = 30,
-    settled: float = SETTLED,
+    steps: int | None = None,
+    settled: float | None = None,
     ended: Sequence[tuple[Array, float]] = (),
+    options: PeakDescentOptions = PeakDescentOptions(),
 ) -> Array:
     """From a certified design to the nearest optimum of the true problem; the best x found.
 
-    At most `steps` designs are asked for; none more once it is in the basin of an optimum (x, J)
-    where others `ended`. Returns the start where it is not certified.
+    At most `steps` designs are evaluated, and none more once it is in the basin of an optimum
+    (x, J) where others `ended`. Returns the start where it is not certified.
     """
-    model = _Peaks(truth, ended)
+    steps = options.steps if steps is None else steps
+    settled = options.settled if settled is None else settled
+    model = _Peaks(truth, ended, options)
     here = model.at(model.box.shares(x))
     if here is None or model.ended(here, here):
         return x
     scale = max(float(np.abs(here.gradient).max()), 1e-300)
+    radius = Radius(options.first_radius, options.least_radius, options.largest_radius)
     end = minimise(
-        model, here, scale * np.eye(x.size), Radius(FIRST, LEAST, LARGEST), steps=steps,
-        penalty=scale, least_gain=settled * abs(here.value),
+        model, here, scale * np.eye(x.size), radius, steps=steps, penalty=scale,
+        least_gain=settled * abs(here.value),
     )  # fmt: skip
     return model.box.lower + model.box.width * end.best.x
 
 
-class _Peaks(Model[_Design]):
+class _Peaks(TrustRegionModel[_Design]):
     """The true problem in unit-box variables."""
 
     growing = True
 
-    def __init__(self, truth: TrueQuantities, known: Sequence[tuple[Array, float]]) -> None:
-        self.truth = truth
+    def __init__(
+        self,
+        truth: TrueQuantities,
+        known: Sequence[tuple[Array, float]],
+        options: PeakDescentOptions,
+    ) -> None:
+        self.truth, self.options = truth, options
         self.box = lifted_bounds(truth.problem)
         self.low, self.high = np.zeros_like(self.box.lower), np.ones_like(self.box.lower)
         self.known = [(self.box.shares(at), J) for at, J in known]
-        self.bend = SHELF
+        self.curvature = options.first_curvature  # of a peak below -3 dB, as learnt so far
 
     def at(self, x: Array) -> Iterate[_Design] | None:
         """A certified design with ∇J, its constraints and its peaks."""
@@ -103,8 +126,8 @@ class _Peaks(Model[_Design]):
         made = there.design
         if not made.figures.certified or made.made is None:
             return None
-        peaks = other_peaks(there.problem, there.x, made, BAND)
-        rows = first_order(there, peaks, INSIDE)
+        peaks = other_peaks(there.problem, there.x, made, self.options.band)
+        rows = first_order(there, peaks, there.options.inside)
         place = float(np.log(made.figures.sensitivity_peak_frequency))
         others = [(name, 0.0, 0) for name in rows.names[1 : len(rows.names) - len(peaks)]]
         tags = (("peak", place, made.made.worst), *others, *(peak.tag for peak in peaks))
@@ -115,14 +138,14 @@ class _Peaks(Model[_Design]):
         """Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong."""
         found = here.data
         shelf = np.array([kind == "shelf" for kind, _, _ in found.tags])
-        margin = self.bend * radius**2 * shelf if shelf.any() else None
+        margin = self.curvature * radius**2 * shelf if shelf.any() else None
         return Rows(found.g, found.jacobian, margin=margin)
 
     def learnt(
         self, H: Array, here: Iterate[_Design], there: Iterate[_Design], step: Step, radius: float
     ) -> Array:
         """With the change of the Lagrangian's gradient."""
-        self.bend = _bend(here, there, self.bend)
+        self.curvature = _curvature(here, there, self.curvature, self.options)
         after = there.gradient.copy()
         for value, tag in zip(step.multipliers, here.data.tags, strict=True):
             row = there.data.same(tag)
@@ -135,14 +158,19 @@ class _Peaks(Model[_Design]):
 
     def ended(self, here: Iterate[_Design], there: Iterate[_Design]) -> bool:
         """In the basin of an end that is known, and no lower."""
-        return any(there.value >= J and np.abs(there.x - z).max() <= BASIN for z, J in self.known)
+        return any(
+            there.value >= J and np.abs(there.x - z).max() <= self.options.basin
+            for z, J in self.known
+        )
 
 
-def _bend(here: Iterate[_Design], there: Iterate[_Design], bend: float) -> float:
-    """How far a shelf may depart from its slope, ln per (share of the box)², after a step.
+def _curvature(
+    here: Iterate[_Design], there: Iterate[_Design], before: float, options: PeakDescentOptions
+) -> float:
+    """How far a peak below -3 dB may depart from its slope, ln per (share of the box)².
 
-    Twice what was seen, but at least a quarter of what was feared before; four times what was
-    feared where a shelf was passed.
+    After a step twice what it showed, but at least a quarter of what was assumed `before`; four
+    times that where such a peak was lost.
     """
     d = there.x - here.x
     size = float(np.abs(d).max())
@@ -150,28 +178,31 @@ def _bend(here: Iterate[_Design], there: Iterate[_Design], bend: float) -> float
     for value, row, tag in zip(here.data.g, here.data.jacobian, here.data.tags, strict=True):
         if tag[0] == "shelf" and size > 1e-6:
             same = there.data.same(tag)
-            if same is None and value + row @ d > -BAND:
-                return 4.0 * bend
+            if same is None and value + row @ d > -options.band:
+                return 4.0 * before
             if same is not None:
                 seen.append(abs(there.data.g[same] - value - float(row @ d)) / size**2)
-    return max(0.25 * bend, 2.0 * max(seen), FLATTEST) if seen else bend
+    return max(0.25 * before, 2.0 * max(seen), options.least_curvature) if seen else before
 
 
-def polish(truth: TrueQuantities, x: Array) -> TrueDesign:
+def polish(
+    truth: TrueQuantities, x: Array, options: PeakDescentOptions = PeakDescentOptions()
+) -> TrueDesign:
     """From a design nearly optimal to the nearest stationary point of the true problem.
 
-    A descent past kinks, every peak of S a constraint of its own (some ten designs where IPOPT
+    A descent past kinks, every peak of S a constraint (some ten designs where IPOPT
     takes a hundred), then Newton's steps as long as the residual falls, where no other peak is
     near. Returns the start itself where neither finds better that is certified and feasible.
     """
     here = TrueDesign(truth, x)
-    if not (here.acceptable and here.residual <= STATIONARY):
-        end = TrueDesign(truth, descend(truth, x, steps=80, settled=1e-13))
+    if not (here.acceptable and here.residual <= options.stationary):
+        steps, settled = options.polish_steps, options.polish_settled
+        end = TrueDesign(truth, descend(truth, x, steps=steps, settled=settled, options=options))
         if end.acceptable and (not here.acceptable or _improves(here, end)):
             here = end
-    for _ in range(3 if here.acceptable else 0):
-        near = EXACT < here.kkt.stationarity <= NEWTON
-        if not near or other_peaks(here.problem, here.x, here.design, ON_EDGE):
+    for _ in range(options.newton_steps if here.acceptable else 0):
+        near = options.newton_to < here.kkt.stationarity <= options.newton_from
+        if not near or other_peaks(here.problem, here.x, here.design, options.at_kink):
             break
         step = newton_step(here)
         end = here if step is None else TrueDesign(truth, step)

@@ -9,7 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
+from ccd_casadi.codesign.formulation import (
+    FormulationResult,
+    FormulationRound,
+    KnownSamples,
+    iterate_of,
+)
 from ccd_casadi.codesign.gaussian_processes import best_left_out, interpolating, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -20,19 +25,10 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.inner_problem.objective import constraint_shares, objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.sampling.inner_samples import QuantitySample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design, fit_outputs, to_casadi
-
-STEP = 1e-4  # share of the box below which a step counts as small
-SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
-REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated anew
-# IPOPT aims this far inside ln S_max and ln S_low: about the surrogates' error at the end, so
-# that the truth is feasible there and has nothing left to be polished.
-MARGIN = 1e-7
-FRESH = 4  # of the starts, one in so many is new in a round after the first
-FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polish then mends
 
 
 @dataclass(frozen=True)
@@ -61,8 +57,27 @@ class Lifted:
         return self.points or 6 * variables
 
 
+@dataclass(frozen=True)
+class LiftedRoundOptions:
+    """Numbers of the rounds of the lifted formulation."""
+
+    small_step: float = 1e-4  # share of the box below which a step counts as none
+    settled: float = 0.1  # of the tolerance: a change of J below it counts as none
+    refit_growth: float = 1.25  # of the samples, at which hyperparameters are estimated anew
+    # ln: how far inside S_max and S_low IPOPT aims: about the surrogates' error at the end, so
+    # that the truth is feasible there and the polish has nothing to correct.
+    margin: float = 1e-7
+    fresh: int = 4  # one in this many starts is new, in a round after the first
+    slack: float = 1e-6  # ln: of S_max and S_low, which the polish then corrects
+
+
 def solve_lifted(
-    sampler: Sampler, options: Lifted, *, seed: int, given: KnownSamples | None = None
+    sampler: Sampler,
+    options: Lifted,
+    *,
+    seed: int,
+    given: KnownSamples | None = None,
+    rounds: LiftedRoundOptions = LiftedRoundOptions(),
 ) -> FormulationResult:
     """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
 
@@ -79,23 +94,23 @@ def solve_lifted(
     if len(samples) < n + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(message=message)
-    iterates: list[Iterate] = []
+    iterates: list[FormulationRound] = []
     incumbent: QuantitySample | None = None
     processes: tuple[GaussianProcess, ...] = ()
     solution: OuterSolution | None = None
     agreed, fitted = False, 0
     for round_number in range(options.max_refinements + 1):
-        if len(samples) >= REFIT * fitted:
+        if len(samples) >= rounds.refit_growth * fitted:
             processes = fit_quantities(problem, samples, seed, kind=options.kernel)
             fitted = len(samples)
         elif len(samples) > len(processes[0].X):
             processes = update_quantities(samples, processes)
-        program = outer_program(problem, to_casadi(processes, std=False), margin=MARGIN)
+        program = outer_program(problem, to_casadi(processes, std=False), margin=rounds.margin)
         spread = design("sobol", *bounds, options.starts, seed + round_number)
         if incumbent is not None:
             # One sample moves the surrogates' optima, and seldom makes one: the last round's lead.
             known = [] if solution is None else [optimum.x for optimum in solution.optima]
-            spread = np.vstack([incumbent.x, *known, spread[: options.starts // FRESH]])
+            spread = np.vstack([incumbent.x, *known, spread[: options.starts // rounds.fresh]])
         try:
             solution = solve_program(program, spread)
         except OuterFailure as error:
@@ -114,12 +129,12 @@ def solve_lifted(
         iterates.append(iterate)
         settled = incumbent is not None and abs(
             iterate.objective - _objective(problem, incumbent)
-        ) <= SETTLED * options.tolerance * abs(iterate.objective)
+        ) <= rounds.settled * options.tolerance * abs(iterate.objective)
         if sample.certified:
             samples.append(sample)
-            incumbent = _better(problem, incumbent, sample)
+            incumbent = _better(problem, incumbent, sample, rounds)
         agreed = iterate.error <= options.tolerance
-        if agreed and (iterate.step <= STEP or settled):
+        if agreed and (iterate.step <= rounds.small_step or settled):
             break
     if incumbent is None:
         message = "no design near the predicted optima meets " + ", ".join(problem.inner.bounds)
@@ -162,14 +177,15 @@ def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:
 
 
 def _better(
-    problem: CoDesignProblem, incumbent: QuantitySample | None, sample: QuantitySample
-) -> QuantitySample:
+    problem: CoDesignProblem, incumbent: QuantitySample | None, sample: QuantitySample,
+    options: LiftedRoundOptions,
+) -> QuantitySample:  # fmt: skip
     """The sample with less violation beyond the slack, of λ in shares of its size, of a bound in
     ln; among feasible ones the better J."""
 
     def rank(s: QuantitySample) -> tuple[float, float]:
         lam = constraint_shares(problem, s.x[: len(problem.names)])
-        over = np.concatenate([s.values[1:-1] - problem.inner.levels + MARGIN, lam]).max()
-        return max(0.0, float(over) - FEASIBLE), _objective(problem, s)
+        over = np.concatenate([s.values[1:-1] - problem.inner.levels + options.margin, lam]).max()
+        return max(0.0, float(over) - options.slack), _objective(problem, s)
 
     return sample if incumbent is None else min(incumbent, sample, key=rank)

@@ -5,11 +5,17 @@ to: each round fits the samples in a trust region around the best verified desig
 where the surrogate promised too much, until prediction and truth agree there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, Iterate, KnownSamples, iterate_of
+from ccd_casadi.codesign.formulation import (
+    FormulationResult,
+    FormulationRound,
+    KnownSamples,
+    iterate_of,
+)
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -20,12 +26,10 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.inner_problem.objective import objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.optim.pieces import Box
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design, fit, to_casadi
-
-STEP = 1e-3  # share of the box below which a step counts as small
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,58 @@ class Nested:
         return self.points**variables if self.plan == "grid" else self.points
 
 
+@dataclass(frozen=True)
+class NestedRegionOptions:
+    """Numbers of the trust region of the nested formulation, in shares of the box of θ."""
+
+    small_step: float = 1e-3  # below which a step counts as none
+    least_radius: float = 1e-3
+    inaccurate: float = 0.4  # factor of the radius where prediction and truth disagree
+    inaccurate_better: float = 0.6  # the same where the truth is better all the same
+    failed: float = 0.5  # where it agrees and is no better, or IPOPT does not converge
+    grown: float = 2.0  # where it agrees and the region alone ends the step
+    whole_step: float = 0.9  # of the radius: such a step is ended by the region
+
+
+@dataclass(frozen=True)
+class NestedState:
+    """What the nested formulation knows before a round.
+
+    Attributes
+    ----------
+    samples : tuple of InnerSample
+        All true values.
+    radius : float
+        Of the region around the best of them, in shares of the box.
+    iterates : tuple of FormulationRound
+        The rounds so far.
+    surrogate, solution : GaussianProcess, OuterSolution
+        The last ones.
+    agreed : bool
+        Whether prediction and truth agreed in the last round.
+    """
+
+    samples: tuple[InnerSample, ...]
+    radius: float = 1.0
+    iterates: tuple[FormulationRound, ...] = ()
+    surrogate: GaussianProcess | None = None
+    solution: OuterSolution | None = None
+    agreed: bool = False
+
+    def with_radius(self, improved: bool, options: NestedRegionOptions) -> "NestedState":
+        """After a round: a smaller region where the surrogate promised too much, or a larger one
+        where that alone has ended the step; `improved`: whether the truth is better."""
+        radius, step = self.radius, self.iterates[-1].step
+        if not self.agreed:
+            factor = options.inaccurate_better if improved else options.inaccurate
+            radius = max(radius * factor, options.least_radius)
+        elif not improved:
+            radius *= options.failed
+        elif step >= options.whole_step * radius:
+            radius = min(1.0, options.grown * radius)
+        return replace(self, radius=radius)
+
+
 def solve_nested(
     sampler: Sampler,
     options: Nested,
@@ -68,6 +124,7 @@ def solve_nested(
     seed: int,
     given: KnownSamples | None = None,
     gradients: bool = False,
+    region_options: NestedRegionOptions = NestedRegionOptions(),
 ) -> FormulationResult:
     """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.
 
@@ -81,68 +138,64 @@ def solve_nested(
         thetas = _allowed(problem, np.unique(np.vstack([plan, problem.start]), axis=0))
     else:
         thetas = np.array([sample.x[:n] for sample in given])
-    samples = sampler.values(thetas)
-    if not any(sample.feasible for sample in samples):
+    state = NestedState(tuple(sampler.values(thetas)))
+    if not any(sample.feasible for sample in state.samples):
         return FormulationResult(message="no sampled theta is feasible")
-    iterates: list[Iterate] = []
 
-    def refine(number: int) -> None:
-        """True inner problems spread over the region around the best θ."""
-        region = bounds.around(_best(problem, samples).theta, radius)
+    def refined(state: NestedState, number: int) -> NestedState:
+        """With true inner problems spread over the region around the best θ."""
+        region = bounds.around(_best(problem, state.samples).theta, state.radius)
         new = design("lhs", *region, 2 * n + 1, seed + number)
         with sampler.spent.on("rounds"):
-            samples.extend(sampler.values(_allowed(problem, new), f"refining round {number + 1}"))
+            found = sampler.values(_allowed(problem, new), f"refining round {number + 1}")
+        return replace(state, samples=(*state.samples, *found))
 
-    radius, agreed = 1.0, False
-    surrogate: GaussianProcess | None = None
-    solution: OuterSolution | None = None
-    for round_number in range(options.max_refinements + 1):
-        samples, improvements = sampler.latest(samples), sampler.improvements
-        best = _best(problem, samples)
-        region = bounds.around(best.theta, radius)
-        local = _local(samples, region, bounds)
+    for number in range(options.max_refinements + 1):
+        state = replace(state, samples=tuple(sampler.latest(state.samples)))
+        improvements, best = sampler.improvements, _best(problem, state.samples)
+        region = bounds.around(best.theta, state.radius)
+        local = _local(state.samples, region, bounds)
         if len(local) == 1:  # a feasible sliver: what is fitted has to be found first
-            radius = max(0.4 * radius, 1e-3)
-            refine(round_number)
+            radius = max(region_options.inaccurate * state.radius, region_options.least_radius)
+            state = refined(replace(state, radius=radius), number)
             continue
         surrogate = fit_bandwidth(problem, local, seed, options.kernel, gradients)
+        state = replace(state, surrogate=surrogate)
         program = outer_program(problem, to_casadi(surrogate, std=False))
         program = replace(program, box=region)
-        starts = _starts(problem, local, region, options.starts, seed + round_number)
+        starts = _starts(problem, local, region, options.starts, seed + number)
         try:
             solution = solve_program(program, starts)
         except OuterFailure:
-            radius *= 0.5
+            state = replace(state, radius=region_options.failed * state.radius)
             continue
         theta = solution.best.x
         predicted = float(surrogate.predict(theta[None, :])[0])
         with sampler.spent.on("rounds"):
-            sample = sampler.values(theta, f"verifying round {round_number + 1}")[0]
+            sample = sampler.values(theta, f"verifying round {number + 1}")[0]
         error = float(abs(predicted / sample.value - 1.0)) if sample.feasible else np.inf
         step = float(bounds.away(theta, best.theta))
-        figures = {"error": error, "step": step, "radius": radius}
+        figures = {"error": error, "step": step, "radius": state.radius}
         iterate = iterate_of(problem, sample.theta, predicted, sample.value, **figures)
-        iterates.append(iterate)
-        samples.append(sample)
-        change = iterate.objective - objective(problem, best.theta, best.value)
-        improved = change < 0.0
-        agreed = iterate.error <= options.tolerance
-        settled = abs(change) <= options.tolerance * abs(iterate.objective)
+        state = replace(
+            state, samples=(*state.samples, sample), iterates=(*state.iterates, iterate),
+            solution=solution, agreed=error <= options.tolerance,
+        )  # fmt: skip
         if sampler.improvements > improvements:
             continue  # fitted to worse controllers than are known now
-        if agreed and (iterate.step <= STEP or settled):
+        change = iterate.objective - objective(problem, best.theta, best.value)
+        settled = abs(change) <= options.tolerance * abs(iterate.objective)
+        if state.agreed and (step <= region_options.small_step or settled):
             break
-        if not agreed:
-            radius = max(radius * (0.6 if improved else 0.4), 1e-3)
-            refine(round_number)
-        elif not improved:
-            radius *= 0.5
-        elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone
-            radius = min(1.0, 2.0 * radius)
-    best = _best(problem, sampler.latest(samples))
-    message = "" if agreed else "prediction and truth did not agree within the budget"
-    surrogates = () if surrogate is None else (surrogate,)
-    return FormulationResult(best.joint, tuple(iterates), surrogates, solution, agreed, message)
+        state = state.with_radius(change < 0.0, region_options)
+        if not state.agreed:
+            state = refined(state, number)
+    best = _best(problem, sampler.latest(state.samples))
+    message = "" if state.agreed else "prediction and truth did not agree within the budget"
+    surrogates = () if state.surrogate is None else (state.surrogate,)
+    return FormulationResult(
+        best.joint, state.iterates, surrogates, state.solution, state.agreed, message
+    )
 
 
 def fit_bandwidth(
@@ -152,9 +205,25 @@ def fit_bandwidth(
     kind: str = "matern52",
     gradients: bool = False,
 ) -> GaussianProcess:
-    """An interpolating Gaussian process of ω_b*(θ) in rad/s (or the error in m) over the box.
+    """Fit an interpolating Gaussian process of v(θ) over the box.
 
-    With `gradients` of those samples that have one, if most do.
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        Its box of θ, SI.
+    samples : list of InnerSample
+        True values: ω_b in rad/s, or of another figure in its SI unit.
+    seed : int
+        Of the search for hyperparameters.
+    kind : str
+        "matern52", "rbf", or "auto", which predicts left-out samples best.
+    gradients : bool
+        Whether to fit the gradients of those samples that have one too, if most do.
+
+    Returns
+    -------
+    GaussianProcess
+        v over θ (n_θ,), SI.
     """
     sloped = [sample for sample in samples if np.isfinite(sample.gradient).all()]
     gradients = gradients and len(sloped) > len(samples) // 2
@@ -176,13 +245,13 @@ def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:
     return thetas[keep] if any(keep) else thetas
 
 
-def _best(problem: CoDesignProblem, samples: list[InnerSample]) -> InnerSample:
+def _best(problem: CoDesignProblem, samples: Sequence[InnerSample]) -> InnerSample:
     feasible = [sample for sample in samples if sample.feasible]
     inside = [s for s in feasible if not violated(problem, s.theta)]
     return min(inside or feasible, key=lambda s: objective(problem, s.theta, s.value))
 
 
-def _local(samples: list[InnerSample], region: Box, bounds: Box) -> list[InnerSample]:
+def _local(samples: Sequence[InnerSample], region: Box, bounds: Box) -> list[InnerSample]:
     """Feasible samples in the region and a margin; the nearest ones where these are too few."""
     feasible = list({s.theta: s for s in samples if s.feasible}.values())
     centre = 0.5 * (region.lower + region.upper)

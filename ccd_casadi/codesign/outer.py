@@ -23,13 +23,11 @@ from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.optim.pieces import Box
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import counted
 from surrogates import design
-
-BASIN = 1e-2  # of the box: ends of local solves on the truth that are closer are of one optimum
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class End:
+class PolishedDesign:
     """A polished design of the truth before it is judged.
 
     `x` begins with θ. `gap`: by how much (relative) the whole inner problem at θ is better, NaN
@@ -71,6 +69,7 @@ class Outer(ABC):
     """The outer problem of one kind of inner problem, on a sampler's store and workers."""
 
     kkt_level: float  # residual up to which an end counts as stationary
+    same_optimum = 1e-2  # of the box: ends of local solves on the truth that are closer are one
     extra_variables: tuple[str, ...] = ()  # what else x holds, logarithms
 
     def __init__(self, sampler: Sampler) -> None:
@@ -147,7 +146,9 @@ class Outer(ABC):
         if not places:
             words = f"no design meets its constraints from {counted(starts, 'start')}"
             return FormulationResult(message=words)
-        ends = distinct([(one.objective, one.x) for one in places], self.bounds, starts, BASIN)
+        ends = distinct(
+            [(one.objective, one.x) for one in places], self.bounds, starts, self.same_optimum
+        )
         return FormulationResult(ends.best.x, outer=ends, agreed=True)
 
     @abstractmethod
@@ -155,14 +156,16 @@ class Outer(ABC):
         """A formulation that found nothing: a design to go on from, or why there is none."""
 
     @abstractmethod
-    def polished(self, x: Array) -> End:
+    def polished(self, x: Array) -> PolishedDesign:
         """Polish a point on the truth, and hold the whole inner problem there against it."""
 
-    def extended(self, end: End) -> "Outer | None":
+    def extended(self, end: PolishedDesign) -> "Outer | None":
         """With what stood against an end, to be searched again; None where nothing did."""
         return None
 
-    def with_training_sample(self, outcome: FormulationResult, end: End) -> FormulationResult:
+    def with_training_sample(
+        self, outcome: FormulationResult, end: PolishedDesign
+    ) -> FormulationResult:
         """With surrogates that have an end among their samples, which they did not foresee."""
         values, slopes = self.training_samples(end, outcome.surrogates[0].lower.size)
         found = [
@@ -171,7 +174,7 @@ class Outer(ABC):
         ]
         return replace(outcome, surrogates=tuple(found))
 
-    def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
+    def training_samples(self, end: PolishedDesign, inputs: int) -> tuple[Array, Array]:
         """Values (k,) and slopes (k, n) at an end of what surrogates of n = `inputs` fit."""
         found = self.sampler.values(self.theta_of(end.x), "the end")[0]
         return np.array([end.value]), np.array([found.gradient])
@@ -190,7 +193,7 @@ class Outer(ABC):
         return str(solution.result["reason"])
 
     @abstractmethod
-    def verified(self, end: End, rounds: int) -> Verified:
+    def verified(self, end: PolishedDesign, rounds: int) -> Verified:
         """The design judged on the truth, after so many `rounds` of the whole search."""
 
     def point_of(self, run: FinishedRun) -> Array:

@@ -5,17 +5,17 @@ x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what th
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
+from ccd_casadi.codesign.final_judgement import second_on_weighted
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.judgement import second_on_weighted
-from ccd_casadi.codesign.kinked import SETTLED, descend, polish
-from ccd_casadi.codesign.kkt import TrueDesign, kkt_certificate
-from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.kinked import PeakDescentOptions, descend, polish
+from ccd_casadi.codesign.lifted_kkt import TrueDesign, kkt_certificate
+from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, other_damping, survived
@@ -26,19 +26,25 @@ from ccd_casadi.inner_problem.objective import final_design, objective
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 from surrogates import design
 
-POLISH_ROUNDS = 3
-INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
-BASIN = 1e-4  # residual of an end whose basin is not searched again
+
+@dataclass(frozen=True)
+class MixedOuterOptions:
+    """Numbers of the outer problem with mixed-sensitivity controllers."""
+
+    polishes: int = 3  # at most, each from a better controller of the whole inner problem
+    inner_gap: float = 1e-6  # relative: by how much the whole inner problem may be better
+    stationary: float = 1e-4  # residual of an end whose basin is not searched again
 
 
 class MixedOuter(Outer):
     """See the module."""
 
+    options = MixedOuterOptions()
     kkt_level = VerifiedDesign.kkt_level
     extra_variables = ("omega_S", "omega_T")
 
@@ -60,12 +66,12 @@ class MixedOuter(Outer):
         best = max(feasible, key=lambda sample: sample.bandwidth)
         return replace(outcome, x=best.joint, agreed=False)
 
-    def polished(self, x: Array) -> End:
+    def polished(self, x: Array) -> PolishedDesign:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
         sampler, truth = self.sampler, self.sampler.truth
         lower, upper = self.bounds
         width = 1e-9 * self.bounds.width  # within rounding of a bound: onto it
-        for _ in range(POLISH_ROUNDS):
+        for _ in range(self.options.polishes):
             before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
             with polishing as progress, sampler.spent.on("polish"):
@@ -80,13 +86,13 @@ class MixedOuter(Outer):
                 inner = sampler.values(end.theta, "verifying")[0]
             bandwidth = end.design.figures.bandwidth
             gap = inner.bandwidth / bandwidth - 1.0 if inner.feasible else np.nan
-            if not gap > INNER_GAP:
+            if not gap > self.options.inner_gap:
                 break
             x = inner.joint
         J = end.objective if end.acceptable else np.inf
-        return End(end.x, bandwidth, J, end.kkt, float(gap))
+        return PolishedDesign(end.x, bandwidth, J, end.kkt, float(gap))
 
-    def training_samples(self, end: End, inputs: int) -> tuple[Array, Array]:
+    def training_samples(self, end: PolishedDesign, inputs: int) -> tuple[Array, Array]:
         if inputs < end.x.size:
             return super().training_samples(end, inputs)
         found = self.sampler.quantities(end.x)[0]
@@ -99,18 +105,18 @@ class MixedOuter(Outer):
         # where no design is feasible it goes from the middle of the weights' frequencies
         begin = np.where(np.isfinite(sample.joint), sample.joint, np.mean(self.bounds, axis=0))
         basins = [(place.x, place.objective) for place in known if place.stationary]
-        settled = SETTLED if settled is None else settled
+        settled = PeakDescentOptions().settled if settled is None else settled
         end = descend(truth, begin, ended=basins, settled=settled)
         for x in (end, begin):
             made = TrueDesign(truth, x)
             if made.acceptable:
-                return Place(x, made.objective, made.kkt.stationarity <= BASIN)
+                return Place(x, made.objective, made.kkt.stationarity <= self.options.stationary)
         return None
 
     def failure_reason(self, solution: Solution, share: float | None) -> str:
         return failure_words(self.sampler, solution, share)
 
-    def verified(self, end: End, rounds: int) -> VerifiedDesign:
+    def verified(self, end: PolishedDesign, rounds: int) -> VerifiedDesign:
         problem, sampler, x = self.problem, self.sampler, end.x
         here = TrueDesign(sampler.truth, x)
         theta = tuple(float(v) for v in self.theta_of(x))

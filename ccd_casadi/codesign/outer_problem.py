@@ -16,14 +16,14 @@ import numpy as np
 
 from ccd_casadi.inner_problem.objective import constraint_shares, constraint_sizes, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sweep import MARGIN
+from ccd_casadi.inner_problem.sweep import SweepOptions
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.interrupts import interrupts_kept, raise_dropped
 from surrogates import design
 
-OPTIONS: dict[str, Any] = {
+IPOPT: dict[str, Any] = {
     "print_time": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -35,12 +35,21 @@ OPTIONS: dict[str, Any] = {
     "ipopt.honor_original_bounds": "yes",
     "show_eval_warnings": False,
 }
-APART = 1e-4  # of the box: ends closer than this are one optimum
 
 
 @dataclass(frozen=True)
 class NonlinearProgram:
-    """min f(x), g(x) <= 0, x in its box; g has λ in shares of its size."""
+    """min f(x)  s.t.  g(x) <= 0, x in its box.
+
+    Attributes
+    ----------
+    x, f, g : casadi.MX
+        Variables (n,), J, and constraints (m,), of which λ is in shares of its size.
+    box : Box
+        Bounds of x.
+    exact_hessian : bool
+        Whether CasADi has second derivatives of the plant's hardware.
+    """
 
     x: ca.MX
     f: ca.MX
@@ -50,8 +59,8 @@ class NonlinearProgram:
 
 
 @dataclass(frozen=True)
-class LocalOptimum:
-    """Where local solves from so many `starts` ended."""
+class OuterOptimum:
+    """Where local solves from this number of `starts` ended."""
 
     x: Array
     objective: float
@@ -60,13 +69,13 @@ class LocalOptimum:
 
 @dataclass(frozen=True)
 class OuterSolution:
-    """All distinct local optima, best first, and the number of starts."""
+    """All distinct local optima, best first, and the number of starts that led to them."""
 
-    optima: tuple[LocalOptimum, ...]
+    optima: tuple[OuterOptimum, ...]
     starts: int
 
     @property
-    def best(self) -> LocalOptimum:
+    def best(self) -> OuterOptimum:
         """That of the least objective."""
         return self.optima[0]
 
@@ -76,10 +85,25 @@ class OuterFailure(RuntimeError):
 
 
 def outer_program(
-    problem: CoDesignProblem, model: ca.Function, *, margin: float = MARGIN
+    problem: CoDesignProblem, model: ca.Function, *, margin: float = SweepOptions.margin
 ) -> NonlinearProgram:
-    """Over θ with model(θ) -> ω_b in rad/s; or over (θ, ln ω_S, ln ω_T), where the model is a
-    function of these, with model(x) -> ω_b, ln of what is bounded."""
+    """The program of equation (9) with a model in place of the true synthesis.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        J, λ and the box.
+    model : casadi.Function
+        θ (n_θ,) to ω_b in rad/s; or (θ, ln ω_S, ln ω_T), ω in rad/s, to ω_b and ln of each
+        bounded figure of the loop, which are then constraints.
+    margin : float
+        ln: how far inside their bounds these are kept.
+
+    Returns
+    -------
+    NonlinearProgram
+        Over the inputs of the model.
+    """
     lifted = model.size1_in(0) > len(problem.names)
     bounds = lifted_bounds(problem) if lifted else box(problem)
     levels = problem.inner.levels - margin if lifted else ()
@@ -92,21 +116,47 @@ def outer_program(
 
 
 def lifted_bounds(problem: CoDesignProblem) -> Box:
-    """Bounds of (θ, ln ω_S, ln ω_T)."""
+    """Bounds of x = (θ, ln ω_S, ln ω_T).
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With mixed-sensitivity controllers.
+
+    Returns
+    -------
+    Box
+        Of n_θ + 2 variables: θ in SI, ω in rad/s.
+    """
     ends = np.log([problem.inner.omega_S, problem.inner.omega_T])
     return Box(*(np.append(end, ends[:, i]) for i, end in enumerate(box(problem))))
 
 
 def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
-    """IPOPT from every row of `starts`; variables are scaled to the unit box.
+    """Solve a program by IPOPT from many starts, with variables scaled to the unit box.
 
-    Raises OuterFailure where no start converges.
+    Parameters
+    ----------
+    program : NonlinearProgram
+        Its box has finite ends.
+    starts : (k, n) array
+        In the units of x; outside of the box they are moved onto it.
+
+    Returns
+    -------
+    OuterSolution
+        The distinct local optima.
+
+    Raises
+    ------
+    OuterFailure
+        No start converges.
     """
     lower, width = program.box.lower, program.box.width
     z = ca.MX.sym("z", program.x.shape[0])
     inside = lower + width * z
     f, g = ca.substitute([program.f, program.g], [program.x], [inside])
-    options = OPTIONS.copy()
+    options = IPOPT.copy()
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
     solver = ca.nlpsol("program", "ipopt", {"x": z, "f": f, "g": g}, options)
@@ -126,15 +176,16 @@ def solve_program(program: NonlinearProgram, starts: Array) -> OuterSolution:
 
 
 def distinct(
-    ends: Sequence[tuple[float, Array]], bounds: Box, starts: int, apart: float = APART
+    ends: Sequence[tuple[float, Array]], bounds: Box, starts: int, apart: float = 1e-4
 ) -> OuterSolution:
-    """Ends (J, x) of local solves from so many starts, those of one optimum together."""
-    optima: list[LocalOptimum] = []
+    """Ends (J, x) of local solves from this many starts; those closer than `apart` (shares of the
+    box) are one optimum."""
+    optima: list[OuterOptimum] = []
     for objective, x in sorted(ends, key=lambda item: item[0]):
         near = (i for i, other in enumerate(optima) if bounds.away(x, other.x) < apart)
         same = next(near, None)
         if same is None:
-            optima.append(LocalOptimum(x, objective))
+            optima.append(OuterOptimum(x, objective))
         else:
             optima[same] = replace(optima[same], starts=optima[same].starts + 1)
     return OuterSolution(tuple(optima), starts)

@@ -17,9 +17,9 @@ import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
+from ccd_casadi.codesign.final_judgement import second_on_set
 from ccd_casadi.codesign.joint_model import with_scenarios
-from ccd_casadi.codesign.judgement import second_on_set
-from ccd_casadi.codesign.outer import End, Place, is_expensive
+from ccd_casadi.codesign.outer import Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
@@ -46,24 +46,30 @@ from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, recertif
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.limitations.of_problem import known_gap, none_reaches
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
-from ccd_casadi.sampling.units import WORTH
+from ccd_casadi.sampling.units import NeighbourOptions
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Workers, results
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.worker_process import alongside
 
-STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
-LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
-WORTH_ELEMENTS = 1e-3  # relative: what one has to gain where each θ is a finite-element model
-LOOKS, APART = 5, 101  # for plants that an end does not keep, each elsewhere in the box
-LOOKS_OF_ELEMENTS = 2  # of these, and in this process, which knows the elements
-TAKEN = 4  # times at most that a search at the end may find a better controller
+
+@dataclass(frozen=True)
+class StructuredOuterOptions:
+    """Numbers of the outer problem with controllers of fixed structure."""
+
+    stationary: float = 1e-5  # scaled residual below which a polish has nothing to do
+    least_gain: float = 1e-9  # of J: pieces of a kink that promise less are not known so well
+    better_at_elements: float = 1e-3  # relative: a controller that is better by less is the same
+    searches: int = 5  # for plants that exceed a bound at an end, each elsewhere in the box
+    searches_at_elements: int = 2  # of these where each θ is a finite-element model
+    first_seed: int = 101  # they are numbered from it
+    polishes: int = 4  # at most, each from a better controller that a search at the end has found
 
 
 @dataclass(frozen=True)
-class StructuredEnd(End):
+class PolishedStructured(PolishedDesign):
     """With the sampler of the problem that has it, its value and that one's design and gradients,
     a multi-start search there (None where plants are to be added first), the worst plant, and those
     to add."""
@@ -81,6 +87,7 @@ class StructuredOuter(ThetaOuter):
     `ended` before, no places far from there are tried again."""
 
     kkt_level = VerifiedStructured.kkt_level
+    structured_options = StructuredOuterOptions()
 
     def __init__(self, sampler: Sampler, words: str = "", ended: bool = False) -> None:
         super().__init__(sampler)
@@ -136,36 +143,39 @@ class StructuredOuter(ThetaOuter):
             self.sampler.value_from(best.theta, best.kappa)  # a polish there begins with it
         return Place(np.array(best.theta), J, ended)
 
-    def polished(self, x: Array) -> StructuredEnd:
-        sampler, theta = self.sampler, self.theta_of(x)
-        for attempt in range(TAKEN):
+    def polished(self, x: Array) -> PolishedStructured:
+        sampler, theta, options = self.sampler, self.theta_of(x), self.structured_options
+        enough = NeighbourOptions().least_gain if self.retries_pay else options.better_at_elements
+        for attempt in range(options.polishes):
             with sampler.spent.on("polish"):
-                sampler, best = polish_structured(sampler, theta, self.ended or attempt > 0)
+                sampler, best = polish_structured(
+                    sampler, theta, self.ended or attempt > 0, options
+                )
             problem, found = sampler.problem, value_with_design(sampler, best)
-            worst, scenarios = _worst_plants(sampler, best, found.design)
+            worst, scenarios = _worst_plants(sampler, best, found.design, options)
             multistart = None if scenarios else multistart_at(sampler, best)
             gap = np.nan if multistart is None else _gap(problem, best, multistart)
-            if multistart is None or not gap > (WORTH if self.retries_pay else WORTH_ELEMENTS):
+            if multistart is None or not gap > enough:
                 break
             sampler.value_from(best.theta, multistart.design.kappa.tolist())
             theta = np.array(best.theta)
-        return StructuredEnd(
+        return PolishedStructured(
             np.array(best.theta), best.value, objective_of(problem, best),
             theta_kkt(problem, best, envelope=found.envelope), gap, sampler, best, found,
             multistart, worst, scenarios,
         )  # fmt: skip
 
-    def extended(self, end: End) -> "StructuredOuter | None":
+    def extended(self, end: PolishedDesign) -> "StructuredOuter | None":
         """With plants that it does not keep, searched for this alone: fresh ones judge the
         answer."""
-        end = cast(StructuredEnd, end)
+        end = cast(PolishedStructured, end)
         if not end.scenarios:
             return None
         anchored = with_warm_start(end.sampler.problem, end.inner.design.kappa)
         return StructuredOuter(with_scenarios(end.sampler.of(anchored), end.scenarios), ended=True)
 
-    def verified(self, end: End, rounds: int) -> VerifiedStructured:
-        end = cast(StructuredEnd, end)
+    def verified(self, end: PolishedDesign, rounds: int) -> VerifiedStructured:
+        end = cast(PolishedStructured, end)
         sampler, best, design, worst = end.sampler, end.best, end.inner.design, end.worst
         problem = sampler.problem
         design = recertified(problem, best.theta, design)  # what a store holds is not relied on
@@ -229,7 +239,7 @@ class StructuredOuter(ThetaOuter):
 
 
 def _worst_plants(
-    sampler: Sampler, best: InnerSample, design: SectionsDesign
+    sampler: Sampler, best: InnerSample, design: SectionsDesign, options: StructuredOuterOptions
 ) -> tuple[Excess, tuple[Scenario, ...]]:
     """The worst plant found for a design and those to add, by one search and, where that finds
     none, by several elsewhere in the box: before a multi-start search, which they would outdate."""
@@ -239,8 +249,9 @@ def _worst_plants(
     if scenarios or not np.isfinite(objective_of(problem, best)):
         return worst, scenarios
     few = is_expensive(problem)
-    turns = range(APART, APART + (LOOKS_OF_ELEMENTS if few else LOOKS))
-    workers = Workers(1) if few else sampler.workers
+    count = options.searches_at_elements if few else options.searches
+    turns = range(options.first_seed, options.first_seed + count)
+    workers = Workers(1) if few else sampler.workers  # this process knows the elements
     other, scenarios = on_box.worst_elsewhere(turns, workers, tell)
     return max(worst, other, key=lambda one: one.value), scenarios
 
@@ -258,7 +269,10 @@ def _gap(problem: CoDesignProblem, best: InnerSample, multistart: StructuredValu
 
 
 def polish_structured(
-    sampler: Sampler, theta: Array, ended: bool = False
+    sampler: Sampler,
+    theta: Array,
+    ended: bool = False,
+    options: StructuredOuterOptions = StructuredOuterOptions(),
 ) -> tuple[Sampler, InnerSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more plants, where worse ones were found.
@@ -284,6 +298,6 @@ def polish_structured(
     near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
     candidates = sampler.values(np.unique([near, theta], axis=0), "polishing")
     best = min(candidates, key=lambda s: objective_of(problem, s))
-    if theta_kkt(problem, best).stationarity > STATIONARY:
-        best = pieces_from(sampler, best, LEVEL)
+    if theta_kkt(problem, best).stationarity > options.stationary:
+        best = pieces_from(sampler, best, options.least_gain)
     return sampler, best

@@ -7,33 +7,39 @@ is held against a wider search, and how the design is judged.
 
 from abc import ABC
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
+from ccd_casadi.codesign.theta_kkt import ThetaKktOptions, theta_kkt
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
-from ccd_casadi.optim.pieces import FIRST, Local, descend
+from ccd_casadi.optim.pieces import Local, PiecesOptions, descend
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
-SETTLED = 1e-7  # of J: what steps promise less than that is not looked for
-FAR = 0.1  # of the box: the first radius where the optimum is not known to be near by
-FOLLOWED = 3  # descents at most, each with the better controllers that the one before has found
-STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
+
+@dataclass(frozen=True)
+class ThetaDescentOptions:
+    """Numbers of descents over θ by the pieces of J."""
+
+    settled: float = 1e-7  # of J: steps that promise less are not taken
+    far_radius: float = 0.1  # of the box: the first one where the optimum may be far away
+    descents: int = 3  # at most, each with the better controllers that the one before has found
+    steps: int = 15  # per parameter, at most: from near by it takes half of that
 
 
 class ThetaOuter(Outer, ABC):
     """See the module; `words` say why its kind has nothing to begin with, where it has not."""
 
     words = ""
+    options = ThetaDescentOptions()
 
     @property
     def global_check_is_cheap(self) -> bool:
@@ -45,25 +51,28 @@ class ThetaOuter(Outer, ABC):
         words = self.words if nearest is None else nearest.shortfall
         return replace(outcome, message=words or outcome.message)
 
-    def polished(self, x: Array) -> End:
+    def polished(self, x: Array) -> PolishedDesign:
         """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
         problem, sampler = self.problem, self.sampler
         with sampler.spent.on("polish"):
             best = sampler.values(self.theta_of(x), "polishing")[0]
-            best = pieces_from(sampler, best, SETTLED)
+            best = pieces_from(sampler, best, self.options.settled)
         kkt = theta_kkt(problem, best, sampler)
-        return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, np.nan)
+        return PolishedDesign(
+            np.array(best.theta), best.value, objective_of(problem, best), kkt, np.nan
+        )
 
     def local_solve(
         self, sample: InnerSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem = self.problem
-        first, least = (FAR, SETTLED) if settled is None else (FIRST, settled)
+        far = self.options.far_radius, self.options.settled
+        first, least = far if settled is None else (PiecesOptions.radius, settled)
         best = pieces_from(self.sampler, sample, least, first, known)
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None
-        stationary = theta_kkt(problem, best).stationarity <= SMOOTH
+        stationary = theta_kkt(problem, best).stationarity <= ThetaKktOptions().smooth
         return Place(np.array(best.theta), J, stationary)
 
     def responses(self, x: Array) -> PostOptimal:
@@ -74,8 +83,9 @@ def pieces_from(
     sampler: Sampler,
     best: InnerSample,
     settled: float,
-    first: float = FIRST,
+    first: float = PiecesOptions.radius,
     ends: Sequence[Place] = (),
+    options: ThetaDescentOptions = ThetaDescentOptions(),
 ) -> InnerSample:
     """From a sample to where the pieces of J promise no more, or near a stationary point of `ends`,
     with what is known near by.
@@ -104,11 +114,11 @@ def pieces_from(
         found = hardware_at(problem, bounds.lower + bounds.width * z)
         return found.constraints, found.slopes
 
-    for _ in range(FOLLOWED):
+    for _ in range(options.descents):
         start, improvements = local(best), sampler.improvements
         if start is None:
             break
-        steps = STEPS * len(problem.names)
+        steps = options.steps * len(problem.names)
         descend(
             at, start, known, constraints, steps=steps, settled=settled, first=first, ended=ended
         )

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import null_space
 
-from ccd_casadi.codesign.kkt import (
+from ccd_casadi.codesign.lifted_kkt import (
     OTHER_PEAK,
     TrueDesign,
     active_at,
@@ -34,18 +34,16 @@ from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.structured_bandwidth import StructuredValue
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, structured_of
-from ccd_casadi.optim.kkt import ACTIVE, ActiveSet, KktCertificate
+from ccd_casadi.optim.kkt import ActiveSet, KktCertificate, KktOptions
 from ccd_casadi.optim.pieces import Box
 from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Progress
 
-WEAK = 1e-6  # a multiplier below this share of ‖∇J‖∞ holds nothing
-
 
 @dataclass(frozen=True)
-class Response:
+class OptimumResponse:
     """Derivatives of the optimum to one parameter of the case, per unit of it.
 
     Of J*, ω_b (rad/s), f, θ and (ln ω_S, ln ω_T). `value` is the parameter's own; bounds on ω_S
@@ -63,13 +61,22 @@ class Response:
 
 @dataclass(frozen=True)
 class PostOptimal:
-    """The responses, the certificate that they rest on, and whether they are determined.
+    """How an optimum responds to the parameters of its case.
 
-    `weak` names what touches without a multiplier: across it a response is one-sided. Where
-    `determined` is False (dependent constraints, no second-order minimum) only dJ*/dp is given.
+    Attributes
+    ----------
+    responses : tuple of OptimumResponse
+        Derivatives, one per parameter.
+    kkt : KktCertificate
+        Of the optimality conditions on which they rest.
+    weak : tuple of str
+        What binds without a multiplier: across it a response is one-sided.
+    determined : bool
+        False with dependent constraints or without a second-order minimum: then only dJ*/dp is
+        given.
     """
 
-    responses: tuple[Response, ...]
+    responses: tuple[OptimumResponse, ...]
     kkt: KktCertificate
     weak: tuple[str, ...]
     determined: bool
@@ -96,7 +103,7 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
     design, kkt, active = here.design, here.kkt, active_at(here)
     kinked = not set(_strong(kkt)) <= set(active.labels)
     if kinked:  # where local peaks are equal, each is a constraint
-        active = active_at(here, other_peaks(problem, x, design, ACTIVE))
+        active = active_at(here, other_peaks(problem, x, design, KktOptions.active))
 
     def hessian() -> Array | None:
         if kinked:
@@ -141,10 +148,10 @@ def structured_responses(
     )  # fmt: skip
 
 
-def _strong(kkt: KktCertificate) -> list[str]:
-    """What holds the design: a multiplier that counts."""
+def _strong(kkt: KktCertificate, weak: float = 1e-6) -> list[str]:
+    """What holds the design: a multiplier above this share of ‖∇J‖∞."""
     size = float(np.abs(kkt.objective_gradient).max())
-    return [name for name in kkt.active if kkt.multipliers[name] > WEAK * size]
+    return [name for name in kkt.active if kkt.multipliers[name] > weak * size]
 
 
 def _responses(
@@ -181,7 +188,7 @@ def _responses(
         dx = tuple(map(float, dz * width))
         change = sum(kkt.multipliers.get(name, 0.0) * d for name, d in parameter.levels.items())
         responses.append(
-            Response(
+            OptimumResponse(
                 parameter=parameter.name,
                 value=parameter.value,
                 objective=float(parameter.cost + change),

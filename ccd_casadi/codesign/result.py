@@ -17,7 +17,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.result_entries import budget_entry, move_entry
@@ -31,7 +31,7 @@ from ccd_casadi.codesign.verdict import (
 )
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.sampling.samples import spent_entry
+from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import json_values, write_json
 from ccd_casadi.support.text import versions
@@ -42,7 +42,7 @@ FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or ch
 
 
 def result_dict(
-    terms: Terms,
+    terms: RunTerms,
     outcome: FormulationResult,
     verified: Verified,
     spent: Mapping[str, int],
@@ -131,13 +131,13 @@ def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float
     return value
 
 
-def infeasible_dict(terms: Terms, reason: str, spent: Mapping[str, int]) -> dict[str, Any]:
+def infeasible_dict(terms: RunTerms, reason: str, spent: Mapping[str, int]) -> dict[str, Any]:
     """result.json where no certified design meets the constraints."""
     head = {"status": "infeasible", "reason": reason, "formulation": terms.formulation}
     return head | run_entry(terms, spent)
 
 
-def run_entry(terms: Terms, spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
+def run_entry(terms: RunTerms, spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
     """What every result.json says of its run."""
     return {
         "format": FORMAT,
@@ -149,7 +149,20 @@ def run_entry(terms: Terms, spent: Mapping[str, int], moved: bool = False) -> di
 
 
 def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """A line as the solve wrote it; empty where a run is older than verdicts."""
+    """A line of the verdict as the solve wrote it.
+
+    Parameters
+    ----------
+    result : mapping
+        result.json.
+    name : str
+        Of the line.
+
+    Returns
+    -------
+    mapping
+        Its entry; empty where the file has no such line.
+    """
     verdict = result.get("verdict")
     line = verdict.get(name) if isinstance(verdict, Mapping) else None
     if not isinstance(line, Mapping):
@@ -159,10 +172,24 @@ def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine) -> FinishedRun:
-    """The run with a line of its verdict, written into its folder if `out` lies in that.
+    """Replace a line of a run's verdict, and write it if `out` is within the run's folder.
 
     Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays
     that of the solve.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        The run.
+    out : Path
+        Where the command writes.
+    name, line : str, VerdictLine
+        Of the verdict.
+
+    Returns
+    -------
+    FinishedRun
+        With the line in its result.
     """
     folder, before = run.folder.resolve(), at_solve(run.result, name)
     if not before or not out.resolve().is_relative_to(folder):
@@ -174,7 +201,20 @@ def with_verdict_line(run: FinishedRun, out: Path, name: str, line: VerdictLine)
 
 
 def resolved(case: Case, solution: Solution) -> Case:
-    """The case with what was found best of what it left open: design plant, listed values."""
+    """Fix what a case left open at what was found best: design plant, listed values.
+
+    Parameters
+    ----------
+    case : Case
+        As it was solved.
+    solution : Solution
+        Its result.
+
+    Returns
+    -------
+    Case
+        With nothing left open.
+    """
     problem = solution.problem
     if problem is None:
         return case
@@ -191,7 +231,16 @@ def resolved(case: Case, solution: Solution) -> Case:
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
     """Write what a run folder holds besides samples and report; clear an earlier run's.
 
-    The case in it names what was found best of what was open, so that what works on the run does.
+    The case in it names what was found best of what was open: later commands use that.
+
+    Parameters
+    ----------
+    folder : Path
+        Exists.
+    case : Case
+        As it was solved.
+    solution : Solution
+        Its result.
     """
     for name in ("result.json", "controller.json", "surrogate.json", "report.html", "index.html"):
         (folder / name).unlink(missing_ok=True)

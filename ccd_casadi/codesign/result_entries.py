@@ -14,7 +14,7 @@ from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import BINDS, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.certificate import TOLERANCE
+from ccd_casadi.fixed_structure.certificate import CertificateOptions
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
@@ -22,14 +22,25 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.structured_bandwidth import exact_times, motion_of
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
-from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, compliance_words, statics
 
 
 def figures_dict(figures: DesignFigures) -> dict[str, Any]:
-    """One design's figures under the contract's keys."""
+    """One mixed-sensitivity design's figures under the contract's keys.
+
+    Parameters
+    ----------
+    figures : DesignFigures
+        SI.
+
+    Returns
+    -------
+    dict
+        SI, and Hz where a key says so.
+    """
     return {
         "omega_S_hz": figures.omega_S / HZ,
         "omega_T_hz": figures.omega_T / HZ,
@@ -156,13 +167,28 @@ def _source(item: SourceFigures, whole: BudgetFigures) -> dict[str, Any]:
     }
 
 
-WORST = 1.0 + TOLERANCE  # figure over bound up to which the judge counts a bound as met
+WORST = 1.0 + CertificateOptions.tolerance  # figure over bound that the judge counts as met
 
 
 def design_dict(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
 ) -> dict[str, Any]:
-    """A certified design's figures under the contract's keys, the worst of its plants."""
+    """A certified design's figures under the contract's keys, the worst of its plants.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With the set of plants.
+    theta : (n_θ,) sequence
+        SI.
+    design : SectionsDesign
+        With its certificate.
+
+    Returns
+    -------
+    dict
+        SI, and Hz where a key says so.
+    """
     judged = design.certificate
     assert judged is not None
     highest = max(judged.plants, key=lambda plant: plant.S_peak)
@@ -219,7 +245,18 @@ def design_dict(
 
 
 def active_of(design: SectionsDesign) -> list[str]:
-    """What binds the controller."""
+    """The bounds on the loop that bind a controller of fixed structure.
+
+    Parameters
+    ----------
+    design : SectionsDesign
+        With its multipliers.
+
+    Returns
+    -------
+    list of str
+        Keys of the case file.
+    """
     return bound_words(name for name, mu in design.multipliers.items() if mu > 1e-6)
 
 
@@ -258,10 +295,10 @@ def _channel_entry(bounds: Bounds, judged: SetCertificate) -> dict[str, Any]:
 
 
 def kept_words(worst: Excess) -> str:
-    """Which bounds hold on a box whose judge allows `LOOSE`, by its worst plant to six digits."""
+    """Which bounds hold on a box whose judge is loose, by its worst plant to six digits."""
     if float(f"{100.0 + 100.0 * np.expm1(worst.value):.6g}") <= 100.0:
         return "within every bound"
-    return f"no bound exceeded by more than {100.0 * LOOSE:g} %"
+    return f"no bound exceeded by more than {100.0 * BoxCheckOptions.looseness:g} %"
 
 
 def robust_dict(wide: SetCertificate, plants: int, worst: Excess) -> dict[str, Any]:
@@ -298,7 +335,20 @@ def proof_dict(proof: Proof) -> dict[str, Any]:
 def sections_controller(
     design: SectionsDesign | MeasuredDesign, sampling: Sampling | None
 ) -> dict[str, Any]:
-    """controller.json: the state space in SI, the sections, and how they run."""
+    """The content of controller.json: the state space, the sections, and how they run.
+
+    Parameters
+    ----------
+    design : SectionsDesign or MeasuredDesign
+        With a controller.
+    sampling : Sampling or None
+        Of the loop.
+
+    Returns
+    -------
+    dict
+        JSON values, SI.
+    """
     assert design.controller is not None
     words = sections_dict(design.structure, design.kappa) | {"kappa": design.kappa.tolist()}
     if isinstance(design, MeasuredDesign):
@@ -312,8 +362,26 @@ def box_words(
     wide: SetCertificate, checked: int, proof: Proof, worst: Excess, drawn: Yield | None,
     *, along: bool,
 ) -> dict[str, Any]:  # fmt: skip
-    """What `survives` takes of a loop on its box: the judge on so many plants, the proof, the worst
-    plant that was searched, random ones; `along`: whether its common shift is kept."""
+    """Arguments of `survives` for a loop on its box of plants.
+
+    Parameters
+    ----------
+    wide, checked : SetCertificate, int
+        The judge's certificate, on this number of plants of the box.
+    proof : Proof
+        For the whole box.
+    worst : Excess
+        The worst plant that a search found.
+    drawn : Yield or None
+        Random plants.
+    along : bool
+        Whether the common shift is kept.
+
+    Returns
+    -------
+    dict
+        `own`, `own_words` and `figures`.
+    """
     excess, fresh = math.expm1(worst.value), "" if drawn is None else drawn.words
     figures = {
         "plants": checked,

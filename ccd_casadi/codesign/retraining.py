@@ -13,15 +13,20 @@ import numpy as np
 from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.schema import case_to_toml
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, Terms, outputs_of
+from ccd_casadi.codesign.formulation import FormulationResult, KnownSamples, RunTerms, outputs_of
 from ccd_casadi.codesign.formulations import Direct, formulation_of
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
-from ccd_casadi.codesign.search import conclude_at
+from ccd_casadi.codesign.outer_search import conclude_at
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.optim.pieces import Box
-from ccd_casadi.sampling.samples import InnerSample, QuantitySample, quantity_sample, spent_entry
+from ccd_casadi.sampling.inner_samples import (
+    InnerSample,
+    QuantitySample,
+    quantity_sample,
+    spent_entry,
+)
 from ccd_casadi.sampling.store import Sample, SampleStore, hashes_of, problem_hash
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -29,20 +34,21 @@ from surrogates import GaussianProcess, sobol
 from surrogates.export import save
 from surrogates.files import write_whole
 
-SAME = 1e-9  # of the box: the rounding of a point that went through a surrogate
 
-
-def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Array, Sample]]:
+def stored_designs(
+    store: SampleStore, problem: CoDesignProblem, rounding: float = 1e-9
+) -> list[tuple[Array, Sample]]:
     """Designs with derivatives inside the box as (x, row), x = (θ, ln ω_S, ln ω_T), oldest first.
 
-    Designs that were not certified are among them.
+    Designs that were not certified are among them. A point that went through a surrogate may be
+    outside by the `rounding`, a share of the box.
     """
     bounds = lifted_bounds(problem)
     keys = store.keys_with_gradients(hashes_of(problem)[0])
     known, found = store.get(keys), []
     for item in keys:
         row = known.get(item)
-        # an index that names what the table has not is damage too
+        # an index that names a row which the table lacks is damage too
         if (
             row is None
             or len(row.theta) != len(problem.names)
@@ -51,7 +57,7 @@ def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[A
             raise store.damaged()
         x = np.array([*row.theta, np.log(row.omega_S), np.log(row.omega_T)])
         inside = np.clip(x, *bounds)
-        if bounds.away(x, inside) <= SAME:
+        if bounds.away(x, inside) <= rounding:
             found.append((inside, row))
     return found
 
@@ -72,9 +78,24 @@ LOCK = "retrain.lock"  # a database that the job keeps locked, of what was spent
 
 @contextmanager
 def only_job(run: Path, spent: int) -> Iterator[int]:
-    """Hold a run folder, at most until the process ends; yields what its first job found spent.
+    """Hold a run folder, at most until the process ends.
 
-    Raises UserError where another job holds it.
+    Parameters
+    ----------
+    run : Path
+        The folder.
+    spent : int
+        Syntheses in its store, which count as those before the first job.
+
+    Yields
+    ------
+    int
+        Syntheses before the folder's first job.
+
+    Raises
+    ------
+    UserError
+        Another job holds the folder.
     """
     with ExitStack() as stack:
         try:
@@ -117,22 +138,34 @@ def keep_version(
 
 
 def publish(run: Path) -> None:
-    """Make surrogate.json the newest version."""
+    """Copy the newest version of the surrogates to surrogate.json.
+
+    Parameters
+    ----------
+    run : Path
+        A run folder with one version at least.
+    """
     newest = (run / FOLDER / f"{version_names(run)[-1]}.json").read_bytes()
     target = run / NEWEST
     if not target.exists() or target.read_bytes() != newest:
         write_whole(target, newest)
 
 
-PER_INPUT = 3  # samples an input that a first fit is worth
-DOUBLINGS = 4  # of the first design, where the truth has no value at most points
-NEAR = 1e-4  # of the box: of samples nearer than that the first counts
-ROUNDS = 24  # of one job at most
 NOTHING_NEW = "nothing new"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RetrainingOptions:
+    """Numbers of a retraining job."""
+
+    samples_per_input: int = 3  # from which a first fit is made
+    doublings: int = 4  # of the first design, where the truth has no value at most points
+    same: float = 1e-4  # of the box: of samples nearer than that the first counts
+    rounds: int = 24  # of one job at most
+
+
+@dataclass(frozen=True)
+class RetrainingEnd:
     """How a job ended; spent: syntheses since the first job on this run folder began."""
 
     status: str
@@ -144,10 +177,26 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Job:
-    """One job on a run folder that was solved by `formulation`, or is to be.
+    """One retraining job on a run folder.
 
-    `budget`: syntheses that retraining may add to the folder, over all its jobs; `base`: those
-    before the first. `tolerance` (relative): of prediction and truth, by default the case's.
+    Attributes
+    ----------
+    folder, case : Path, Case
+        The run and its case.
+    outer : Outer
+        Its outer problem, on its store.
+    formulation : str
+        By which the run was solved, or is to be.
+    base : int
+        Syntheses before the folder's first job.
+    budget : int
+        Syntheses that retraining may add to the folder, over all its jobs.
+    tolerance : float
+        Relative, of prediction and truth; None: the case's.
+    seed : int
+        Of designs and fits.
+    options : RetrainingOptions
+        Numbers of the method.
     """
 
     folder: Path
@@ -158,6 +207,7 @@ class Job:
     budget: int = 500
     tolerance: float | None = None
     seed: int = 0
+    options: RetrainingOptions = RetrainingOptions()
 
     @property
     def spent(self) -> int:
@@ -175,7 +225,7 @@ class Job:
         """Whether x = θ: what is sampled is a whole inner problem."""
         return self.formulation == "nested" or not self.outer.extra_variables
 
-    def run(self, write: Callable[[Solution], object]) -> Outcome:
+    def run(self, write: Callable[[Solution], object]) -> RetrainingEnd:
         """To its end; `write` puts a solution into the folder.
 
         Raises UserError where the budget is too small for a first fit.
@@ -188,7 +238,7 @@ class Job:
         if known is not None:
             return known
         outer, sampler = self.outer, self.outer.sampler
-        terms = Terms(self.formulation, mark["tolerance"], self.seed)
+        terms = RunTerms(self.formulation, mark["tolerance"], self.seed)
         words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
         outcome = FormulationResult(message=words)
         if not words:
@@ -202,9 +252,9 @@ class Job:
         solution.result.update(spent_entry({"store": self.spent}), retraining=retraining)
         write(solution)
         status, rounds = str(solution.result["status"]), len(outcome.iterates)
-        return Outcome(status, reason, rounds, self.spent - self.base, version)
+        return RetrainingEnd(status, reason, rounds, self.spent - self.base, version)
 
-    def _ended_before(self, mark: dict[str, Any]) -> Outcome | None:
+    def _ended_before(self, mark: dict[str, Any]) -> RetrainingEnd | None:
         """What an earlier job ended with, where there is nothing left to do."""
         path = self.folder / "result.json"
         if not path.exists() or not (self.folder / "report.html").exists():
@@ -216,7 +266,7 @@ class Job:
         same = all(before.get(name) == value for name, value in mark.items())
         if not same or (before.get("reason") != "converged" and self.left > 0):
             return None
-        return Outcome(str(found.get("status")), NOTHING_NEW, 0, self.spent - self.base,
+        return RetrainingEnd(str(found.get("status")), NOTHING_NEW, 0, self.spent - self.base,
                        before.get("version"))  # fmt: skip
 
     def _trained(self, tolerance: float) -> FormulationResult:
@@ -227,7 +277,7 @@ class Job:
             words = "too few points where the truth has a value"
             return FormulationResult(message=words)
         sampled = 2 * len(self.outer.problem.names) + 2 if self.over_theta else 1
-        rounds = min(int(self.left / (self._cost(len(given)) * sampled)), ROUNDS)
+        rounds = min(int(self.left / (self._cost(len(given)) * sampled)), self.options.rounds)
         options = formulation_of(self.case, name)
         assert not isinstance(options, Direct)
         options = replace(options, tolerance=tolerance, max_refinements=max(rounds - 1, 0))
@@ -245,17 +295,17 @@ class Job:
         """
         bounds = box(self.outer.problem) if self.over_theta else self.outer.bounds
         n, seen = len(bounds.lower), self._stored()
-        least = PER_INPUT * n
-        for doubling in range(DOUBLINGS):
+        least, same = self.options.samples_per_input * n, self.options.same
+        for doubling in range(self.options.doublings):
             if len(_usable(seen)) >= least:
                 break
             X = sobol(*bounds, least << doubling, self.seed)
-            new = X[_distances(X, seen, bounds) > NEAR]
+            new = X[_distances(X, seen, bounds) > same]
             room = max(int(np.ceil(self.left / self._cost(len(seen)))), 0)
             seen += self._truth(new[:room])
         kept: list[Seen] = []
         for sample in _usable(seen):
-            if _distances(np.array([sample.x]), kept, bounds)[0] > NEAR:
+            if _distances(np.array([sample.x]), kept, bounds)[0] > same:
                 kept.append(sample)
         if len(kept) < n + 2:
             if len(seen) >= least:

@@ -30,8 +30,6 @@ from ccd_casadi.support.terminal import Progress
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome
 
-DENSE = 41  # shifts of a robust set on which the design is looked at, at the least
-MATTERS = 0.01  # of a bound: what the other damping has to pass it by to be told
 KEPT = {
     "ratio": "a resonance shift keeps every mode's damping ratio",
     "matrix": "a resonance shift leaves the damping matrix alone: ratios grow as resonances fall",
@@ -39,8 +37,24 @@ KEPT = {
 
 
 @dataclass(frozen=True)
+class RobustCheckOptions:
+    """Numbers of the check of a robust set.
+
+    Attributes
+    ----------
+    shifts : int
+        Of the set at which the design is checked, at the least.
+    exceeded : float
+        Of a bound: what the other damping has to exceed it by to be reported.
+    """
+
+    shifts: int = 41
+    exceeded: float = 0.01
+
+
+@dataclass(frozen=True)
 class RobustCheck:
-    """The worst of the plants of a design's set that were looked at: ‖S‖∞ there, infinite where
+    """The worst of the plants of a design's set that were checked: ‖S‖∞ there, infinite where
     the loop is unstable; `nominal` on the model."""
 
     nominal: float
@@ -82,7 +96,7 @@ class OtherDamping:
         found = [
             f"{'S' if name == 'S_max' else name} exceeds its bound by {100.0 * (share - 1.0):.2g} %"
             for name, share in self.other.items()
-            if share - max(1.0, self.own[name]) > MATTERS
+            if share - max(1.0, self.own[name]) > RobustCheckOptions().exceeded
         ]
         return f"{', '.join(found)} {where}" if found else ""
 
@@ -99,11 +113,26 @@ class OtherDamping:
 def survived(
     problem: CoDesignProblem, loops: LoopsOffModel, design: DesignFigures | SectionsDesign
 ) -> tuple[Survival | None, RobustCheck | None]:
-    """What a certified loop survives and whether its set is kept: neither says what the other
-    denies.
+    """What a certified loop survives and whether its set is kept, without contradicting each other.
 
-    The ranges are asked at the ends of the set and where it is worst, and the set at all that was
-    asked for the ranges.
+    The ranges are evaluated at the ends of the set and where it is worst too, and the set at all
+    places of the ranges.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With S_max and the set.
+    loops : LoopsOffModel
+        Of the design's controller.
+    design : DesignFigures or SectionsDesign
+        The design as its certificate has it.
+
+    Returns
+    -------
+    survival : Survival or None
+        None where the design is not certified.
+    check : RobustCheck or None
+        None where mixed sensitivity has no set.
     """
     check = check_robust(problem, loops)
     if not design.certified:
@@ -154,7 +183,7 @@ def _places(loops: LoopsOffModel, reach: float, shifts: int) -> list[float]:
     """From end to end of a set, its own shifts among them."""
     places = [-reach]
     while places[-1] < reach:
-        step = min(loops.step(places[-1]), 2.0 * reach / (DENSE - 1))
+        step = min(loops.step(places[-1]), 2.0 * reach / (RobustCheckOptions().shifts - 1))
         places.append(min(places[-1] + step, reach))
     return sorted({*places, *np.linspace(-reach, reach, shifts).tolist(), 0.0})
 

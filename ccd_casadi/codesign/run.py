@@ -8,7 +8,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.tables import Case
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
-from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.formulations import (
     Formulation,
     formulation_of,
@@ -18,8 +18,8 @@ from ccd_casadi.codesign.formulations import (
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
+from ccd_casadi.codesign.outer_search import conclude, conclude_at, search_outer
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.search import conclude, conclude_at, search_outer
 from ccd_casadi.codesign.structured_lists import ListedStructured
 from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
@@ -103,12 +103,32 @@ def co_design(
     """Run one formulation on a sampler, verify and polish its design on the truth.
 
     A robust problem that leaves its design plant open is solved for each, and the best one kept;
-    one with parameters from lists by branching over these (`catalogue`). `known`: a local optimum
-    that is known already, in place of the formulation.
+    one with parameters from lists by branching over these (`catalogue`).
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the problem.
+    formulation : Nested, Lifted or Direct
+        With its options.
+    seed : int
+        Of every random choice.
+    known : (n,) array
+        x of a local optimum that is known already, in place of the formulation.
+
+    Returns
+    -------
+    Solution
+        With `verified` None where no design is feasible.
+
+    Raises
+    ------
+    UserError
+        J rewards what it should not.
     """
     if sampler.problem.listed:
         return _of_lists(sampler, formulation, seed)
-    terms = Terms(type(formulation).__name__.lower(), formulation.tolerance, seed)
+    terms = RunTerms(type(formulation).__name__.lower(), formulation.tolerance, seed)
     require_solvable(sampler.problem)
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
@@ -121,7 +141,18 @@ def co_design(
 
 
 def outer_of(sampler: Sampler) -> Outer:
-    """The outer problem of the kind of controller that a sampler's problem has."""
+    """The outer problem of the kind of controller that a sampler's problem has.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the problem.
+
+    Returns
+    -------
+    Outer
+        An instance of its class in `OUTERS`.
+    """
     return OUTERS[type(sampler.problem.controller)](sampler)
 
 
@@ -153,7 +184,13 @@ def verify(sampler: Sampler, x: Array) -> Verified:
 
 
 def require_solvable(problem: CoDesignProblem) -> None:
-    """Raise UserError where J rewards what it should not."""
+    """Refuse a problem whose J rewards what it should not.
+
+    Raises
+    ------
+    UserError
+        J decreases with a figure of which less is better.
+    """
     if not problem.figure.larger_is_better and not problem.w2 > 0.0:
         v = problem.figure
         words = f'with inner.minimise = "{v.key}" J = w1 f + w2 {v.symbol} counts the {v.words} '

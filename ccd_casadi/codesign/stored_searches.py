@@ -1,6 +1,6 @@
 """Searches of controllers of fixed structure that are kept in the store of samples.
 
-A run that goes on from its store repeats none: the search at the start, multi-start searches at the
+A run that resumes from its store repeats none: the search at the start, multi-start searches at the
 ends, and the values of samples with their designs.
 """
 
@@ -27,8 +27,8 @@ from ccd_casadi.inner_problem.structured_search import (
     with_range,
     with_warm_start,
 )
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import problem_hash, sample_key
 from ccd_casadi.sampling.units import from_controller
 from ccd_casadi.support.terminal import Tell, remark
@@ -36,8 +36,8 @@ from ccd_casadi.support.terminal import Tell, remark
 
 @dataclass(frozen=True)
 class InitialSearch:
-    """Warm starts (κ in SI) and plants of the search at the start, as stores name them; `words`:
-    why there are none."""
+    """Warm starts (κ in SI: `anchors`) and plants (`members`) of the search at the start, by the
+    names that stores use; `words`: why there are none."""
 
     anchors: tuple[tuple[float, ...], ...]
     members: tuple[Scenario, ...]
@@ -61,7 +61,7 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
         words = "" if made.certified else made.words
         alone = len(own.scenarios) == len(uncertain_plant(problem, start).corners())
         if made.certified and alone and problem.figure is BANDWIDTH:
-            # No plant was found worse: this is the search that an end at the start would ask for.
+            # No plant was found worse: this is the search that an end at the start needs.
             make = partial(ProblemAt(anchored, start).value_of, made, 1)
             sampler.of(anchored).cached("race", start, StructuredValue, make)
         return InitialSearch(own.warm_starts, own.scenarios, own.error_warm_starts, words)
@@ -73,8 +73,20 @@ def with_initial_search(sampler: Sampler, seed: int) -> tuple[CoDesignProblem, s
 
 
 def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
-    """A multi-start search at the θ of a sample, from its controller too, with all its optima,
-    counted; from the store if it is there."""
+    """A multi-start search at the θ of a sample, from its controller too; stored, and counted.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the problem.
+    best : InnerSample
+        With θ and κ, SI.
+
+    Returns
+    -------
+    StructuredValue
+        With all local optima of its design.
+    """
     problem, theta = with_warm_start(sampler.problem, best.kappa), best.theta
 
     def multistart() -> StructuredValue:
@@ -87,7 +99,20 @@ def multistart_at(sampler: Sampler, best: InnerSample) -> StructuredValue:
 
 
 def value_with_design(sampler: Sampler, best: InnerSample) -> StructuredValue:
-    """A sample with its design and envelope, from the store where it was made before."""
+    """A sample with its design and envelope, from the store where it was made before.
+
+    Parameters
+    ----------
+    sampler : Sampler
+        Of the problem.
+    best : InnerSample
+        With θ and κ, SI.
+
+    Returns
+    -------
+    StructuredValue
+        The value at θ from its κ, or from warm starts where it has none.
+    """
     problem = from_controller(sampler.problem, best.kappa) if best.kappa else sampler.problem
     make = partial(structured_value, problem, best.theta)
     return sampler.of(problem).cached("value", best.theta, StructuredValue, make)

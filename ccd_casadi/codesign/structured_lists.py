@@ -23,7 +23,7 @@ from ccd_casadi.codesign.outer_problem import (
     unmet_constraint,
 )
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.outer_theta import FAR, SETTLED, pieces_from
+from ccd_casadi.codesign.outer_theta import ThetaDescentOptions, pieces_from
 from ccd_casadi.codesign.stored_searches import printer
 from ccd_casadi.codesign.theta_joint import joint_search
 from ccd_casadi.codesign.verified import Solution
@@ -46,8 +46,6 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from surrogates import design
-
-INSIDE = 1e-7  # of λ
 
 
 @dataclass
@@ -109,7 +107,9 @@ def _climbed(sampler: Sampler, theta: Array) -> Solution:
         tell = printer("near by", sampler.quiet)
         asked, best, _ = joint_search(sampler, theta, tell, ends=())
     if best.theta == first.theta or violated(asked.problem, best.theta):  # it lost λ
-        asked, best = sampler, pieces_from(sampler, first, SETTLED, FAR)
+        options = ThetaDescentOptions()
+        best = pieces_from(sampler, first, options.settled, options.far_radius)
+        asked = sampler
     problem = asked.problem
     J = objective_of(problem, best)
     if not np.isfinite(J):
@@ -163,12 +163,12 @@ def _nothing(words: str) -> Solution:
     return Solution(result, FormulationResult(message=words), None)
 
 
-def _allowed(problem: CoDesignProblem, theta: Array) -> Array | None:
-    """The nearest θ within the box and λ(θ) <= 0; None where none is found."""
+def _allowed(problem: CoDesignProblem, theta: Array, inside: float = 1e-7) -> Array | None:
+    """The nearest θ within the box and λ(θ) <= -`inside`; None where none is found."""
     bounds, plant, x = box(problem), plant_of(problem), ca.MX.sym("theta", len(theta))
     lam, theta = plant.hardware(x)[1], np.clip(theta, *bounds)
     f = ca.sumsqr((x - theta) / bounds.width)
-    program = NonlinearProgram(x, f, lam + INSIDE, bounds, plant.exact_hessian)
+    program = NonlinearProgram(x, f, lam + inside, bounds, plant.exact_hessian)
     try:
         return np.clip(solve_program(program, theta).best.x, *bounds) if lam.numel() else theta
     except OuterFailure:

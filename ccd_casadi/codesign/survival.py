@@ -24,20 +24,50 @@ from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import least_margins
-from ccd_casadi.synthesis.synthesis import INTEGRATOR, Statics, statics
+from ccd_casadi.synthesis.synthesis import Statics, StaticsOptions, statics
 
-STEP = 0.3  # of the distance to a shift at which a pole of G meets a pole or zero of K
-WIDEST = 0.03  # of the frequency: step of a shift far from all of these
-WEAK = 1e-3  # gain at a resonance below which its mode does nothing to the loop
+PEAK = MixedSensitivity.slack  # relative: by how much S_max may be exceeded within its range
+
+
+@dataclass(frozen=True)
+class SurvivalOptions:
+    """Numbers of the ranges that a loop survives."""
+
+    reach: float = 0.5  # of the frequency: how far a shift is followed
+    factors: tuple[float, float] = (0.1, 10.0)  # of the damping: as far as it is followed
+    meeting_step: float = 0.3  # of the distance to a shift where a pole of G meets a root of K
+    largest_step: float = 0.03  # of the frequency: far from all of these
+    weak_gain: float = 1e-3  # at a resonance, below which its mode does nothing to the loop
+    damping_step: float = 0.1  # of the logarithm of the damping
+    first_step: float = 1e-4
+    step_growth: float = 1.6
+    end: float = 1e-4  # relative: to which the end of a range is known
+    least_end: float = 1e-9  # absolute: to which it is known next to the model
 
 
 @dataclass(frozen=True)
 class LoopsOffModel:
     """The loops of one controller on a plant whose resonances and damping are not the model's.
 
-    `controller`, e in and u out in SI, is K(s), which runs by Tustin's rule where there is a
-    `sampling`, or K(z) itself. D is `rest` + damping (`matrix` + shift `grows`), a known function
-    of both: the model is not asked again.
+    D is `rest` + damping (`matrix` + shift `grows`), a known function of both: the model is not
+    evaluated again.
+
+    Attributes
+    ----------
+    plant : ModalPlant
+        The model with n modes, SI.
+    controller : StateSpace
+        e in and u out, SI: K(s), which runs by Tustin's rule where there is a `sampling`, or K(z).
+    sampling : Sampling or None
+        How the loop runs.
+    rest, matrix, grows : (n, n) array
+        Of the modal damping matrix, 1/s.
+    given : bool
+        Whether the plant's damping is a matrix, not ratios.
+    options : SurvivalOptions
+        Numbers of the ranges.
+    known : dict
+        Loops that were made.
     """
 
     plant: ModalPlant
@@ -46,7 +76,8 @@ class LoopsOffModel:
     rest: Array
     matrix: Array
     grows: Array
-    given: bool  # damping by a matrix
+    given: bool
+    options: SurvivalOptions = SurvivalOptions()
     known: dict[Perturbation, Loop] = field(default_factory=dict, compare=False)
 
     @property
@@ -89,7 +120,7 @@ class LoopsOffModel:
         natural = np.sqrt(k)
         gain = np.linalg.norm(self.run.swept(natural[flexible]), axis=(1, 2))
         gain *= strength[flexible] / np.maximum((natural * d)[flexible], 1e-300)
-        modes = flexible[gain > WEAK]
+        modes = flexible[gain > self.options.weak_gain]
         zeros = self.run.zeros(float(np.abs(self.run.poles).max(initial=0.0)))
         roots = np.concatenate([self.run.rates, self.run.rates_of(zeros)])
         roots, omega = roots[(roots.imag >= 0.0) & np.isfinite(roots), None], natural[modes]
@@ -98,10 +129,11 @@ class LoopsOffModel:
         return at.ravel(), width.ravel()
 
     def step(self, shift: float) -> float:
-        """How far the next shift may lie: of the way to what is nearest in the complex plane."""
+        """How far the next shift may be: a share of the distance to the nearest meeting in the
+        complex plane."""
         at, width = self._meetings
         near = float(np.hypot(at - shift, width).min(initial=np.inf))
-        return min(WIDEST, STEP * max(near, 1e-4))
+        return min(self.options.largest_step, self.options.meeting_step * max(near, 1e-4))
 
 
 def loops_off_model(
@@ -110,7 +142,24 @@ def loops_off_model(
     sampling: Sampling | None = None,
     suspension: Suspension = FREE,
 ) -> LoopsOffModel:
-    """Of a plant's matrices at one θ, whose free bodies are free but for a `suspension`."""
+    """The loops of a controller on a plant given by its matrices.
+
+    Parameters
+    ----------
+    system : Mechanics
+        M, D, K, B, C at one θ, SI.
+    controller : StateSpace
+        e in and u out, SI.
+    sampling : Sampling or None
+        How the loop runs.
+    suspension : Suspension
+        What holds its free bodies.
+
+    Returns
+    -------
+    LoopsOffModel
+        With the plant in modal coordinates.
+    """
 
     def modal(off: Perturbation) -> ModalPlant:
         return without_hidden_rigid_modes(modal_plant(system, suspension, off))
@@ -126,14 +175,6 @@ def loops_off_model(
     return LoopsOffModel(plant, controller, sampling, rest, matrix, grows, given)
 
 
-REACH = 0.5  # of the frequency: how far a shift is followed
-FACTORS = (0.1, 10.0)  # of the damping
-PEAK = MixedSensitivity.slack  # relative: by how much S_max may be exceeded within its range
-E_FOLD = 0.1  # step of the logarithm of the damping
-FIRST = 1e-4  # the first step; then they grow to the caller's
-GROWTH = 1.6
-CLOSE = 1e-4  # relative: of an end, and how near to the model none is told from none
-LEAST = 1e-9
 Function = Callable[[float], float]
 
 
@@ -141,9 +182,9 @@ Function = Callable[[float], float]
 class Survival:
     """Ranges as (low, high) around the model; relative shifts, factors of damping.
 
-    A range that ends at `REACH` or `FACTORS` was not followed further. Margins are the least of
-    all loops broken one at a time at the plant's inputs: `gain` up and down as factors,
-    `phase_deg`, `delay` in s, and `modulus` = 1/‖S‖∞. `unstable_poles_hz`: |p|/2π of the
+    A range that ends at `reach` or `factors` of the options was not followed further. Margins are
+    the least of all loops broken one at a time at the plant's inputs: `gain` up and down as
+    factors, `phase_deg`, `delay` in s, and `modulus` = 1/‖S‖∞. `unstable_poles_hz`: |p|/2π of the
     controller's poles in the right half plane. `contradiction`: what this engine finds on the model
     itself that the certificate denies.
     """
@@ -167,50 +208,126 @@ class Survival:
 def loops_of(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
 ) -> LoopsOffModel:
-    """The loops of a controller in SI (e in, u out) of whatever kind on plants off the model at θ,
-    sampled where the problem's loop is."""
+    """The loops of a controller of any kind on plants off the model at θ.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With the plant and how the loop runs.
+    theta : (n_θ,) sequence
+        SI.
+    controller : StateSpace
+        e in and u out, SI.
+
+    Returns
+    -------
+    LoopsOffModel
+        Of the model at θ.
+    """
     system = mechanics(plant_of(problem), theta)
     return loops_off_model(system, controller, problem.sampling, problem.suspension.free)
 
 
 def growth_of(loop: Loop) -> float:
-    """The largest real part of a pole over its size: below 0 where the loop is stable."""
+    """The largest real part of a pole over its size, max Re(p)/|p|.
+
+    Parameters
+    ----------
+    loop : Loop
+        Closed.
+
+    Returns
+    -------
+    float
+        Below 0 where the loop is stable.
+    """
     return float((loop.poles.real / np.maximum(np.abs(loop.poles), 1e-300)).max())
 
 
 def excess_of(loop: Loop, level: float) -> float:
-    """ln of ‖S‖∞ over a level; 1 where the loop is unstable."""
+    """By how much a loop exceeds a level of S: ln(‖S‖∞ / level).
+
+    Parameters
+    ----------
+    loop : Loop
+        Closed.
+    level : float
+        Of ‖S‖∞.
+
+    Returns
+    -------
+    float
+        1 where the loop is unstable.
+    """
     return math.log(loop.peak / level) if loop.stable else 1.0
 
 
 def shift_range(
     loops: LoopsOffModel,
     f: Callable[[Loop], float],
-    limit: float = REACH,
+    limit: float | None = None,
     marks: Sequence[float] = (),
 ) -> tuple[float, float]:
-    """The common resonance shifts around the model, to both sides, up to which f <= 0."""
+    """The common resonance shifts around the model, to both sides, up to which f <= 0.
+
+    Parameters
+    ----------
+    loops : LoopsOffModel
+        Of the controller.
+    f : function of Loop
+        Not positive where the loop is good.
+    limit : float
+        Relative shift up to which it is followed; None: that of the options.
+    marks : sequence of float
+        Shifts that are evaluated too, on both sides.
+
+    Returns
+    -------
+    tuple of float
+        The lower and the upper end, relative; 0 where the model itself is not good.
+    """
+    most = loops.options.reach if limit is None else limit
 
     def end(sign: float) -> float:
         return sign * reach(
             lambda x: f(loops.at(Perturbation(shift=sign * x))),
             lambda x: loops.step(sign * x),
-            limit,
+            most,
             marks,
+            loops.options,
         )
 
     return end(-1.0), end(1.0)
 
 
 def damping_range(
-    loops: LoopsOffModel, f: Callable[[Loop], float], limits: tuple[float, float] = FACTORS
+    loops: LoopsOffModel, f: Callable[[Loop], float], limits: tuple[float, float] | None = None
 ) -> tuple[float, float]:
-    """The factors of damping around 1, within `limits`, up to which f <= 0."""
+    """The factors of damping around 1 up to which f <= 0.
+
+    Parameters
+    ----------
+    loops : LoopsOffModel
+        Of the controller.
+    f : function of Loop
+        Not positive where the loop is good.
+    limits : tuple of float
+        Factors up to which it is followed; None: those of the options.
+
+    Returns
+    -------
+    tuple of float
+        The lower and the upper end.
+    """
+    limits, step = limits or loops.options.factors, loops.options.damping_step
 
     def end(limit: float) -> float:
         size, sign = abs(math.log(limit)), math.copysign(1.0, math.log(limit))
         found = reach(
-            lambda x: f(loops.at(Perturbation(damping=math.exp(sign * x)))), lambda x: E_FOLD, size
+            lambda x: f(loops.at(Perturbation(damping=math.exp(sign * x)))),
+            lambda x: step,
+            size,
+            options=loops.options,
         )
         return limit if found == size else math.exp(sign * found)
 
@@ -228,7 +345,8 @@ def survival(
 ) -> Survival:
     """The figures of a loop that is stable on the model; ω_b in rad/s.
 
-    `slack`: what S_max may be passed by, relative; `marks`: shifts that are asked on both sides.
+    `slack`: what S_max may be exceeded by, relative; `marks`: shifts that are evaluated too, on
+    both sides.
     """
     nominal, level = loops.at(Perturbation()), S_max * (1.0 + slack)
     denied = "" if nominal.stable else "a second engine finds the loop unstable on the model itself"
@@ -238,8 +356,8 @@ def survival(
     margins = least_margins(nominal.responses, nominal.grid())
     poles = np.linalg.eigvals(loops.controller.A)
     sizes = np.abs(poles)  # of an integrator rounding alone
-    unstable = poles[(poles.real > np.maximum(1e-9 * sizes, INTEGRATOR * bandwidth))
-                     & (poles.imag >= 0.0)]  # fmt: skip
+    size = np.maximum(1e-9 * sizes, StaticsOptions().integrator * bandwidth)
+    unstable = poles[(poles.real > size) & (poles.imag >= 0.0)]
     return Survival(
         stable_shift=shift_range(loops, growth_of, marks=marks),
         S_max_shift=shift_range(loops, excess, marks=marks),
@@ -254,34 +372,44 @@ def survival(
     )
 
 
-def reach(f: Function, step: Function, limit: float, marks: Sequence[float] = ()) -> float:
+def reach(
+    f: Function,
+    step: Function,
+    limit: float,
+    marks: Sequence[float] = (),
+    options: SurvivalOptions = SurvivalOptions(),
+) -> float:
     """The largest x in [0, `limit`] up to which f <= 0; 0 where f(0) is not.
 
-    `step` at x is how far the next place may lie; `marks` are places that are asked besides.
+    `step` at x is how far the next place may be; `marks` are places that are evaluated too.
 
     >>> round(reach(lambda x: 1e-6 - (x - 0.3) ** 2, lambda x: 0.05, 1.0), 4)
     0.299
     """
     ahead = sorted(mark for mark in {*marks, limit} if 0.0 < mark <= limit)
-    before, x, fx, width = None, 0.0, f(0.0), FIRST
+    before, x, fx, width = None, 0.0, f(0.0), options.first_step
     if not fx <= 0.0:
         return 0.0
     while x < limit:
-        width = min(GROWTH * width, step(x))
+        width = min(options.step_growth * width, step(x))
         place = min(x + width, next(mark for mark in ahead if mark > x))
         value = f(place)
         if not value <= 0.0:
-            return _end(f, x, place)
+            return _end(f, x, place, options)
         if before is not None:
             top = highest(f, (before[0], x, place), (before[1], fx, value))
             if top is not None and f(top) > 0.0:
-                return _end(f, max(y for y in (before[0], x) if y < top), top)
+                inside = max(y for y in (before[0], x) if y < top)
+                return _end(f, inside, top, options)
         before, x, fx = (x, fx), place, value
     return limit
 
 
-def highest(f: Function, places: Sequence[float], values: Sequence[float]) -> float | None:
-    """Where the local maximum is that three neighbours bracket; None where it stays below zero.
+def highest(
+    f: Function, places: Sequence[float], values: Sequence[float], least: float = 1e-9
+) -> float | None:
+    """Where the local maximum is that three neighbours bracket, to `least`; None where it stays
+    below zero.
 
     A parabola rises above its middle place by less than by what that is above the lower of the
     others.
@@ -289,14 +417,14 @@ def highest(f: Function, places: Sequence[float], values: Sequence[float]) -> fl
     left, middle, right = values
     if middle < max(left, right) or 2.0 * middle - min(left, right) <= 0.0:
         return None
-    options = {"xatol": 1e-5 * (places[2] - places[0]) + LEAST}
+    options = {"xatol": 1e-5 * (places[2] - places[0]) + least}
     found = scipy.optimize.minimize_scalar(lambda x: -f(float(x)), bounds=(places[0], places[2]),
                             method="bounded", options=options)  # fmt: skip
     return float(found.x) if -found.fun >= middle else places[1]
 
 
-def _end(f: Function, inside: float, outside: float) -> float:
-    while outside - inside > max(LEAST, CLOSE * outside):
+def _end(f: Function, inside: float, outside: float, options: SurvivalOptions) -> float:
+    while outside - inside > max(options.least_end, options.end * outside):
         middle = 0.5 * (inside + outside)
         inside, outside = (middle, outside) if f(middle) <= 0.0 else (inside, middle)
     return inside

@@ -20,6 +20,7 @@ direction left its two sides are all that there is, of several directions some a
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -34,26 +35,32 @@ from ccd_casadi.inner_problem.objective import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.optim.kkt import (
-    STEP,
     ActiveSet,
     FirstOrder,
     Kink,
     KktCertificate,
+    KktOptions,
     active_set,
     hessian_products,
     reduced_curvature,
 )
 from ccd_casadi.optim.pieces import Box
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.arrays import Array
 
-# The envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3: a residual
-# below that says nothing of a kink.
-SMOOTH = 1e-3
 Beside = Callable[[Array], Array]
-EQUATION = 10.0  # weight of the controller's own conditions, which no θ may pay for
-BESIDE = 10.0 * STEP  # of the box: differences of true values and gradients
+
+
+@dataclass(frozen=True)
+class ThetaKktOptions:
+    """Numbers of the optimality conditions over θ."""
+
+    # The envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3: a
+    # residual below that does not indicate a kink.
+    smooth: float = 1e-3
+    equation_weight: float = 10.0  # of the controller's own conditions, which no θ may pay for
+    difference: float = 10.0 * KktOptions.step  # of the box: for true values and gradients
 
 
 def theta_kkt(
@@ -62,6 +69,7 @@ def theta_kkt(
     truth: Sampler | None = None,
     envelope: Envelope | None = None,
     beside: Beside | None = None,
+    options: ThetaKktOptions = ThetaKktOptions(),
 ) -> KktCertificate:
     """Residuals of optimality at a sample.
 
@@ -77,10 +85,10 @@ def theta_kkt(
     nu = at.multipliers()
     residual = at.residual(nu)
     kink: Kink | None = None
-    if residual > SMOOTH and envelope is not None:
+    if residual > options.smooth and envelope is not None:
         direct = own.cost_gradient + problem.w2 * envelope.direct * bounds.width
         to_theta = problem.w2 * envelope.to_theta * bounds.width
-        joint, mu, pair = joint_residual(envelope, direct, to_theta, at.rows, at.size)
+        joint, mu, pair = joint_residual(envelope, direct, to_theta, at.rows, at.size, options)
         if joint < 0.5 * residual:
             multipliers = dict.fromkeys(envelope.names, 0.0)
             for word, value in zip(envelope.names, mu, strict=False):
@@ -101,11 +109,11 @@ def theta_kkt(
         return [objective_gradient(problem, one) for one in there]
 
     if kink is not None:
-        step = STEP if beside else BESIDE
+        step = KktOptions.step if beside else options.difference
         slopes = _slopes(bounds, beside or more, np.array(sample.theta), Z, at.size, step)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers, beside is not None)
     elif beside is None:  # λ's own curvature is left out
-        columns = hessian_products(gradients, bounds.shares(sample.theta), Z, BESIDE)
+        columns = hessian_products(gradients, bounds.shares(sample.theta), Z, options.difference)
         second = reduced_curvature(Z, columns, at.size)
     return at.certificate(nu, residual, second, kink)
 
@@ -121,8 +129,9 @@ def active_theta(problem: CoDesignProblem, sample: InnerSample) -> ActiveSet:
 
 
 def joint_residual(
-    envelope: Envelope, direct: Array, to_theta: Array, A: Array, size: float
-) -> tuple[float, Array, Array]:
+    envelope: Envelope, direct: Array, to_theta: Array, A: Array, size: float,
+    options: ThetaKktOptions = ThetaKktOptions(),
+) -> tuple[float, Array, Array]:  # fmt: skip
     """The residual over θ and controller with the best μ and ν, and these.
 
         rowsᵀ μ = goal,   direct + to_thetaᵀ μ + Aᵀν = 0,   μ, ν >= 0
@@ -131,7 +140,7 @@ def joint_residual(
     the largest of both, over ‖goal‖∞ and over `size`, and of Σ μ slack over ‖goal‖∞: what is to be
     had, to first order, from rows that do not quite bind.
     """
-    count, k = len(envelope.rows), len(A)
+    count, k, weight = len(envelope.rows), len(A), options.equation_weight
     unit = float(np.abs(envelope.goal).max())
     inner = np.hstack([envelope.rows.T / unit, np.zeros((len(envelope.goal), k))])
     ends = np.zeros((len(direct), count - len(to_theta)))
@@ -139,8 +148,8 @@ def joint_residual(
     goals = envelope.goal / unit, -direct / size
     loose = np.pad(envelope.slack / unit, (0, k))
     found, _ = scipy.optimize.nnls(
-        np.vstack([EQUATION * inner, outer, np.diag(loose)]),
-        np.concatenate([EQUATION * goals[0], goals[1], np.zeros(count + k)]),
+        np.vstack([weight * inner, outer, np.diag(loose)]),
+        np.concatenate([weight * goals[0], goals[1], np.zeros(count + k)]),
         maxiter=100 * (count + k),
     )
     off = (inner @ found - goals[0], outer @ found - goals[1], [loose @ found])
@@ -159,7 +168,7 @@ def _slopes(
     bounds: Box, more: Beside, theta: Array, Z: Array, size: float, step: float
 ) -> tuple[tuple[float, float], ...]:
     """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
-    and over `size`; all are asked for at once."""
+    and over `size`; all are evaluated at once."""
     sides = np.array([sign * step * z for z in Z.T for sign in (-1.0, 1.0)])
     ends = np.clip(theta + sides * bounds.width, *bounds)
     steps = np.linalg.norm((ends - theta) / bounds.width, axis=1)

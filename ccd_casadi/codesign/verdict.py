@@ -16,25 +16,46 @@ from enum import StrEnum
 from typing import Any
 
 from ccd_casadi.codesign.formulation import GlobalCheck
-from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
+from ccd_casadi.codesign.survival import Survival, SurvivalOptions
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import FigureOfMerit
-from ccd_casadi.optim.kkt import STEP, Kink, KktCertificate
+from ccd_casadi.optim.kkt import Kink, KktCertificate, KktOptions
 from ccd_casadi.support.text import counted, small_share, spoken, with_unit
-from ccd_casadi.synthesis.second_engine import Comparison
+from ccd_casadi.synthesis.second_engine import EngineComparison
 from surrogates import Quality
 
-SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
-LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
-LEAST_FACTORS = (0.5, 2.0)  # of their damping, which is known no better
-CLOSER_PEAK = 0.10  # relative: peak of S above S_max on a closer model that is worth a warning
-PRIMAL = 1e-6  # of its size: what a constraint may be exceeded by at an optimum
-SIGMAS = 3.0  # left-out error at the design, in predicted deviations
-DELAY_PERIODS = 1.5  # one period of delay and half a period of hold
+
+@dataclass(frozen=True)
+class VerdictOptions:
+    """Limits between the states of a verdict's lines.
+
+    Attributes
+    ----------
+    saddle : float
+        Least scaled eigenvalue of the reduced Hessian; less is a saddle.
+    least_shift : float
+        Of all flexible resonances, relative: the accuracy of a finite-element model at best.
+    least_factors : (float, float)
+        Of their damping, which is known no better.
+    closer_peak : float
+        Relative: peak of S above S_max on a closer model, beyond which the line warns.
+    primal : float
+        Of its size: what a constraint may be exceeded by at an optimum.
+    sigmas, left_out : float
+        Left-out error at the design, in predicted deviations and relative, up to which it passes.
+    """
+
+    saddle: float = -1e-3
+    least_shift: float = 0.02
+    least_factors: tuple[float, float] = (0.5, 2.0)
+    closer_peak: float = 0.10
+    primal: float = 1e-6
+    sigmas: float = 3.0
+    left_out: float = 0.01
 
 
 class State(StrEnum):
-    """What a line of the verdict says."""
+    """The state of a line of the verdict: every line has one of these four."""
 
     PASSED = "passed"
     WARNED = "warned"
@@ -54,7 +75,17 @@ class OwnSet(StrEnum):
 
 @dataclass(frozen=True)
 class VerdictLine:
-    """One line: its state, its words and the figures behind them."""
+    """One line of the verdict.
+
+    Attributes
+    ----------
+    state : State
+        Passed, warned, failed or unknown.
+    words : str
+        Why, in one sentence.
+    figures : mapping
+        On which it rests, by keys of result.json.
+    """
 
     state: State
     words: str
@@ -66,7 +97,7 @@ class VerdictLine:
         return {"state": self.state.value, "words": self.words, **self.figures}
 
 
-def confirmed(line: VerdictLine, second: Comparison) -> VerdictLine:
+def confirmed(line: VerdictLine, second: EngineComparison) -> VerdictLine:
     """`certified` with what a second engine says of the same loops."""
     state, words = line.state, f"{line.words}; {second.words}"
     if second.agrees is False:
@@ -85,18 +116,20 @@ def optimal(
     better: str,
     searched: tuple[str, Mapping[str, Any]],
     unknown: str = "",
-    saddle: float = SADDLE,
+    saddle: float | None = None,
+    options: VerdictOptions = VerdictOptions(),
 ) -> VerdictLine:
     """KKT residual over θ up to `level`, and the whole inner problem at θ, `better` by `gap`.
 
-    `searched`: where something better was looked for, in words and figures; `unknown`: why there
+    `searched`: where something better was searched for, in words and figures; `unknown`: why there
     may be no gradient, in words. A `gap` of NaN: nothing was found to set against the design.
     """
+    saddle = options.saddle if saddle is None else saddle
     residual, kink, (known, found) = kkt.stationarity, kkt.kink, searched
     figures = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap, **found}
     if gap > tolerance:
         return VerdictLine(State.FAILED, f"not optimal: {better}; {known}", figures)
-    if not kkt.primal <= PRIMAL:
+    if not kkt.primal <= options.primal:
         words = f"not optimal: a constraint or bound of theta is exceeded by {kkt.primal:.2g}"
         return VerdictLine(State.FAILED, f"{words}; {known}", figures | {"primal": kkt.primal})
     if not math.isfinite(gap):
@@ -118,7 +151,7 @@ def optimal(
     if kink.least_slope < -level:
         words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
         return VerdictLine(State.FAILED, f"{words}; {known}", figures)
-    beside = f"J by climbs of its controller, {STEP:g} of the box away,"
+    beside = f"J by climbs of its controller, {KktOptions.step:g} of the box away,"
     words = (
         f"locally optimal to first order at a kink of J: KKT residual {residual:.2g} over theta "
         f"and the controller together ({kink.one_gradient:.2g} by the gradient of one side); "
@@ -171,7 +204,7 @@ def search_evidence(
 
 def predicted(
     error: float, tolerance: float, value: float, of: FigureOfMerit, quality: Quality | None,
-    learnt: bool = False,
+    learnt: bool = False, options: VerdictOptions = VerdictOptions(),
 ) -> VerdictLine:  # fmt: skip
     """Surrogate against truth at the design, whose `value` of a figure `of` merit is in SI.
 
@@ -207,7 +240,7 @@ def predicted(
         f"the optimum is a training sample; left out, its {what} is missed by "
         f"{size:.2g} {unit} ({100 * share:.2g} %, {sigmas:.1f} sigma)"
     )
-    if share <= tolerance or (sigmas <= SIGMAS and share <= 0.01):
+    if share <= tolerance or (sigmas <= options.sigmas and share <= options.left_out):
         return VerdictLine(State.PASSED, words, figures)
     words += ": the samples around do not support the design"
     return VerdictLine(State.WARNED, words, figures)
@@ -222,12 +255,31 @@ def survives(
     other_damping: str = "",
     closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
+    options: VerdictOptions = VerdictOptions(),
 ) -> VerdictLine:
-    """A loop on plants off its model; `own`: what is known of it on the case's own set, and
-    `own_words` why (None: its kind asks for no set).
+    """The line `survives`: a loop on plants off its model. A figure that is NaN meets no limit.
 
-    `other_damping`: what that set does not keep, in words; `closer` models of the plant by name:
-    stable, and the peak of S; `figures`: more of them. A figure that is NaN meets no limit.
+    Parameters
+    ----------
+    survival : Survival or None
+        The ranges of the loop; None where it is not certified.
+    S_max : float
+        Bound of ‖S‖∞.
+    own, own_words : OwnSet or None, str
+        What is known of the loop on the case's own set, and why; None: its kind has no set.
+    other_damping : str
+        What that set does not keep, in words.
+    closer : sequence of (name, stable, peak)
+        ‖S‖∞ on closer models of the plant.
+    figures : mapping
+        More of them.
+    options : VerdictOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    VerdictLine
+        Failed, warned, unknown or passed.
     """
     figures = {**(figures or {}), **({} if own is None else {"set": own.value})}
     if survival is None:
@@ -238,11 +290,11 @@ def survives(
     failed, warned = own is OwnSet.BROKEN, own in (OwnSet.UNPROVEN, OwnSet.NONE)
     said = [words for words in (survival.contradiction, own_words, other_damping) if words]
     said.append(f"stable for resonances {_range(low, high)}")
-    if not (low <= -LEAST_SHIFT and high >= LEAST_SHIFT):
+    if not (low <= -options.least_shift and high >= options.least_shift):
         warned = True
-        said[-1] += f", less than +-{100 * LEAST_SHIFT:g} %"
+        said[-1] += f", less than +-{100 * options.least_shift:g} %"
     said.append(f"within S_max {_range(*survival.S_max_shift)}")
-    if not (damping[0] <= LEAST_FACTORS[0] and damping[1] >= LEAST_FACTORS[1]):
+    if not (damping[0] <= options.least_factors[0] and damping[1] >= options.least_factors[1]):
         warned = True
         said.append(f"unstable where damping is not between {damping[0]:.3g} and {damping[1]:.3g}")
     if survival.unstable_poles_hz:
@@ -253,14 +305,14 @@ def survives(
         if not stable:
             failed = True
             said.insert(0, f"unstable on {name}")
-        elif not peak <= (1.0 + CLOSER_PEAK) * S_max:
+        elif not peak <= (1.0 + options.closer_peak) * S_max:
             warned = True
             said.append(f"peak of S {peak:.3g} on {name}")
     failed = failed or bool(survival.contradiction)
     state = State.FAILED if failed else State.WARNED if warned else State.PASSED
     if own is OwnSet.SEARCHED and state is State.PASSED:
         state = State.UNKNOWN
-    rest = survival.statics
+    rest, followed = survival.statics, SurvivalOptions()
     if rest.differentiates:
         said.append(
             f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
@@ -270,10 +322,10 @@ def survives(
     figures |= {
         "stable_shift": list(survival.stable_shift),
         "S_max_shift": list(survival.S_max_shift),
-        "shift_followed_to": REACH,
-        "least_shift": LEAST_SHIFT,
+        "shift_followed_to": followed.reach,
+        "least_shift": options.least_shift,
         "stable_damping": list(survival.stable_damping),
-        "damping_followed_to": list(FACTORS),
+        "damping_followed_to": list(followed.factors),
         "gain_margin": list(survival.gain),
         "phase_margin_deg": survival.phase_deg,
         "modulus_margin": survival.modulus,
@@ -301,7 +353,7 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
         return VerdictLine(State.PASSED, words, figures)
     if survival is None or sampling is not None or not math.isfinite(survival.delay):
         return VerdictLine(State.UNKNOWN, "run deploy", figures)
-    rate = DELAY_PERIODS / survival.delay
+    rate = 1.5 / survival.delay  # one period of delay, and half a period of hold
     words = (
         f"run deploy; on the model the delay margin is {with_unit(survival.delay, 's')}, and below "
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
@@ -310,6 +362,6 @@ def deployable(survival: Survival | None, sampling: Sampling | None = None) -> V
 
 
 def _range(low: float, high: float) -> str:
-    beyond = [">" if abs(end) >= 0.999 * REACH else "" for end in (low, high)]
+    beyond = [">" if abs(end) >= 0.999 * SurvivalOptions().reach else "" for end in (low, high)]
     shown = [float(round(100.0 * end, 3)) for end in (low, high)]  # less is none
     return f"{beyond[0]}{shown[0]:+.2g} to {beyond[1]}{shown[1]:+.2g} %"

@@ -1,8 +1,8 @@
 """The design that a run ends with, and what was found out about it: alike for every controller.
 
 Each kind of controller says what only it knows (`figures`, `evidence`, some lines of the verdict);
-what the outer problem is judged by stands here, and results, verdicts and pages ask for nothing
-else. `Solution` is what a whole run leaves.
+what the outer problem is judged by is here, and results, verdicts and pages use nothing else.
+`Solution` is what a whole run leaves.
 """
 
 from abc import ABC, abstractmethod
@@ -13,12 +13,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ccd_casadi.codesign.final_judgement import judge_on_model
 from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, outputs_of
-from ccd_casadi.codesign.judgement import judge_on_model
 from ccd_casadi.codesign.result_entries import controller_dict
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
-from ccd_casadi.codesign.verdict import SADDLE, VerdictLine, search_evidence, survives
+from ccd_casadi.codesign.verdict import VerdictLine, VerdictOptions, search_evidence, survives
 from ccd_casadi.fixed_structure.judgement import Judgement
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -26,7 +26,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import NotebookHtml
-from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison
+from ccd_casadi.synthesis.second_engine import NOT_COMPARED, EngineComparison
 from surrogates import GaussianProcess, Quality
 
 
@@ -34,12 +34,28 @@ from surrogates import GaussianProcess, Quality
 class Verified(ABC):
     """A design at θ, judged on the truth.
 
-    `design` has the `controller`, whether it is `certified`, and its `bandwidth`, unless its kind
-    reads these elsewhere. `value` is what J counts of the controller, in SI. `inner_gap`: by how
-    much (relative) a search of the whole inner problem at θ beats it, NaN where none was found.
-    `second`: another engine on its loops. `feasible`: certified, within its bounds, and λ(θ) <= 0.
-    `survival` and `damping`: off the model; None where the loop is not stable.
-    `problem` has what a search has added to the case's: a plant set, controllers to start from.
+    Attributes
+    ----------
+    problem : CoDesignProblem
+        With what a search has added to the case's: a plant set, controllers to start from.
+    theta : tuple of float
+        SI.
+    design : Any
+        Has the `controller`, whether it is `certified`, and its `bandwidth`, unless its kind reads
+        these elsewhere.
+    value, objective, hardware_cost : float
+        What J counts of the controller (SI), J and f.
+    kkt : KktCertificate
+        Of optimality.
+    inner_gap : float
+        By how much (relative) a search of the whole inner problem at θ is better, NaN where it
+        found nothing.
+    feasible : bool
+        Certified, within its bounds, and λ(θ) <= 0.
+    survival, damping : Survival, OtherDamping
+        Off the model; None where the loop is not stable.
+    second : EngineComparison
+        Another engine on its loops.
     """
 
     problem: CoDesignProblem
@@ -53,10 +69,10 @@ class Verified(ABC):
     feasible: bool
     survival: Survival | None
     damping: OtherDamping | None
-    second: Comparison = NOT_COMPARED
+    second: EngineComparison = NOT_COMPARED
 
     kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
-    saddle: ClassVar[float] = SADDLE  # least curvature that is none downwards
+    saddle: ClassVar[float] = VerdictOptions().saddle  # least curvature that is none downwards
 
     @property
     def controller(self) -> StateSpace:
@@ -75,7 +91,7 @@ class Verified(ABC):
 
     @property
     def point(self) -> Array:
-        """Where the surrogates of the formulation are asked: θ, and what else they depend on."""
+        """Where the surrogates of the formulation are evaluated: θ, and their other inputs."""
         return np.array(self.theta)
 
     @property

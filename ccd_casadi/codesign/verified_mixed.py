@@ -16,16 +16,36 @@ from ccd_casadi.synthesis.synthesis import Design
 
 
 def robust_words(robust: RobustCheck) -> dict[str, Any]:
-    """What `survives` takes of a set that was searched along its shift."""
+    """Arguments of `survives` for a set that was searched along its shift.
+
+    Parameters
+    ----------
+    robust : RobustCheck
+        The worst of the set.
+
+    Returns
+    -------
+    dict
+        `own` and `own_words`.
+    """
     own = OwnSet.KEPT if robust.passed else OwnSet.BROKEN
     return {"own": own, "own_words": robust.words}
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerifiedDesign(Verified):
-    """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
+    """The design of a run with its controller and every true figure.
 
-    `references`: on closer models of the plant; `robust`: all along the case's own set.
+    Attributes
+    ----------
+    x : (n_θ + 2,) array
+        (θ, ln ω_S, ln ω_T), SI.
+    design : Design
+        Made anew, not from a store.
+    references : tuple of ReferenceCheck
+        On closer models of the plant.
+    robust : RobustCheck or None
+        All along the case's own set.
     """
 
     x: Array

@@ -21,7 +21,7 @@ from ccd_casadi.codesign.verdict import State, VerdictLine
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.design import TWICE
+from ccd_casadi.fixed_structure.design import DesignOptions
 from ccd_casadi.fixed_structure.judgement import Judgement, judgement_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
@@ -67,11 +67,30 @@ def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> 
 class VerifiedStructured(Verified):
     """The design of a run, judged on its set and on the whole box of plants.
 
-    `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
-    the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
-    `worst` the worst plant that was found. `multistart` is a multi-start search at θ,
-    `costs` what easier problems have there, `prices` dω_b/d ln t (rad/s) of every tolerance t, and
-    `gap`, of ω_b, what no controller reaches; `told` the time of its move, where that counts.
+    Attributes
+    ----------
+    design : SectionsDesign
+        Certified anew on its set.
+    multistart : StructuredValue
+        A multi-start search at θ.
+    wide, checked : SetCertificate, int
+        The judge's certificate on a lattice of this number of plants of the box.
+    proof : Proof
+        For the whole box.
+    drawn : Yield or None
+        Where that is not proven: how many random plants of the box survive.
+    worst : Excess
+        The worst plant that was found.
+    rounds : int
+        Of the search.
+    costs : Costs
+        What easier problems reach at θ.
+    prices : mapping
+        dω_b/d ln t in rad/s of every tolerance t.
+    gap : Gap or None
+        Of ω_b: what no controller reaches.
+    told : (float, Yield) or None
+        The time of its move in s, where J counts it.
     """
 
     design: SectionsDesign
@@ -226,7 +245,7 @@ class VerifiedStructured(Verified):
         multistart = ", ".join(f"{value:.2f}" for value in found)
         words = f"a multi-start search at this theta ended at {multistart} Hz{of}"
         design = self.multistart.design
-        if design.found is not None and design.found < TWICE:
+        if design.found is not None and design.found < DesignOptions.repeats:
             words += f", its best not found again from {counted(design.starts, 'start')}"
         figures = {**figures, "local_optima_hz": found, "best_found": design.found}
         return f"{words}; {known}", figures

@@ -18,9 +18,14 @@ from ccd_casadi.robust.perturbed import SampledFigures, sampled_figures, worst_f
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 
-SLOWEST, FASTEST = 4.0, 4000.0  # rates tried, over ω_b/2π
-CLOSE = 1e-3  # relative: how closely the rate that is needed is bracketed
-NICE = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.4, 8.0, 10.0)
+
+@dataclass(frozen=True)
+class RateOptions:
+    """Numbers of the search for a sampling rate."""
+
+    slowest: float = 4.0  # rate tried, over ω_b/2π
+    fastest: float = 4000.0
+    accuracy: float = 1e-3  # relative: how closely the least rate is bracketed
 
 
 class Conversion(StrEnum):
@@ -72,7 +77,7 @@ class Target:
 
     @property
     def peak(self) -> float:
-        """The largest ‖S‖∞ that is let pass."""
+        """The largest ‖S‖∞ that is allowed."""
         return self.S_max * (1.0 + self.excess)
 
     def met(self, figures: SampledFigures) -> bool:
@@ -81,7 +86,7 @@ class Target:
         return self.held(figures) and change <= self.tolerance
 
     def held(self, figures: SampledFigures) -> bool:
-        """Whether the loop is stable within the peak: what is asked on every plant of a set."""
+        """Whether the loop is stable within the peak: what every plant of a set requires."""
         return figures.stable and figures.sensitivity_peak <= self.peak
 
 
@@ -94,14 +99,17 @@ def loop_at(
 
 
 def needed_rate(
-    met: Callable[[float], bool], bandwidth_hz: float, also: Sequence[float] = ()
+    met: Callable[[float], bool],
+    bandwidth_hz: float,
+    also: Sequence[float] = (),
+    options: RateOptions = RateOptions(),
 ) -> float | None:
     """The least rate in Hz from which on every rate tried meets, None where the fastest does not.
 
-    Tried are, from 4000 ω_b down to 4 ω_b, those of `nice_rate`, their geometric means and `also`;
-    the least is bracketed to 0.1 %. A rate below one that fails is never called enough.
+    Tried are, from the fastest down to the slowest, those of `nice_rate`, their geometric means and
+    `also`; the least is bracketed. A rate below one that fails is never called enough.
     """
-    low, high = SLOWEST * bandwidth_hz, FASTEST * bandwidth_hz
+    low, high = options.slowest * bandwidth_hz, options.fastest * bandwidth_hz
     round_ones = [nice_rate(low)]
     while round_ones[-1] < high:
         round_ones.append(nice_rate(round_ones[-1] * 1.01))
@@ -114,7 +122,7 @@ def needed_rate(
         good = rate
     if good is None or np.isnan(bad):
         return good
-    while good / bad > 1.0 + CLOSE:
+    while good / bad > 1.0 + options.accuracy:
         middle = float(np.sqrt(good * bad))
         if met(middle):
             good = middle
@@ -129,8 +137,9 @@ def nice_rate(rate: float) -> float:
     >>> nice_rate(8123.0), nice_rate(10000.0)
     (10000.0, 10000.0)
     """
+    series = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.4, 8.0, 10.0)
     power = 10.0 ** np.floor(np.log10(rate))
-    return float(next(power * nice for nice in NICE if power * nice >= rate * (1.0 - 1e-12)))
+    return float(next(power * nice for nice in series if power * nice >= rate * (1.0 - 1e-12)))
 
 
 def loops_meet(
@@ -169,7 +178,8 @@ def choose(
     if timing.rate_hz is not None:
         return conversion, needed, timing.rate_hz
     if needed is None:
-        words = f"no sampling rate up to {FASTEST * bandwidth_hz:.3g} Hz keeps S_max to 5 %"
+        fastest = RateOptions().fastest * bandwidth_hz
+        words = f"no sampling rate up to {fastest:.3g} Hz keeps S_max to 5 %"
         where = " on all plants of its [robust] set" if family else ""
         raise UserError(
             f"{run.folder}: {words} and omega_b to 3 %{where} with this delay; {remedy}"

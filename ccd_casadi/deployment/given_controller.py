@@ -40,7 +40,15 @@ SECTIONS = {
 def as_it_runs(run: FinishedRun) -> FinishedRun:
     """A run whose case has a sampled loop with its controller as it runs there, by Tustin's rule.
 
-    Other runs as they are. `figures` then has ω_b and ‖S‖∞ of the sampled loop.
+    Parameters
+    ----------
+    run : FinishedRun
+        With K(s).
+
+    Returns
+    -------
+    FinishedRun
+        With K(z), and ω_b and ‖S‖∞ of the sampled loop; other runs as they are.
     """
     if run.problem.sampling is None:
         return run
@@ -51,7 +59,22 @@ def as_it_runs(run: FinishedRun) -> FinishedRun:
 def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
     """The run with the controller of a file in place of its own, measured on its plant.
 
-    Raises UserError where the file holds none that fits, or the loop is not stable with it.
+    Parameters
+    ----------
+    run : FinishedRun
+        With the plant.
+    path : Path
+        See the module.
+
+    Returns
+    -------
+    FinishedRun
+        With the figures of that controller.
+
+    Raises
+    ------
+    UserError
+        The file holds no controller that fits, or the loop is not stable with it.
     """
     K, delay = read_controller(path)
     p, m = len(run.plant.C), run.plant.B.shape[1]

@@ -17,15 +17,41 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
-PARTS = 20  # of a period, that a jitter is a multiple of: few steps to compute
-TAIL = 3.0  # the machine is watched for this many times the setpoint's duration after its end
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """Numbers of a simulated move.
+
+    Attributes
+    ----------
+    parts : int
+        Of a period, that a jitter is a multiple of: few steps to compute.
+    tail : float
+        Time after the setpoint's end that is simulated, over its duration.
+    watched : float
+        Last share of the simulation, where a limit cycle is seen.
+    shares : tuple of float
+        Force limits that are tried, over the peak force.
+    """
+
+    parts: int = 20
+    tail: float = 3.0
+    watched: float = 0.25
+    shares: tuple[float, ...] = (0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)
 
 
 @dataclass(frozen=True)
 class Electronics:
-    """What the electronics do: steps of sensor (unit of y) and force (N), jitter of the delay (s).
+    """What the electronics do.
 
-    The delay of each sample is uniform within ± `jitter` of the nominal one; `seed` of the draws.
+    Attributes
+    ----------
+    sensor_step, force_step : float
+        Quantisation of y (its unit) and of u (N); 0: none.
+    jitter : float
+        The delay of each sample is uniform within ± this of the nominal one, s.
+    seed : int
+        Of the draws.
     """
 
     sensor_step: float = 0.0
@@ -35,7 +61,7 @@ class Electronics:
 
     @property
     def ideal(self) -> bool:
-        """Whether nothing of it is there."""
+        """Whether all of them are zero."""
         return not (self.sensor_step or self.force_step or self.jitter)
 
 
@@ -49,12 +75,13 @@ def move(
     forward: Array | None = None,
     window: float = 1e-6,
     hardware: Electronics | None = None,
+    options: SimulationOptions = SimulationOptions(),
 ) -> Move:
     """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None."""
     hardware = hardware or Electronics()
     K, T = realisation.system, realisation.system.period
     n, m, p = len(plant.A), len(K.C), len(plant.C)
-    count = int(np.ceil((1.0 + TAIL) * profile.duration / T))
+    count = int(np.ceil((1.0 + options.tail) * profile.duration / T))
     time = np.arange(count, dtype=float) * T
     wanted = profile.at(time)
     ahead = np.zeros((count, m))
@@ -63,8 +90,8 @@ def move(
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
     rng = np.random.default_rng(hardware.seed)
-    parts = np.round(PARTS * hardware.jitter / T * rng.uniform(-1.0, 1.0, count))
-    reaches = np.arange(count) + np.maximum(delay / T + parts / PARTS, 0.0)  # in periods
+    parts = np.round(options.parts * hardware.jitter / T * rng.uniform(-1.0, 1.0, count))
+    reaches = np.arange(count) + np.maximum(delay / T + parts / options.parts, 0.0)  # in periods
     reaches = np.maximum.accumulate(reaches)  # no force overtakes an earlier one
 
     @cache
@@ -105,16 +132,21 @@ def _stepped(value: Array, step: float) -> Array:
     return np.asarray(step * np.round(value / step)) if step else value
 
 
-WATCHED = 0.25  # of the watch, in whose end a limit cycle is seen
-SHARES = (0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of the peak force that are tried
-
-
 @dataclass(frozen=True)
 class OnHardware:
-    """The setpoint, the gains of feedforward (5, m, p) or None, the move by its ways in words.
+    """Moves of the deployed loop.
 
-    `least_limit`: share of the unlimited peak force; NaN where the unlimited move itself does not
-    end in its window, and where no limit is given.
+    Attributes
+    ----------
+    profile, window : Setpoint, float
+        The setpoint, and the window in m in which the move has to end.
+    forward : (5, m, p) array or None
+        Gains of the feedforward.
+    ways : mapping of Move
+        By what is different, in words.
+    least_limit : float
+        Share of the unlimited peak force; NaN where the unlimited move itself does not end in its
+        window, and where no limit is given.
     """
 
     profile: Setpoint
@@ -134,15 +166,39 @@ def on_hardware(
     window: float = 1e-6,
     hardware: Electronics | None = None,
     progress: Callable[[str], None] = lambda words: None,
+    options: SimulationOptions = SimulationOptions(),
 ) -> OnHardware:
-    """The move of output 1 on a plant in SI; τ in s, ω_b in rad/s, window in m."""
+    """Simulate the move of output 1 with and without feedforward, limits and electronics.
+
+    Parameters
+    ----------
+    plant : StateSpace
+        u to y, SI.
+    realisation : Realisation
+        The controller as it runs.
+    delay, bandwidth : float
+        τ in s and ω_b in rad/s.
+    limits, window : MoveLimits, float
+        Of the setpoint, and where the move has to end, m.
+    hardware : Electronics or None
+        None: ideal.
+    progress : function of str
+        Takes lines of progress.
+    options : SimulationOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    OnHardware
+        The moves.
+    """
     profile, K = setpoint(limits), realisation.system
     free = replace(realisation, saturation=None, back_calculation=None)
     try:
         forward = feedforward(plant, K.period, delay)
     except UserError:
         forward = None
-    made = partial(move, plant, delay=delay, profile=profile, window=window)
+    made = partial(move, plant, delay=delay, profile=profile, window=window, options=options)
     progress("a move")
     unlimited = made(free)
     ways = {"feedback alone": unlimited}
@@ -159,7 +215,7 @@ def on_hardware(
     if realisation.saturation is not None and np.isfinite(unlimited.settled):
         progress("least force")
         least = 1.0
-        for share in SHARES:
+        for share in options.shares:
             held = with_anti_windup(replace(free, saturation=share * peak), bandwidth)
             if not np.isfinite(made(held, forward=forward).settled):
                 break
@@ -169,6 +225,7 @@ def on_hardware(
 
 def hardware_dict(found: OnHardware) -> dict[str, Any]:
     """For deploy.json; seconds, m and N."""
+    watched = SimulationOptions().watched
     return {
         "duration": found.profile.duration,
         "window": found.window,
@@ -179,7 +236,7 @@ def hardware_dict(found: OnHardware) -> dict[str, Any]:
                 "words": words,
                 "settled": None if np.isinf(move.settled) else move.settled,
                 "peak_error": move.peak_error,
-                "last_error": move.last_error(WATCHED),
+                "last_error": move.last_error(watched),
                 "peak_force": float(move.peak_force.max()),
                 "saturated": move.saturated,
             }

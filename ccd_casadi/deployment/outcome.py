@@ -22,15 +22,21 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures, Statics
 
-# The sampled loop keeps S_max to 5 % and ω_b to 3 %.
-SAMPLED_EXCESS, SAMPLED_BANDWIDTH = 0.05, 0.03
-
 
 @dataclass(frozen=True)
 class ChannelOrders:
-    """A channel's controllers of every order; the one chosen, and the least that keeps S_max.
+    """A channel's controllers of every order.
 
-    `designed`: structure and κ (SI) of sections, which are deployed as they are.
+    Attributes
+    ----------
+    channel : LoopChannel
+        The loop that they close.
+    rows : tuple of ReducedController
+        The full order first.
+    chosen, strict : ReducedController
+        The one deployed, and the least that keeps S_max as the design does.
+    designed : (Structure, array) or None
+        Structure and κ (SI) of sections, which are deployed as they are.
     """
 
     channel: LoopChannel
@@ -42,13 +48,34 @@ class ChannelOrders:
 
 @dataclass(frozen=True)
 class Deployment:
-    """Everything that was found out on the way from a run's controller to the deployed one.
+    """From a run's controller to the deployed one.
 
-    `sampled` are the exact figures of the sampled loop on the nominal plant, `members` those on
-    every other plant of the run's [robust] set. `unverified`: why the run itself is not verified,
-    empty where it is. `needed_hz`: the least rate that will do, None where none does.
-    `judge`: the code's coefficients on the plants as their function returned them.
-    `compliance`: the largest |GS| in m/N and on which plant, where the case bounds it.
+    Attributes
+    ----------
+    orders : tuple of ChannelOrders
+        Of each channel.
+    limits, reduced, reduced_figures : LoopLimits, StateSpace, DesignFigures
+        What the reduction keeps, K(s) after it, SI, and its loop.
+    needed_hz : float or None
+        The least rate that is enough; None where none is.
+    target : Target
+        What the sampled loop keeps.
+    rate_hz, delay : float
+        Hz and s.
+    conversion, plant, realisation : Conversion, StateSpace, Realisation
+        How K(s) becomes K(z); the sampled plant; the difference equation.
+    sampled : SampledFigures
+        Exact ones of the sampled loop on the nominal plant.
+    members : tuple of MemberLoop
+        The same on every other plant of the run's [robust] set.
+    unverified : str
+        Why the run itself is not verified; empty where it is.
+    statics : Statics or None
+        Of the loop at rest.
+    compliance, compliance_max : (Perturbation, float), float
+        The largest |GS| in m/N and on which plant, and its bound, where the case has one.
+    judge : Judgement or None
+        Of the code's coefficients on the plants as their function returned them.
     """
 
     orders: tuple[ChannelOrders, ...]
@@ -121,12 +148,34 @@ def _fault(found: Deployment, item: MemberLoop) -> str:
 
 
 def status_words(run: FinishedRun, found: Deployment) -> str:
-    """`verified`, or not, and the reason beside it."""
+    """`verified`, or not, and the reason.
+
+    Parameters
+    ----------
+    run, found : FinishedRun, Deployment
+        The run and what was deployed of it.
+
+    Returns
+    -------
+    str
+        One line.
+    """
     return f"{short_status(run, found)}  {reason_words(run, found)}".rstrip()
 
 
 def short_status(run: FinishedRun, found: Deployment) -> str:
-    """`verified` without more where every bound is kept as the case gives it."""
+    """`verified` without a remark where every bound is kept as the case gives it.
+
+    Parameters
+    ----------
+    run, found : FinishedRun, Deployment
+        The run and what was deployed of it.
+
+    Returns
+    -------
+    str
+        A few words.
+    """
     if not found.passed:
         return "not verified"
     if _over(run, found) > 0.0:
@@ -135,7 +184,18 @@ def short_status(run: FinishedRun, found: Deployment) -> str:
 
 
 def deployed_line(run: FinishedRun, found: Deployment) -> VerdictLine:
-    """`deployable` of the run's verdict."""
+    """The line `deployable` of the run's verdict.
+
+    Parameters
+    ----------
+    run, found : FinishedRun, Deployment
+        The run and what was deployed of it.
+
+    Returns
+    -------
+    VerdictLine
+        Failed where the sampled loop does not keep its target on a plant.
+    """
     K = found.sampled
     at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
     figures = {
@@ -171,7 +231,18 @@ def _loop_words(found: SampledFigures) -> str:
 
 
 def order_words(run: FinishedRun, found: Deployment) -> str:
-    """`4 of 6 states (7 synthesised), and 1 of the lead filter`."""
+    """The order, as in `4 of 6 states (7 synthesised), and 1 of the lead filter`.
+
+    Parameters
+    ----------
+    run, found : FinishedRun, Deployment
+        The run and what was deployed of it.
+
+    Returns
+    -------
+    str
+        A few words.
+    """
     orders = [item.chosen.order for item in found.orders]
     if kind_of(run.problem).as_designed:
         return f"{' + '.join(map(str, orders))} states, as designed"
@@ -184,7 +255,18 @@ def order_words(run: FinishedRun, found: Deployment) -> str:
 
 
 def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
-    """Bandwidth and peak of S of every loop on the way: name, value and remark."""
+    """Bandwidth and peak of S of every loop on the way.
+
+    Parameters
+    ----------
+    run, found : FinishedRun, Deployment
+        The run and what was deployed of it.
+
+    Returns
+    -------
+    list of (name, value, remark)
+        Of the full, the reduced and the sampled loop.
+    """
     loops: list[tuple[str, Any]] = [("Full", run.figures), ("Reduced", found.reduced_figures)]
     if kind_of(run.problem).as_designed:
         loops = [("Continuous", run.figures)]
@@ -213,7 +295,18 @@ def _over(run: FinishedRun, found: Deployment) -> float:
 
 
 def reason_words(run: FinishedRun, found: Deployment) -> str:
-    """Why it is not verified; where it is, what hold and delay have taken of S_max."""
+    """Why it is not verified; where it is, what hold and delay have taken of S_max.
+
+    Parameters
+    ----------
+    run, found : FinishedRun, Deployment
+        The run and what was deployed of it.
+
+    Returns
+    -------
+    str
+        Empty where there is nothing to say.
+    """
     own = f"the run itself is not verified: {found.unverified}"
     parts = [own] if found.unverified else []
     if found.shortfalls:

@@ -2,7 +2,7 @@
 designed."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,7 @@ from ccd_casadi.deployment.discretise import (
     loop_at,
     loops_meet,
 )
-from ccd_casadi.deployment.outcome import (
-    SAMPLED_BANDWIDTH,
-    SAMPLED_EXCESS,
-    ChannelOrders,
-    Deployment,
-)
+from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.realisation import (
     LoopChannel,
     along_directions,
@@ -55,21 +50,56 @@ from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.synthesis import compliance_of, statics
 
-DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
+
+@dataclass(frozen=True)
+class DeploymentOptions:
+    """What the deployed loop keeps of the designed one.
+
+    A reduced controller keeps S_max and a bound on the compliance to 0.5 %: they bind at most
+    optima, where any change exceeds them a little.
+
+    Attributes
+    ----------
+    sampled_excess, sampled_bandwidth : float
+        Relative, of S_max and ω_b: of the sampled loop.
+    designed_excess : float
+        Relative, of S_max: of a loop that was designed as sampled.
+    reduced_peak, reduced_bandwidth : float
+        Over S_max and ω_b: of the loop with a reduced controller.
+    reduced_norm : float
+        Largest weighted norm over the γ of the design.
+    strict : float
+        Relative: S_max kept as the design itself keeps it.
+    least_rate : float
+        Samples in a period of ω_b.
+    added_plants : int
+        Plants between those of the case's set that may be added to it for the rate.
+    """
+
+    sampled_excess: float = 0.05
+    sampled_bandwidth: float = 0.03
+    designed_excess: float = 1e-3
+    reduced_peak: float = 1.005
+    reduced_bandwidth: float = 0.99
+    reduced_norm: float = 2.0
+    strict: float = 1e-6
+    least_rate: float = 4.0
+    added_plants: int = 5
 
 
 def at_its_rate(
     run: FinishedRun, channels: tuple[LoopChannel, ...], family: tuple[Member, ...],
-    designed: Sampling, timing: Timing,
+    designed: Sampling, timing: Timing, options: DeploymentOptions = DeploymentOptions(),
 ) -> tuple[Target, float, float, float]:  # fmt: skip
     """Target, the rate that is needed by Tustin's rule, and the rate and delay to run at.
 
-    What was designed is the sampled loop: that is what a given rate or delay is held against.
+    What was designed is the sampled loop: a given rate or delay is compared with that.
     """
     tustin, rate = Conversion.TUSTIN, timing.rate_hz or designed.rate_hz
     plant = run.plant.plant_si()
     own = loop_at(plant, run.controller, tustin, designed.period, designed.delay)
-    target = Target(run.problem.inner.S_max, DESIGNED_EXCESS, own.bandwidth, SAMPLED_BANDWIDTH)
+    excess, tolerance = options.designed_excess, options.sampled_bandwidth
+    target = Target(run.problem.inner.S_max, excess, own.bandwidth, tolerance)
     if timing.delay is None and timing.delay_samples == Timing.delay_samples:
         timing = replace(timing, delay=designed.delay)
     loops = [(channel, run.controller) for channel in channels]
@@ -114,15 +144,8 @@ def designed_channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
     return tuple(found)
 
 
-# A reduced controller keeps S_max and a bound on the compliance to 0.5 % (they bind at most optima,
-# where any change passes them a little), S_low, 99 % of ω_b, and no gain more than twice the bound
-# that γ puts on it.
-REDUCED_PEAK, REDUCED_NORM, REDUCED_BANDWIDTH = 1.005, 2.0, 0.99
-STRICT = 1e-6  # relative: S_max kept as the design itself keeps it
-LEAST_RATE = 4.0  # samples in a period of ω_b
 SHORTEN_IT = "shorten it"
 DESIGN_FOR_IT = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
-ADDED = 5  # plants between those of the case's set that may be added to it for the rate
 
 
 @one_blas_thread
@@ -132,6 +155,7 @@ def deploy(
     *,
     saturation: float | None = None,
     progress: Callable[[str], None] = lambda words: None,
+    options: DeploymentOptions = DeploymentOptions(),
 ) -> Deployment:
     """Reduce, discretise and verify the controller of a run.
 
@@ -146,11 +170,14 @@ def deploy(
     timing : Timing
         Rate and delay, where they are given.
     saturation, progress : float, callable
-        Largest force, N; is given a line at each step.
+        Largest force, N; takes a line at each step.
+    options : DeploymentOptions
+        What is kept of the designed loop.
 
     Returns
     -------
     Deployment
+        Also where it is not verified.
 
     Raises
     ------
@@ -159,23 +186,25 @@ def deploy(
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
     designed, family, dense = run.problem.sampling, members(run), members(run, dense=True)
-    target = Target(inner.S_max, SAMPLED_EXCESS, full.bandwidth, SAMPLED_BANDWIDTH)
+    target = Target(inner.S_max, options.sampled_excess, full.bandwidth, options.sampled_bandwidth)
     if kind_of(run.problem).as_designed:
         require_own_bounds(run, designed, timing)
         limits, remedy = LoopLimits(inner.S_max, inner.S_low, np.inf, full.bandwidth), DESIGN_FOR_IT
         orders, channels, small = designed_channels(run), whole_loop(run.plant, K), [K]
         reduced, figures = K, full
     else:
-        if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * full.bandwidth / HZ:
-            words = f"is less than {LEAST_RATE:g} times the bandwidth, {full.bandwidth / HZ:.4g} Hz"
+        least = options.least_rate
+        if timing.rate_hz is not None and timing.rate_hz < least * full.bandwidth / HZ:
+            words = f"is less than {least:g} times the bandwidth, {full.bandwidth / HZ:.4g} Hz"
             raise UserError(f"--rate-hz {timing.rate_hz:g}: {words}; sample faster")
         remedy = SHORTEN_IT
         limits = LoopLimits(
-            REDUCED_PEAK * inner.S_max, inner.S_low * (1.0 + STRICT), REDUCED_NORM * full.gamma,
-            REDUCED_BANDWIDTH * full.bandwidth,
+            options.reduced_peak * inner.S_max, inner.S_low * (1.0 + options.strict),
+            options.reduced_norm * full.gamma, options.reduced_bandwidth * full.bandwidth,
         )  # fmt: skip
         orders = tuple(
-            _orders(run, c, family, limits, progress) for c in scalar_channels(run.plant, K)
+            _orders(run, c, family, limits, progress, options)
+            for c in scalar_channels(run.plant, K)
         )
         channels = tuple(item.channel for item in orders)
         small = [item.chosen.controller for item in orders]
@@ -184,12 +213,12 @@ def deploy(
     way: dict[str, Any] = {"limits": limits, "reduced": reduced, "reduced_figures": figures}
     if designed is not None:
         progress("the rate of the case")
-        target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing)
+        target, own_hz, rate, delay = at_its_rate(run, channels, family, designed, timing, options)
         way |= {"needed_hz": own_hz, "target": target}
         found = _assessed(run, dense, orders, Conversion.TUSTIN, rate, delay, saturation, way)
         return replace(found, judge=attempted(_judged, run, found))
     loops = list(zip(channels, small, strict=True))
-    for attempt in range(1 + ADDED):
+    for attempt in range(1 + options.added_plants):
         conversion, needed, rate = choose(
             run, timing, loops, target, family, progress, attempt, remedy
         )
@@ -229,15 +258,18 @@ def _orders(
     family: tuple[Member, ...],
     limits: LoopLimits,
     progress: Callable[[str], None],
+    options: DeploymentOptions,
 ) -> ChannelOrders:
     progress(f"orders of channel {channel.name}")
     inner, most = run.problem.inner, run.problem.inner.compliance_max
     rows = reductions(channel, run.weights, inner.omega_low)
-    strict = replace(limits, peak=inner.S_max * (1.0 + STRICT))
+    strict = replace(limits, peak=inner.S_max * (1.0 + options.strict))
     order = WorstFirst(family)
 
     def compliant(plant: ScaledPlant, row: ReducedController) -> bool:
-        return most is None or compliance_of(plant, row.controller).gain <= REDUCED_PEAK * most
+        if most is None:
+            return True
+        return compliance_of(plant, row.controller).gain <= options.reduced_peak * most
 
     def holds(peak: float) -> Callable[[ReducedController], bool]:
         def on(member: Member, row: ReducedController) -> bool:

@@ -13,12 +13,22 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
-DIAGONAL = 1e-8  # share of the gain that may lie off the diagonal and count as rounding
-
 
 @dataclass(frozen=True)
 class LoopChannel:
-    """Uᵀ G V and Vᵀ K U, controller in SI; U = `outputs` (p, k), V = `inputs` (m, k)."""
+    """A part of the loop, Uᵀ G V and Vᵀ K U.
+
+    Attributes
+    ----------
+    name : str
+        Its number, or "all".
+    outputs, inputs : (p, k), (m, k) array
+        U and V.
+    plant : ScaledPlant
+        Uᵀ G V.
+    controller : StateSpace
+        Vᵀ K U, SI.
+    """
 
     name: str
     outputs: Array
@@ -34,7 +44,20 @@ def whole_loop(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel,
 
 
 def scalar_channels(plant: ScaledPlant, controller: StateSpace) -> tuple[LoopChannel, ...]:
-    """The scalar channels of the loop, or the whole loop as one channel."""
+    """The scalar channels of a loop, or the whole loop as one channel.
+
+    Parameters
+    ----------
+    plant : ScaledPlant
+        With its decoupling directions.
+    controller : StateSpace
+        e in, u out, SI.
+
+    Returns
+    -------
+    tuple of LoopChannel
+        One for each output where plant and controller are diagonal along the directions.
+    """
     p, m = plant.C.shape[0], plant.B.shape[1]
     U = np.hstack([c.outputs for c in plant.channels] or [np.eye(p)])
     V = np.hstack([c.inputs for c in plant.channels] or [np.eye(m)])
@@ -60,9 +83,10 @@ def along_directions(plant: ScaledPlant, u: Array, v: Array) -> ScaledPlant:
     return replace(plant, B=B, C=C, channels=())
 
 
-def _diagonal(response: np.ndarray) -> bool:
+def _diagonal(response: np.ndarray, rounding: float = 1e-8) -> bool:
+    """Whether what is off the diagonal is at most this share of the gain."""
     off = response * (1.0 - np.eye(response.shape[1]))
-    return bool(np.abs(off).max() <= DIAGONAL * np.abs(response).max())
+    return bool(np.abs(off).max() <= rounding * np.abs(response).max())
 
 
 def assemble(channels: Sequence[LoopChannel], controllers: Sequence[StateSpace]) -> StateSpace:
@@ -76,14 +100,11 @@ def assemble(channels: Sequence[LoopChannel], controllers: Sequence[StateSpace])
     )
 
 
-CONDITION = 1e4  # most of the block-diagonalising transformation, its columns of unit length
-
-
 @dataclass(frozen=True)
 class Realisation:
     """x_{k+1} = A x_k + B e_k, u_k = C x_k + D e_k in SI; A block-diagonal with these `blocks`.
 
-    With a `saturation` in N every u is clipped to ± it, and the states are led back by what was
+    With a `saturation` in N every u is clipped to ± it, and the states are corrected by what was
     cut off: + L (u_k - v_k), L = `back_calculation` (n, m) (`anti_windup`).
     """
 
@@ -122,7 +143,18 @@ def realise(
 
 
 def realised(K: StateSpace) -> Realisation:
-    """A controller in discrete time as the code has it."""
+    """A controller in discrete time as the code has it.
+
+    Parameters
+    ----------
+    K : StateSpace
+        K(z), SI.
+
+    Returns
+    -------
+    Realisation
+        Without saturation.
+    """
     system, blocks = block_diagonal(K)
     return Realisation(replace(system, period=K.period), tuple(blocks))
 
@@ -145,11 +177,11 @@ def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
     return StateSpace(A, B, C, K.D), sizes
 
 
-def _decoupled(A: Array) -> tuple[Array, Array, list[int]]:
+def _decoupled(A: Array, condition: float = 1e4) -> tuple[Array, Array, list[int]]:
     """T⁻¹ A T, T and the sizes of its diagonal blocks: Bavely and Stewart's method (1979).
 
     Of the real Schur form block after block is split off by a Sylvester equation, and grows by the
-    next one where T would exceed its condition.
+    next one where T, its columns of unit length, would exceed a condition.
     """
     S, T = schur(A, output="real")
     n, start = len(S), 0
@@ -162,7 +194,7 @@ def _decoupled(A: Array) -> tuple[Array, Array, list[int]]:
                 S[here, here], -S[rest, rest], -S[here, rest]
             )
             unit = split / np.linalg.norm(split, axis=0)
-            if not (np.isfinite(unit).all() and np.linalg.cond(unit) <= CONDITION):
+            if not (np.isfinite(unit).all() and np.linalg.cond(unit) <= condition):
                 continue
             S[here, rest], T = 0.0, split
         sizes.append(end - start)
@@ -235,11 +267,6 @@ def plain_title(title: str) -> str:
     return "".join(c if c.isalnum() or c in " ._-" else "_" for c in title)
 
 
-# Error of the force, as the filter sees it, over the limit. On rigid stages with PID, 0.01 to 0.1
-# settle alike and sooner than 1; the others are tried where the Riccati equation fails.
-TRUSTS = (0.1, 0.01, 1.0)
-
-
 def with_anti_windup(realisation: Realisation, bandwidth: float) -> Realisation:
     """The same with back-calculation where it has a saturation; ω_b in rad/s."""
     if realisation.saturation is None:
@@ -248,14 +275,21 @@ def with_anti_windup(realisation: Realisation, bandwidth: float) -> Realisation:
     return replace(realisation, back_calculation=L)
 
 
-def back_calculation(K: StateSpace, limit: float, bandwidth: float) -> Array:
-    """L (n, m) for a limit in N and ω_b in rad/s; raises UserError where K has no such gain."""
+def back_calculation(
+    K: StateSpace, limit: float, bandwidth: float, trusts: Sequence[float] = (0.1, 0.01, 1.0)
+) -> Array:
+    """L (n, m) for a limit in N and ω_b in rad/s; raises UserError where K has no such gain.
+
+    `trusts`: error of the force, as the filter sees it, over the limit. On rigid stages with PID
+    0.01 to 0.1 settle alike and sooner than 1; later ones are tried where the Riccati equation of
+    those before fails.
+    """
     n, m = K.B.shape[0], K.C.shape[0]
     if not n:
         return np.zeros((0, m))
     gain = np.abs(K.response(np.array([bandwidth]))[0]).max()
     noise = K.B / gain  # in units of the limit, as all forces here: L does not depend on it
-    for trust in TRUSTS:
+    for trust in trusts:
         weight = trust**2 * np.eye(m)
         try:
             P = solve_discrete_are(K.A.T, (K.C / limit).T, noise @ noise.T, weight)

@@ -27,8 +27,6 @@ from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
-NEGLIGIBLE = 1e-9  # of the largest closed-loop Hankel value: a state under it is none
-
 
 class Reduction(StrEnum):
     """How a controller was reduced."""
@@ -69,16 +67,19 @@ class ReducedController:
         )
 
 
-def reductions(channel: LoopChannel, weights: Weights, omega_low: float) -> list[ReducedController]:
+def reductions(
+    channel: LoopChannel, weights: Weights, omega_low: float, negligible: float = 1e-9
+) -> list[ReducedController]:
     """Every method at every order from the minimal one down to 1, highest order first.
 
-    A method that cannot give an order is left out there. ω_low in rad/s.
+    A method that cannot give an order is left out there. ω_low in rad/s. A state whose closed-loop
+    Hankel value is `negligible`, as a share of the largest, is not in the minimal one.
     """
     plant = channel.plant
     K = channel.controller.in_units(plant.omega_0, plant.force)
     loop = closed_loop(plant.system, K).T
     _, values = _balanced(K, loop, 0)
-    order = int(np.sum(values > NEGLIGIBLE * values[0]))
+    order = int(np.sum(values > negligible * values[0]))
     K, _ = _balanced(K, loop, order)
     found = []
     for r in range(order, 0, -1):
@@ -101,7 +102,7 @@ def smallest(
 ) -> ReducedController:
     """The row of least order within the limits; of several, the one with the lowest peak.
 
-    `holds`: what else is asked of it, on other plants. The minimal realisation where none does.
+    `holds`: what else it has to keep, on other plants. The minimal realisation where none does.
     """
     met = [row for row in rows if row.meets(limits)]
     met.sort(key=lambda row: (row.order, row.figures.sensitivity_peak))

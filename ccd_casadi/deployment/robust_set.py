@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.judgement import written_plants
-from ccd_casadi.codesign.robust_check import DENSE
+from ccd_casadi.codesign.final_judgement import written_plants
+from ccd_casadi.codesign.robust_check import RobustCheckOptions
 from ccd_casadi.deployment.realisation import LoopChannel, along_directions
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
@@ -22,8 +22,6 @@ from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.robust.perturbed import SampledFigures
 from ccd_casadi.support.arrays import Array
-
-LATTICE = 41  # plants of a box that a deployed loop of sections is looked at on, besides its set
 
 
 @dataclass(frozen=True)
@@ -63,8 +61,20 @@ class MemberLoop:
 
 
 def place_words(at: Perturbation) -> str:
-    """`resonances +3 %, damping x 0.5`.
+    """A perturbation in words.
 
+    Parameters
+    ----------
+    at : Perturbation
+        Of the plant.
+
+    Returns
+    -------
+    str
+        Its parts that are not nominal.
+
+    Examples
+    --------
     >>> place_words(Perturbation(0.03, 0.5)), place_words(Perturbation())
     ('resonances +3 %, damping x 0.5', 'the nominal plant')
     """
@@ -81,14 +91,14 @@ def place_words(at: Perturbation) -> str:
 def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
     """Every plant of the set but the nominal one; empty without a set.
 
-    `dense`: on as many shifts as a design is verified on.
+    `dense`: on the number of shifts that a design is verified on.
     """
     if kind_of(run.problem).as_designed:
         return _of_structured(run, dense)
     robust = run.problem.robust
     if robust is None:
         return ()
-    places = robust.perturbations(DENSE if dense and robust.shift else None)
+    places = robust.perturbations(RobustCheckOptions().shifts if dense and robust.shift else None)
     return tuple(
         Member(at, scale_plant(run.modal(at), run.weights.M_K))
         for at in places
@@ -100,16 +110,18 @@ def as_written(run: FinishedRun) -> list[StateSpace]:
     """The model and every plant of the dense set, by the matrices as the plant function returned
     them."""
     if not kind_of(run.problem).as_designed:
-        return written_plants(run.problem, run.theta, DENSE)
+        return written_plants(run.problem, run.theta, RobustCheckOptions().shifts)
     uncertain = uncertain_plant(run.problem, run.theta)
     return uncertain.as_written([(0, uncertain.nominal), *_points(run, uncertain, True)])
 
 
-def _points(run: FinishedRun, uncertain: UncertainPlant, dense: bool) -> list[tuple[int, Array]]:
-    """Corners of the box, the run's own set, `dense`: a lattice too."""
+def _points(
+    run: FinishedRun, uncertain: UncertainPlant, dense: bool, count: int = 41
+) -> list[tuple[int, Array]]:
+    """Corners of the box, the run's own set, `dense`: a lattice of `count` plants too."""
     sections = structured_of(run.problem)
     points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.scenarios)]
-    return points + (lattice(uncertain, LATTICE, sections.seed) if dense else [])
+    return points + (lattice(uncertain, count, sections.seed) if dense else [])
 
 
 def _of_structured(run: FinishedRun, dense: bool) -> tuple[Member, ...]:

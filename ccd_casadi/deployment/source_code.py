@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.setpoint import ORDER
+from ccd_casadi.analysis.setpoint import FeedforwardOptions
 from ccd_casadi.deployment.realisation import (
     Realisation,
     difference_equation,
@@ -33,7 +33,6 @@ FILE = "controller.fmu"
 NAME = "controller"  # modelIdentifier
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
 _LIBRARY = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("win", ".dll")}
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same controller is the same file
 
 
 def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], title: str) -> bool:
@@ -61,7 +60,8 @@ def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], 
         content[f"binaries/{system}{bits}/{NAME}{ending}"] = library
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, data in content.items():
-            file.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
+            # of the format's first day: the same controller is the same file
+            file.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
     return library is not None
 
 
@@ -109,14 +109,25 @@ COMPILE = (
     "-o controller_test controller.c controller_test.c"
 )
 C_FILES, ST_FILE = ("controller.h", "controller.c", "controller_test.c"), "controller.st"
-SAMPLES = 64  # of the test vectors
-ERROR = 1e-6  # m; size of the errors in the test vectors
-TOLERANCE = 1e-12  # of the largest force
 
 
 def write_c(folder: Path, realisation: Realisation, **how: Any) -> Mapping[str, str]:
-    """controller.h, controller.c and controller_test.c in `folder`, and their texts; `how` as in
-    `c_files`."""
+    """Write controller.h, controller.c and controller_test.c.
+
+    Parameters
+    ----------
+    folder : Path
+        Exists.
+    realisation : Realisation
+        The difference equation.
+    how : keywords
+        Of `c_files`.
+
+    Returns
+    -------
+    mapping of str
+        Their texts by name.
+    """
     files = c_files(realisation, **how)
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8")
@@ -125,12 +136,13 @@ def write_c(folder: Path, realisation: Realisation, **how: Any) -> Mapping[str, 
 
 def c_files(
     realisation: Realisation, *, title: str, delay: float, verified: bool,
-    forward: Array | None = None, kind: str = "Controller",
+    forward: Array | None = None, kind: str = "Controller", tolerance: float = 1e-12,
 ) -> Mapping[str, str]:  # fmt: skip
     """The three files' texts by name; delay in s; the header says whether the loop was verified,
     and what `kind` of controller it is.
 
-    `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none.
+    `forward` (5, m, p) are the gains of `feedforward`; zeros where there are none. `tolerance`, of
+    the largest force: what the test accepts.
     """
     K, limit = realisation.system, realisation.saturation
     errors, forwards, first, forces = vectors(realisation)
@@ -138,8 +150,8 @@ def c_files(
         "rate": f"{1.0 / K.period:.10g}", "ahead": f"{delay + 0.5 * K.period:.6g}",
         "room": max(len(K.A), 1), "limit": None if limit is None else f"{limit:.17g}",
         "blocks": realisation.blocks or (0,), "A": realisation.block_entries,
-        "F": np.zeros((ORDER + 1, *K.D.shape)) if forward is None else forward,
-        "compile": COMPILE, "tolerance": f"{TOLERANCE:g}", "samples": SAMPLES,
+        "F": np.zeros((FeedforwardOptions().order + 1, *K.D.shape)) if forward is None else forward,
+        "compile": COMPILE, "tolerance": f"{tolerance:g}", "samples": len(errors),
         "errors": errors, "forwards": forwards, "first": first, "forces": forces,
         "initialiser": lambda entries: f"{{\n    {literals(entries, 4)}\n}}",
     }  # fmt: skip
@@ -178,16 +190,19 @@ def _values(
     }  # fmt: skip
 
 
-def vectors(realisation: Realisation) -> tuple[Array, Array, Array, Array]:
+def vectors(
+    realisation: Realisation, samples: int = 64, error: float = 1e-6
+) -> tuple[Array, Array, Array, Array]:
     """Errors (k, p), feedforward (k, m), forces before (m,), and the forces (k, m) that follow.
 
-    Where there is a limit the feedforward reaches beyond it, so that every path is walked.
+    k = `samples` of a size of `error` in m. Where there is a limit the feedforward reaches beyond
+    it, so that every path is tested.
     """
     K, limit = realisation.system, realisation.saturation
     rng = np.random.default_rng(0)
-    errors = ERROR * rng.standard_normal((SAMPLES, K.B.shape[1]))
-    size = limit if limit is not None else ERROR * float(np.abs(K.D).max() + 1.0)
-    forwards = size * rng.standard_normal((SAMPLES, len(K.C)))
+    errors = error * rng.standard_normal((samples, K.B.shape[1]))
+    size = limit if limit is not None else error * float(np.abs(K.D).max() + 1.0)
+    forwards = size * rng.standard_normal((samples, len(K.C)))
     first = np.full(len(K.C), 0.5 * size)
     start = [dot(row, [*errors[0], *first]) for row in takeover(K).tolist()]
     return errors, forwards, first, difference_equation(realisation, errors, forwards, start)

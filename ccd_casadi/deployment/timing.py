@@ -5,10 +5,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Timing:
-    """How the controller runs: a rate (None: the one that is needed), a delay, and its `lead`.
+    """How a controller runs.
 
-    The delay, from reading y to the new u at the actuator, is `delay` in s, or where that is
-    None `delay_samples` periods.
+    Attributes
+    ----------
+    rate_hz : float or None
+        Hz; None: the least that is enough, rounded up.
+    delay : float or None
+        From reading y to the new u at the actuator, s.
+    delay_samples : float
+        The same in periods, where `delay` is None.
+    lead : bool
+        Whether a lead filter compensates hold and delay.
     """
 
     rate_hz: float | None = None

@@ -8,8 +8,8 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping, loop_view
-from ccd_casadi.analysis.move import Move, mass_feedforward, moves
-from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
+from ccd_casadi.analysis.move import Move, MoveOptions, mass_feedforward, moves
+from ccd_casadi.analysis.move_limits import LIMITS
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.drawing.content import Area, Curve, Level, Lines, Modes, Panel
 from ccd_casadi.drawing.paint import block_html, escape
@@ -34,7 +34,7 @@ STEP_POINTS = 240
 STEP_PERIODS = 5.0  # of the bandwidth
 WATCHED = 2.0  # durations of the move that are shown
 NONE = np.zeros(0)
-AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, WINDOW)
+AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, LIMITS.window)
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ def curves_of(look: Look) -> Curves | None:
 def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
     """The default one of robustness."""
     ((made,),) = moves(
-        [loop], [mass_feedforward(look.modal, 0)], setpoint(LIMITS), axis=0, window=WINDOW,
-        bandwidth_hz=bandwidth_hz, doublings=1,
+        [loop], [mass_feedforward(look.modal, 0)], setpoint(LIMITS), axis=0, window=LIMITS.window,
+        bandwidth_hz=bandwidth_hz, options=MoveOptions(doublings=1),
     )  # fmt: skip
     return made.until(WATCHED * made.duration)
 

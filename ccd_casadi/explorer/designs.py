@@ -12,7 +12,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.controller_kinds import with_structure
 from ccd_casadi.cases.controller_tables import LoopTable
 from ccd_casadi.cases.tables import Case
-from ccd_casadi.codesign.verdict import LEAST_SHIFT
+from ccd_casadi.codesign.verdict import VerdictOptions
 from ccd_casadi.inner_problem.objective import violated
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -161,7 +161,7 @@ class Elements:
 
 # Stated error of the frequencies up to which matrices pass for the model's own: what every verdict
 # asks a loop to survive.
-OWN = LEAST_SHIFT
+OWN = VerdictOptions().least_shift
 
 
 @dataclass(frozen=True)

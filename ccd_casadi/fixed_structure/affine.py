@@ -5,20 +5,29 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import add, mul, neg
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from ccd_casadi.support.arrays import Array
 
-ROUND = 2e-15  # relative: eight times what a product of complex numbers loses
-
 
 @dataclass(frozen=True)
 class Affine:
-    """centre (N,), slope (n, N), rest (N,): of N boxes; `rest` is infinite where nothing holds."""
+    """An affine form f = centre + Σ slope_i t_i + δ, |t_i| <= 1, |δ| <= rest, on each of N boxes.
 
+    Attributes
+    ----------
+    centre, rest : array (N,)
+        `rest` is infinite where nothing holds.
+    slope : array (n, N)
+        Of n variables.
+    rounding : float
+        Relative: eight times what a product of complex numbers loses.
+    """
+
+    rounding: ClassVar[float] = 2e-15
     centre: np.ndarray
     slope: np.ndarray
     rest: Array
@@ -50,15 +59,15 @@ class Affine:
         with np.errstate(divide="ignore", invalid="ignore"):
             along = (self.slope * (self.centre.conj() / size)).real
         found = size - np.abs(along).sum(0) - self.rest
-        return np.asarray(np.where(found > 0.0, found * (1.0 - ROUND), 0.0))
+        return np.asarray(np.where(found > 0.0, found * (1.0 - self.rounding), 0.0))
 
     def __add__(self, other: "Affine | complex | np.ndarray") -> "Affine":
         if isinstance(other, Affine):
             self._same_variables(other)
-            rest = self.rest + other.rest + ROUND * (self.size + other.size)
+            rest = self.rest + other.rest + self.rounding * (self.size + other.size)
             return Affine(self.centre + other.centre, self.slope + other.slope, rest)
         size = self.middle + np.abs(other)
-        return Affine(self.centre + other, self.slope, self.rest + ROUND * size)
+        return Affine(self.centre + other, self.slope, self.rest + self.rounding * size)
 
     def __neg__(self) -> "Affine":
         return Affine(-self.centre, -self.slope, self.rest)
@@ -68,13 +77,13 @@ class Affine:
 
     def __mul__(self, other: "Affine | complex | np.ndarray") -> "Affine":
         if not isinstance(other, Affine):
-            rest = (self.rest + ROUND * self.size) * np.abs(other)
+            rest = (self.rest + self.rounding * self.size) * np.abs(other)
             return Affine(self.centre * other, self.slope * other, rest)
         self._same_variables(other)
         a, b = self.middle + self.reach, other.middle + other.reach
         # t_i² lies in [0, 1]: half of it goes to the centre.
         rest = self.reach * other.reach - 0.5 * (self.reaches * other.reaches).sum(0)
-        rest += self.rest * b + other.rest * a + self.rest * other.rest + ROUND * a * b
+        rest += self.rest * b + other.rest * a + self.rest * other.rest + self.rounding * a * b
         centre = self.centre * other.centre + 0.5 * (self.slope * other.slope).sum(0)
         slope = self.centre * other.slope + other.centre * self.slope
         return Affine(centre, slope, np.where(np.isnan(rest), np.inf, rest))
@@ -99,7 +108,7 @@ def product(how: str, f: Affine, g: Affine) -> Affine:
     of = partial(np.einsum, how)
     slope = [of(a, g.centre) + of(f.centre, b) for a, b in zip(f.slope, g.slope, strict=True)]
     rest = of(f.reach, g.reach) + of(f.rest, g.size) + of(np.abs(f.centre) + f.reach, g.rest)
-    rest += ROUND * g.centre.shape[1] * of(f.size, g.size)
+    rest += f.rounding * g.centre.shape[1] * of(f.size, g.size)
     return Affine(of(f.centre, g.centre), np.array(slope), rest)
 
 
@@ -119,7 +128,7 @@ def inverse(f: Affine) -> Affine:
         centre = 1.0 / f.centre
         deviation = f.reach + f.rest
         rest = (f.rest + deviation**2 / low) / size**2
-        rest += ROUND * (1.0 + deviation / size) / size
+        rest += f.rounding * (1.0 + deviation / size) / size
         slope = -f.slope * centre**2
     good = (low > 0.0) & np.isfinite(rest)
     return Affine(np.where(good, centre, 0.0), np.where(good, slope, 0.0),
@@ -132,7 +141,7 @@ def exponential(f: Affine) -> Affine:
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = f.reach + f.rest
         rest = f.rest + 0.5 * deviation**2 * np.exp(deviation)
-        rest = np.abs(value) * (rest + ROUND * (1.0 + np.abs(f.centre) + f.reach))
+        rest = np.abs(value) * (rest + f.rounding * (1.0 + np.abs(f.centre) + f.reach))
     return Affine(value, value * f.slope, np.where(np.isnan(rest), np.inf, rest))
 
 
@@ -144,7 +153,7 @@ def root(f: Affine) -> Affine:
         value = np.sqrt(f.centre.real)
         deviation = f.reach + f.rest
         rest = 0.5 * f.rest / value + deviation**2 / (8.0 * low**1.5)
-        rest += ROUND * (value + deviation / value)
+        rest += f.rounding * (value + deviation / value)
         slope = 0.5 * f.slope / value
     return Affine(np.where(good, value, 1.0), np.where(good, slope, 0.0),
                   np.where(good, rest, np.inf))  # fmt: skip
@@ -195,16 +204,21 @@ def outputs(graph: ca.Function, x: list[Affine]) -> list[Affine]:
     return found
 
 
-RIGID = 1e-10  # λ over the largest: what the model's rigid modes are enclosed to, of no stiffness
-STEPS = 12  # of the search for discs that are mapped into themselves
-WIDER = 1.1  # than what the step before gave
-SINGULAR = 1e-14  # relative: a mass matrix with such an eigenvalue is not inverted
+@dataclass(frozen=True)
+class ModeEnclosureOptions:
+    """Numbers of the enclosure of modes that move with the parameters."""
+
+    rigid: float = 1e-10  # λ over the largest, up to which a mode counts as one without stiffness
+    steps: int = 12  # of the search for discs that are mapped into themselves
+    inflation: float = 1.1  # of the discs of the step before
+    singular: float = 1e-14  # least eigenvalue of a mass matrix over its largest, to be inverted
 
 
 @np.errstate(all="ignore")  # of pieces that are too wide
 def moving_modes(
-    graph: ca.Function, rigid: int, unit: float, low: Array, high: Array
-) -> tuple[list[list[Affine]], np.ndarray]:
+    graph: ca.Function, rigid: int, unit: float, low: Array, high: Array,
+    options: ModeEnclosureOptions = ModeEnclosureOptions(),
+) -> tuple[list[list[Affine]], np.ndarray]:  # fmt: skip
     """ω and b c of every mode over boxes (q, N) of x, time in 1/`unit`; where they are enclosed.
 
     `graph`: x to M, D, K, b (n, 1), c (1, n), SI. That the first modes are `rigid` and the others
@@ -219,7 +233,7 @@ def moving_modes(
     known = np.asarray(np.isfinite(sizes).all(axis=0))
     mass, stiffness = (np.where(known[:, None, None], f.centre, eye) for f in (M, K))
     spectrum = np.linalg.eigvalsh(mass)
-    known &= spectrum[:, 0] > SINGULAR * spectrum[:, -1]
+    known &= spectrum[:, 0] > options.singular * spectrum[:, -1]
     half = np.linalg.inv(np.linalg.cholesky(np.where(known[:, None, None], mass, eye)))
     lam, turned = np.linalg.eigh(half @ stiffness @ half.transpose(0, 2, 1))
     shapes = half.transpose(0, 2, 1) @ turned
@@ -231,8 +245,8 @@ def moving_modes(
     away = lam[:, :, None] - lam[:, None, :]
     away[:, own, own] = np.inf
     rho, m = np.zeros((N, n, n)), np.zeros((N, n))
-    for _ in range(STEPS):
-        held, within = WIDER * rho, WIDER * m
+    for _ in range(options.steps):
+        held, within = options.inflation * rho, options.inflation * m
         top, gap = (size + within)[:, None, :], np.abs(away) - within[:, None, :]
         moved = E.size + F.size * top + E.size @ held + (F.size @ held) * top
         rho, m = np.where(gap > 0.0, moved / gap, np.inf), moved[:, own, own]
@@ -249,7 +263,7 @@ def moving_modes(
     value = Affine(lam, A.slope[..., own, own], second[:, own, own])
     least, most = 2.0 * size - value.size, value.size
     lowest = most[:, :rigid].max(axis=1, initial=0.0, keepdims=True)
-    apart = np.where(own < rigid, most <= RIGID * least[:, -1:], least > lowest)
+    apart = np.where(own < rigid, most <= options.rigid * least[:, -1:], least > lowest)
     forms = root(value) * (1.0 / unit), read * drive * inverse(length) * unit**-2
     of_mode = [[Affine(f.centre[back, i], f.slope[:, back, i], f.rest[back, i]) for f in forms]
                for i in range(n)]  # fmt: skip

@@ -23,7 +23,17 @@ BINDS = {
 
 
 def kind_and_channel(name: str) -> tuple[str, str]:
-    """A multiplier's name in parts: the kind of bound, and the channel whose own it is, if any.
+    """Split a multiplier's name.
+
+    Parameters
+    ----------
+    name : str
+        A kind of bound, or "kind of channel".
+
+    Returns
+    -------
+    kind, channel : str
+        The channel is empty where the bound is the whole loop's.
 
     >>> kind_and_channel("S_MAX"), kind_and_channel("S_MAX of tilt")
     (('S_MAX', ''), ('S_MAX', 'tilt'))
@@ -33,7 +43,17 @@ def kind_and_channel(name: str) -> tuple[str, str]:
 
 
 def key_words(name: str) -> str:
-    """The key of a bound by kind and channel, or by the name of a figure over it."""
+    """Name a bound by its key of a case file.
+
+    Parameters
+    ----------
+    name : str
+        As for `kind_and_channel`, or the name of a figure over its bound.
+
+    Returns
+    -------
+    str
+    """
     kind, channel = kind_and_channel(name)
     return BINDS.get(kind, kind) + (f" of channel {channel}" if channel else "")
 
@@ -61,7 +81,7 @@ class LoopPeaks(ChannelPeaks):
 
 
 class ShapeEnd(StrEnum):
-    """Up to where the shape bounds |S|."""
+    """The frequency up to which the shape bounds |S|."""
 
     S_MAX = "S_max"  # at every frequency, up to where it meets S_max; its room opens from ω_b on
     CROSSING = "crossing"  # below ω_b only, where all of its room is open
@@ -69,13 +89,20 @@ class ShapeEnd(StrEnum):
 
 @dataclass(frozen=True)
 class ChannelBounds:
-    """What one channel keeps besides the whole loop; None, or a ratio of 1: nothing of its own.
+    """The bounds of one channel besides those of the whole loop.
 
-    `output` u makes its error uᵀe of the plant's, `force` w its force wᵀf. For references of
-    length 1 in any direction, with ω_i = bandwidth_ratio ω_b,
+    For references of length 1 in any direction, with ω_i = bandwidth_ratio ω_b,
 
         ‖uᵀS(jω)‖ <= S_max,   ‖uᵀS(jω)‖ within the shape with ω_i in place of ω_b
-        |W_KS| ‖wᵀKS‖ <= weighted_level,   W_KS with this M_K, N/m
+        |W_KS| ‖wᵀKS‖ <= weighted_level,   W_KS with this M_K
+
+    Attributes
+    ----------
+    name : str
+    output, force : tuple of float (p,), (m,)
+        u makes its error uᵀe of the plant's, w its force wᵀf.
+    S_max, bandwidth_ratio, M_K : float or None, float, float or None
+        None, or a ratio of 1: no such bound. M_K in N/m.
     """
 
     name: str
@@ -92,7 +119,7 @@ class ChannelBounds:
 
     @property
     def given(self) -> bool:
-        """Whether there is any bound of its own."""
+        """Whether the channel has any bound besides the whole loop's."""
         return (self.S_max, self.M_K, self.bandwidth_ratio) != (None, None, 1.0)
 
 

@@ -17,15 +17,27 @@ from ccd_casadi.lti.loop import Loop, Sampling
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 
-AT_ONCE = 2_000  # boxes that are divided at a time, at most
-BATCHES = 250  # of what may be spent: little is spent on the worst boxes alone
-STUCK = 0.25  # of its boxes still open: it would take many times as many to close them
-DECADES = 6.0  # of frequency cells at the start, downwards; below is one cell to 0
+
+@dataclass(frozen=True)
+class BoxProofOptions:
+    """Numbers of the proof on a box; slacks are relative."""
+
+    slack: float = 1e-3  # by how much a bound may be exceeded in what is proven
+    slack_of_many: float = 0.05  # that of several channels or more than `few_parameters`
+    few_parameters: int = 4
+    most_boxes: int = 500_000  # of all options; some twenty seconds
+    most_boxes_of_many: int = 250_000  # of each option, with several channels or many parameters
+    stuck_boxes_of_many: int = 45_000  # those after which such a proof gives up if it is stuck
+    stuck_share: float = 0.25  # of its boxes open: it would take many times as many to close them
+    batch: int = 2_000  # boxes that are divided at a time, at most
+    batches: int = 250  # at least, so that little is spent on the worst boxes alone
+    decades: float = 6.0  # of frequency cells at the start; below them is one cell to 0
+    unit_frequency: float = 3.0  # over ω_b and the fastest pole: above it cells divide 1/ω
 
 
 @dataclass(frozen=True)
 class Division:
-    """What so many `boxes` prove: figures over bounds at most, by kind of bound.
+    """What a number of `boxes` prove: figures over bounds at most, by kind of bound.
 
     `passed`: a bound, by which factor it is passed at least on some box, and that one's middle.
     """
@@ -50,9 +62,12 @@ class _Enclosed(Boxes):
         return dict(zip(names, self.highest.max(axis=1, initial=0.0).tolist(), strict=True))
 
 
-def divided(family: LoopFamily, box: Array, slack: float, share: int, enough: int) -> Division:
+def divided(
+    family: LoopFamily, box: Array, slack: float, share: int, enough: int,
+    options: BoxProofOptions = BoxProofOptions(),
+) -> Division:  # fmt: skip
     """Up to `share` boxes of the whole one (2, n); `enough` where too many of them stay open."""
-    part, known, spent = _first(family, box), np.array(np.inf), 0
+    part, known, spent = _first(family, box, options.decades), np.array(np.inf), 0
     levels: dict[str, float] = {}
     waiting: _Enclosed | None = None
     while True:
@@ -70,10 +85,11 @@ def divided(family: LoopFamily, box: Array, slack: float, share: int, enough: in
         here = here.only(wide)
         waiting = here if waiting is None else waiting.beside(here)
         count = len(waiting.worst)
-        if not count or spent >= share or (spent >= enough and count > STUCK * spent):
+        stuck = spent >= enough and count > options.stuck_share * spent
+        if not count or spent >= share or stuck:
             return Division(raised(levels, waiting.levels(found.names)), spent)
         order = np.argsort(-waiting.worst, kind="stable")
-        first = min(AT_ONCE, max(enough // BATCHES, count // 4, 1))
+        first = min(options.batch, max(enough // options.batches, count // 4, 1))
         worst, waiting = waiting.only(order[:first]), waiting.only(order[first:])
         part, known = _halved(worst), np.tile(worst.highest, 2)
 
@@ -84,13 +100,13 @@ def raised(levels: Mapping[str, float], others: Mapping[str, float]) -> dict[str
     return {name: max(levels.get(name, 0.0), others.get(name, 0.0)) for name in names}
 
 
-def _first(family: LoopFamily, box: Array) -> Boxes:
+def _first(family: LoopFamily, box: Array, decades: float) -> Boxes:
     """Cells of frequency from 0 to infinity, or to half the sampling rate, over the whole box."""
     low, band = family.bounds.omega_low / family.unit, family.bandwidth / family.unit
     scale, top = 1.0, 1.0
     if family.period is not None:
         scale, top = family.period, np.pi
-    edges = np.geomspace(10.0**-DECADES, 1.0, int(2 * DECADES) + 1) * top
+    edges = np.geomspace(10.0**-decades, 1.0, int(2 * decades) + 1) * top
     corner = min(family.corner / family.unit, 1.0)
     edges = np.unique(np.concatenate([[0.0], edges, np.array([low, band, corner]) * scale]))
     edges = edges[edges <= top]
@@ -133,16 +149,8 @@ def _halved(boxes: _Enclosed) -> Boxes:
     )
 
 
-SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
-SLACK_OF_MANY = 0.05  # of several channels or many parameters
-FEW_PARAMETERS = 4
-MOST_BOXES = 500_000  # some twenty seconds
-MOST_OF_MANY, ENOUGH_OF_MANY = 250_000, 45_000  # of each option, at most, and where it is stuck
-ABOVE = 3.0  # times ω_b and the fastest pole: from there on frequencies are counted by 1/ω
-
-
 class ProofOutcome(StrEnum):
-    """How far a proof came."""
+    """How far a proof came; its value is the sentence that reports it."""
 
     PROVEN = "every bound holds, with its slack, on the whole box"
     LOOSER = "stable on the whole box; some bound is only proven with a larger factor"
@@ -159,10 +167,23 @@ NOT_APPLICABLE = (ProofOutcome.NOT_SQUARE, ProofOutcome.NOT_MODAL, ProofOutcome.
 
 @dataclass(frozen=True)
 class Proof:
-    """What is proven on the box: every |figure| <= `levels` times its bound, by kind of bound.
+    """What is proven on a box: every |figure| <= level times its bound.
 
-    `slack` was asked for; `boxes` were looked at. Of a refuted box `option`, `point`, the bound and
-    the factor by which it is passed at least; enclosures say so, not a sample.
+    Attributes
+    ----------
+    outcome, slack : ProofOutcome, float
+        How far it came; the relative excess that was allowed.
+    parameters : tuple of str
+        The names of the box's coordinates.
+    levels : dict
+        By kind of bound.
+    boxes : int
+        Boxes that were enclosed.
+    option, point, passed : int, tuple of float, (str, float)
+        Of a refuted box: where, which bound and the least factor by which it is exceeded there, by
+        an enclosure and not by a sample.
+    channels : bool
+        Whether single channels have bounds, which no proof is of.
     """
 
     outcome: ProofOutcome
@@ -173,7 +194,7 @@ class Proof:
     option: int = 0
     point: tuple[float, ...] = ()
     passed: tuple[str, float] = ("", np.nan)
-    channels: bool = False  # whether there are bounds of single channels, which no proof is of
+    channels: bool = False
 
     @property
     def proven(self) -> bool:
@@ -182,8 +203,8 @@ class Proof:
 
     @property
     def conclusive(self) -> bool:
-        """Whether that is all that is asked for, and closely: no plant need be drawn besides."""
-        return self.proven and self.slack <= SLACK
+        """Whether it proves all that is required, and closely: no plant need be drawn besides."""
+        return self.proven and self.slack <= BoxProofOptions.slack
 
     @property
     def refuted(self) -> bool:
@@ -197,15 +218,14 @@ class Proof:
 
     @property
     def unasked(self) -> str:
-        """Why nothing was proven that was not begun either: the proof does not apply, or is not of
-        every bound; empty where it is complete in kind."""
+        """Why the proof does not apply, or is not of every bound; empty where it is of all."""
         if self.outcome in NOT_APPLICABLE:
             return self.outcome.value
         return "bounds of single channels are judged, not proven" if self.channels else ""
 
     @property
     def unclosed(self) -> bool:
-        """Whether it was begun, and did not reach every bound within its slack."""
+        """Whether it applied, and did not reach every bound within its slack."""
         return self.outcome in (ProofOutcome.LOOSER, ProofOutcome.OPEN)
 
     @property
@@ -215,7 +235,7 @@ class Proof:
 
     @property
     def words(self) -> str:
-        """One line."""
+        """The outcome in one line, with its levels."""
         if self.outcome is ProofOutcome.REFUTED:
             at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
             return f"{self.passed[0]} is exceeded by a factor of {self.passed[1]:.4g} at {at}"
@@ -250,17 +270,37 @@ def prove(
     slack: float | None = None,
     most_boxes: int | None = None,
     workers: Pool | None = None,
+    options: BoxProofOptions = BoxProofOptions(),
 ) -> Proof:
-    """Bounds and stability of the SI controller κ with ω_b (rad/s) on the whole box.
+    """Prove bounds and stability of a controller on the whole box, by branch and bound.
 
-    Of plants with modal damping. The box is that of `uncertain`, all its options; the plant's
-    modal data and κ count as exact. Of several channels or more than four parameters with
-    `SLACK_OF_MANY` by default, and of several channels the whole's bounds. The options are spread
-    over `workers`.
+    The enclosures are those of `LoopFamily.enclose`. Plants have modal damping; their modal data
+    and κ count as exact. Of several channels the whole's bounds are proven.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+        Its box, with all its options.
+    structure, kappa : Structure or ChannelStructure, array (n,)
+        The controller, SI.
+    bandwidth : float
+        ω_b, rad/s.
+    bounds, sampling : Bounds, Sampling, optional
+        None: a continuous loop.
+    slack, most_boxes : float, int, optional
+        By default those of `options`.
+    workers : Pool, optional
+        The options are spread over them.
+    options : BoxProofOptions
+
+    Returns
+    -------
+    Proof
+        Of every bound the factor below which its figure is proven.
     """
     names = uncertain.names
-    many = isinstance(structure, ChannelStructure) or len(names) > FEW_PARAMETERS
-    slack = slack or (SLACK_OF_MANY if many else SLACK)
+    many = isinstance(structure, ChannelStructure) or len(names) > options.few_parameters
+    slack = slack or (options.slack_of_many if many else options.slack)
     outputs, inputs = structure.directions
     if len(uncertain.options[0].C) != len(outputs) or 1 != len(outputs) != outputs.shape[1]:
         return Proof(ProofOutcome.NOT_SQUARE, slack, names)
@@ -270,7 +310,7 @@ def prove(
     if not all(Loop(model, K, sampling).stable for model in models):
         return Proof(ProofOutcome.UNSTABLE, slack, names)
     fastest = max(float(np.abs(model.rates).max()) for model in models)
-    unit = ABOVE * max(bandwidth, fastest, bounds.omega_low)
+    unit = options.unit_frequency * max(bandwidth, fastest, bounds.omega_low)
     period = None if sampling is None else sampling.period * unit
     delay = 0.0 if sampling is None else sampling.delay * unit
     parts = tuple(structure.split(structure.in_units(kappa, 1.0 / unit, 1.0)))
@@ -283,22 +323,22 @@ def prove(
         families.append(LoopFamily(
             plant, names, parts, outputs, inputs, bounds, bandwidth, unit, period, delay
         ))  # fmt: skip
-    share, enough = (most_boxes or MOST_BOXES) // len(models), None
+    share, enough = (most_boxes or options.most_boxes) // len(models), None
     if many and most_boxes is None:
-        share, enough = min(share, MOST_OF_MANY), ENOUGH_OF_MANY
-    proof = divide(families, uncertain.box, slack, share, workers, enough)
+        share, enough = min(share, options.most_boxes_of_many), options.stuck_boxes_of_many
+    proof = divide(families, uncertain.box, slack, share, workers, enough, options)
     return replace(proof, channels=any(own.given for own in bounds.channels))
 
 
 def divide(
     families: list[LoopFamily], box: Array, slack: float, share: int, workers: Pool | None = None,
-    enough: int | None = None,
+    enough: int | None = None, options: BoxProofOptions = BoxProofOptions(),
 ) -> Proof:  # fmt: skip
     """Branch and bound of every option's loops, each stable at one point of `box` (2, n): `share`
     boxes of each, or `enough` where many of these are still open then."""
     enough = share if enough is None else enough
     first = sorted(range(len(families)), key=lambda option: -len(families[option].plant.omega))
-    tasks = {option: (families[option], box, slack, share, enough) for option in first}
+    tasks = {option: (families[option], box, slack, share, enough, options) for option in first}
     found = dict(results(workers, divided, tasks))
     names, levels = families[0].names, dict[str, float]()
     for option in range(len(families)):

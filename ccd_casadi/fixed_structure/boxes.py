@@ -42,7 +42,7 @@ class Boxes:
         return type(self)(*(part[..., chosen] for part in vars(self).values()))
 
     def beside(self, other: Self) -> Self:
-        """Both."""
+        """These boxes, then the others."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return type(self)(*map(np.hstack, pairs))
 
@@ -58,7 +58,7 @@ class Boxes:
 
 
 @dataclass(frozen=True)
-class Axis:
+class FrequencyAxis:
     """Frequencies as forms of variable 0: s = y/x, e^{-sT}; period (None: continuous) and delay.
     `at_rest`: as they are there."""
 
@@ -122,21 +122,23 @@ class Axis:
         return form if self.at_rest else form * inverse(self.y * self.y)
 
 
-def axis_of(boxes: Boxes, period: float | None, delay: float, at_rest: bool = False) -> Axis:
+def axis_of(
+    boxes: Boxes, period: float | None, delay: float, at_rest: bool = False
+) -> FrequencyAxis:
     """The frequencies of boxes."""
     f = variable(boxes.low[0], boxes.high[0], 0, 1)
     if period is None:
         upper = boxes.chart == Chart.HIGH
         one = Affine(np.ones(len(f.centre)), np.zeros_like(f.slope), np.zeros(len(f.centre)))
         x, y = _either(upper, f, one), _either(upper, one, f) * 1j
-        return Axis(x, y, y, one, None, 0.0, at_rest)
+        return FrequencyAxis(x, y, y, one, None, 0.0, at_rest)
     half = exponential(f * 0.5j)
     back = exponential(f * -0.5j)
     x, y = (half + back) * 0.5, (half - back) * (1.0 / period)
-    return Axis(x, y, f * (1j / period), back * back, period, delay, at_rest)
+    return FrequencyAxis(x, y, f * (1j / period), back * back, period, delay, at_rest)
 
 
-def gain_of(structure: Structure, kappa: Array, axis: Axis, integrator: bool) -> Affine:
+def gain_of(structure: Structure, kappa: Array, axis: FrequencyAxis, integrator: bool) -> Affine:
     """K of a structure, or y K where the channels have an `integrator`."""
     values, x, y = np.exp(kappa), axis.x, axis.y
     one = Affine(np.ones(len(x.centre)), np.zeros_like(x.slope), np.zeros(len(x.centre)))

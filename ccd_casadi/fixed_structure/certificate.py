@@ -12,7 +12,7 @@ Hamiltonian is of: they are known on the grid (`grid_only`), and where a proof h
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,29 +27,54 @@ from ccd_casadi.fixed_structure.bounds import (
     kind_and_channel,
 )
 from ccd_casadi.fixed_structure.certificate_curves import (
+    CurveOptions,
     crossing_and_bandwidth,
     grid_through,
     padded,
     peaks,
     with_crossings,
 )
-from ccd_casadi.fixed_structure.certificate_responses import LoopTable, norms
+from ccd_casadi.fixed_structure.certificate_responses import LoopResponses, norms
 from ccd_casadi.lti.loop import Sampling, delayed
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
-from ccd_casadi.support.text import counted
+from ccd_casadi.support.text import HZ, counted
 from ccd_casadi.support.worker_process import one_blas_thread
 
 if TYPE_CHECKING:
     from ccd_casadi.plants.scaling import ScaledPlant
 
-TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
-AT_ONCE = 16  # plants: the last ones keep all workers busy
-ROUNDING = 1e3 * float(np.finfo(float).eps)  # of a balanced matrix; 31 eps were seen at a pole
-HALF_WIDTHS, FINE = 3.0, 30  # around a resonance beyond half the rate, and points in each
-REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
+
+@dataclass(frozen=True)
+class CertificateOptions:
+    """Numbers of the judge.
+
+    Attributes
+    ----------
+    tolerance : float
+        Relative: by how much a figure may exceed its bound and count as met.
+    batch : int
+        Plants of one task: the last ones keep all workers busy.
+    rounding : float
+        Of a balanced matrix; poles showed 31 eps.
+    half_widths : float
+        To either side of a resonance beyond half the rate.
+    points : int
+        Of the grid there.
+    rest : float
+        Of the grid's lowest frequency: counts as 0 Hz.
+    curves : CurveOptions
+    """
+
+    tolerance: float = 1e-5
+    batch: int = 16
+    rounding: float = 1e3 * float(np.finfo(float).eps)
+    half_widths: float = 3.0
+    points: int = 240
+    rest: float = 1e-3
+    curves: CurveOptions = field(default_factory=CurveOptions)
 
 
 @dataclass(frozen=True)
@@ -66,6 +91,7 @@ class PlantFigures(LoopPeaks):
     `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
     `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
     `static_compliance` is GS towards 0 Hz, 0 with an integrator; `low_compliance` at ω_low.
+    `GS_beyond`: rad/s of a resonance beyond half the rate where |GS| is largest; 0: it is below.
     `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peaks by Hamiltonians.
     `channels`: as those of the bounds.
     """
@@ -75,6 +101,7 @@ class PlantFigures(LoopPeaks):
     crossing: float = np.nan
     static_compliance: float = np.nan
     low_compliance: float = np.nan
+    GS_beyond: float = 0.0
     confirmed: bool = False
     channels: tuple[ChannelFigures, ...] = ()
 
@@ -100,6 +127,7 @@ def certify(
     *,
     integrator: bool = True,
     workers: Pool | None = None,
+    options: CertificateOptions = CertificateOptions(),
 ) -> SetCertificate:
     """Judge an SI controller on plants against the bounds, σ_max of each matrix.
 
@@ -112,18 +140,20 @@ def certify(
         With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
         None: a continuous loop; the plants are spread over them.
+    options : CertificateOptions
 
     Returns
     -------
-    Certificate
+    SetCertificate
         Stability, figures over bounds, and ω_b in rad/s, the least of all plants.
     """
     systems = [own if isinstance(own, StateSpace) else own.plant_si() for own in plants]
     sizes = [(G.A.shape, G.B.shape, G.C.shape) for G in systems]
     alike = [[i for i, own in enumerate(sizes) if own == size] for size in dict.fromkeys(sizes)]
-    parts = [same[i : i + AT_ONCE] for same in alike for i in range(0, len(same), AT_ONCE)]
+    batch = options.batch
+    parts = [same[i : i + batch] for same in alike for i in range(0, len(same), batch)]
     tasks = {
-        tuple(part): ([systems[i] for i in part], controller, bounds, sampling, integrator)
+        tuple(part): ([systems[i] for i in part], controller, bounds, sampling, integrator, options)
         for part in parts
     }
     each: dict[int, PlantFigures] = {}
@@ -141,10 +171,15 @@ def certify(
         for name, ratio in shares.items():
             worst[name] = float(np.maximum(worst.get(name, 0.0), ratio))  # NaN stays NaN
     broken = [f"{key_words(name)} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in worst.items()
-              if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
+              if not ratio <= 1.0 + options.tolerance]  # fmt: skip
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
     if broken:
         words = f"exceeds its bound on {', '.join(broken)}"
+        beyond = max(found, key=lambda figures: figures.GS).GS_beyond
+        if beyond and not worst.get("GS", 0.0) <= 1.0 + options.tolerance:
+            words += (f"; |GS| is largest at {beyond / HZ:.4g} Hz, at a resonance beyond half the "
+                      "sampling rate, which the search does not see: raise the rate, or damp that "
+                      "resonance")  # fmt: skip
     elif not bandwidth > 0.0:
         words = "S does not start below -3 dB on every plant"
     elif lost:
@@ -163,6 +198,7 @@ def judged(
     bounds: Bounds,
     sampling: Sampling | None,
     integrator: bool,
+    options: CertificateOptions = CertificateOptions(),
 ) -> list[PlantFigures]:
     """The figures of every plant's loop; the plants have matrices of one size."""
     free = [_balanced(plant) for plant in plants]
@@ -176,10 +212,10 @@ def judged(
     poles = [np.linalg.eigvals(S.A) for S in loops]
     grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
     found = [PlantFigures(False, one) for one in grown]
-    # A pole that is no further from the axis than rounding may move it may lie on it. Eigenvalues
+    # A pole as close to the axis as rounding may move it may lie on it. Eigenvalues
     # are those of the balanced matrix: a large gain of K does not move them in proportion.
     sizes = [np.linalg.norm(matrix_balance(S.A)[0]) for S in loops]
-    good = [i for i, size in enumerate(sizes) if grown[i] < -ROUNDING * size]
+    good = [i for i, size in enumerate(sizes) if grown[i] < -options.rounding * size]
     if not good:
         return found
     corner = 0.0
@@ -191,29 +227,33 @@ def judged(
     for i in good:
         nulls = free[i].rates_of(free[i].zeros(_size(free[i])))
         roots = [poles[i], np.linalg.eigvals(G[i].A), own, nulls, *zeros]
-        grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner))
+        grids.append(grid_through(roots, sampling, bounds.omega_low, _size(free[i]), corner,
+                                  options.curves))  # fmt: skip
     grid, rows = padded(grids), np.arange(len(good))
     if not integrator:
-        grid = np.concatenate([REST * grid[:, :1], grid], axis=1)
-    table = LoopTable([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
-                      integrator)  # fmt: skip
+        grid = np.concatenate([options.rest * grid[:, :1], grid], axis=1)
+    table = LoopResponses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds,
+                          integrator)  # fmt: skip
     if len(free[0].C) > 1:
-        grid, values = with_crossings(table, grid)
+        grid, values = with_crossings(table, grid, options.curves)
     else:
         values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
-    tops = peaks(table, grid, values)
+    tops = peaks(table, grid, values, options.curves)
+    beyond_half_the_rate = np.zeros(len(good))
     if table.free is not None and bounds.compliance_max is not None:
-        beyond = _compliance_beyond(table, [free[i] for i in good])
-        tops["GS"] = np.maximum(tops["GS"][0], beyond), tops["GS"][1]
+        beyond, at = _compliance_beyond(table, [free[i] for i in good], options)
+        larger = beyond > tops["GS"][0]
+        tops["GS"] = np.where(larger, beyond, tops["GS"][0]), tops["GS"][1]
+        beyond_half_the_rate = np.where(larger, at, 0.0)
     loops = [loops[i] for i in good]
     for k, i in enumerate(good):
         _raised(tops, k, loops[k], G[i], held, bounds, table.period)
-    crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"])
+    crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], options=options.curves)
     norm, confirmed = norms(loops, table.period, *tops["S"])
     channels: list[list[ChannelFigures]] = [[] for _ in good]
     for one in bounds.channels:
-        of_rows, certain = _rows(one, loops, table, grid, values, tops)
+        of_rows, certain = _rows(one, loops, table, grid, values, tops, options.curves)
         for k, figures in enumerate(of_rows):
             channels[k].append(figures)
             if one.bandwidth_ratio > 1.0:
@@ -233,6 +273,7 @@ def judged(
             KS=float(tops["KS"][0][k]),
             T=float(tops["T"][0][k]),
             GS=float(tops["GS"][0][k]),
+            GS_beyond=float(beyond_half_the_rate[k]),
             weighted_KS=float(weighted[0][k]),
             weighted_T=float(weighted[1][k]),
             # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
@@ -275,25 +316,31 @@ def _raised(
             value[row], at[row] = norm, place
 
 
-def _compliance_beyond(table: LoopTable, plants: Sequence[StateSpace]) -> Array:
-    """|S G| of every plant (P,) beyond half the rate, at its resonances there: a force of such a
-    frequency moves it by G, and its samples are those of a slower one."""
-    found = np.zeros(len(plants))
+def _compliance_beyond(
+    table: LoopResponses, plants: Sequence[StateSpace], options: CertificateOptions
+) -> tuple[Array, Array]:
+    """|S G| of every plant (P,) beyond half the rate, at its resonances there, and their ω: a force
+    of such a frequency moves it by G, and its samples are those of a slower one."""
+    found, at = np.zeros(len(plants)), np.zeros(len(plants))
     for i, G in enumerate(plants):
         poles = np.linalg.eigvals(G.A)
         for p in poles[poles.imag > np.pi / (table.period or np.inf)]:
-            around = p.imag + abs(p.real) * np.linspace(-HALF_WIDTHS, HALF_WIDTHS, 8 * FINE + 1)
-            found[i] = max(found[i], float(table.at(np.array([i]), around[None])["GS"].max()))
-    return found
+            width = options.half_widths
+            around = p.imag + abs(p.real) * np.linspace(-width, width, options.points + 1)
+            most = float(table.at(np.array([i]), around[None])["GS"].max())
+            if not most <= found[i]:  # NaN stays NaN
+                found[i], at[i] = most, p.imag
+    return found, at
 
 
 def _rows(
     bounds: ChannelBounds,
     loops: Sequence[StateSpace],
-    table: LoopTable,
+    table: LoopResponses,
     grid: Array,
     values: dict[str, Array],
     tops: dict[str, tuple[Array, Array]],
+    options: CurveOptions,
 ) -> tuple[list[ChannelFigures], np.ndarray]:
     """The figures of one channel's row on every plant, and whether its peak is confirmed."""
     if not bounds.given:
@@ -301,7 +348,7 @@ def _rows(
     curve, u = f"S of {bounds.name}", np.array([bounds.output])
     rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
     norm, confirmed = norms(rows, table.period, *tops[curve])
-    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], bounds.output)
+    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], bounds.output, options)
     missing = np.full(len(grid), np.nan)
     weighted = tops.get(f"weighted KS of {bounds.name}", (missing, missing))[0]
     columns = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1).tolist()
@@ -334,7 +381,7 @@ def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     held = np.zeros((n + m, n + m))
     held[:n, :n], held[:n, n:] = G.A, G.B
     first, second = expm(held * rest), expm(held * (T - rest))
-    age = m * (whole + 1)  # u_{k-1} … of so many periods are kept
+    age = m * (whole + 1)  # u_{k-1} … of these periods are kept
     A, B = np.zeros((n + age, n + age)), np.zeros((n + age, m))
     A[:n, :n] = second[:n, :n] @ first[:n, :n]
     A[:n, n + m * whole : n + m * (whole + 1)] = second[:n, :n] @ first[:n, n:]

@@ -6,22 +6,30 @@ all plants at once: no derivative is taken, as the synthesis does.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
-from ccd_casadi.fixed_structure.certificate_responses import LoopTable
+from ccd_casadi.fixed_structure.certificate_responses import LoopResponses
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import frequency_grid, root_flanks, zoomed
 from ccd_casadi.support.arrays import Array
 
-HALF_POWER = 1.0 / np.sqrt(2.0)
-PER_DECADE = 60
-FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 1.0, 2.0, 5.0))])
-APART = 1e-9  # relative: grid points that are closer count as one
-NEAR = 0.9  # of the height that counts: local maxima below it lie below it between points too
-FINER = 41  # points in such a maximum's bracket of a lesser singular value
-SECTIONS = 15  # of a bracket in ten: to rounding
+HALF_POWER = 1.0 / np.sqrt(2.0)  # |S| at -3 dB
+
+
+@dataclass(frozen=True)
+class CurveOptions:
+    """Numbers of the judge's grids and of the peaks on them."""
+
+    per_decade: int = 60  # points of a grid
+    flanks: tuple[float, ...] = (0.0, -0.2, 0.2, -0.5, 0.5, -1.0, 1.0, -2.0, 2.0, -5.0, 5.0)
+    # ^ points around a root, in half widths
+    apart: float = 1e-9  # relative: grid points that are closer count as one
+    near: float = 0.9  # of the height that counts: lower maxima stay below it between points too
+    finer: int = 41  # points in the bracket of such a maximum of a lesser singular value
+    sections: int = 15  # of a bracket into ten parts: to rounding
 
 
 def grid_through(
@@ -30,6 +38,7 @@ def grid_through(
     omega_low: float,
     size: float,
     corner: float,
+    options: CurveOptions = CurveOptions(),
 ) -> Array:
     """ω in rad/s, logarithmic and through every root with its flanks.
 
@@ -49,10 +58,10 @@ def grid_through(
     top = max(300.0 * max(size, float(np.abs(joint).max())), 30.0 * corner)
     if sampling is not None:
         top = np.pi / sampling.period
-    count = int(PER_DECADE * np.log10(top / bottom))
-    special = (root_flanks(joint, FLANKS), np.abs(joint), np.array([omega_low]))
+    count = int(options.per_decade * np.log10(top / bottom))
+    special = (root_flanks(joint, np.array(options.flanks)), np.abs(joint), np.array([omega_low]))
     # Of two points that rounding parts one may be the maximum, and its bracket end at the other.
-    return frequency_grid(bottom, top, count, *special, apart=APART)
+    return frequency_grid(bottom, top, count, *special, apart=options.apart)
 
 
 def padded(grids: Sequence[Array]) -> Array:
@@ -61,14 +70,16 @@ def padded(grids: Sequence[Array]) -> Array:
     return np.array([np.pad(grid, (0, most - len(grid)), mode="edge") for grid in grids])
 
 
-def with_crossings(table: LoopTable, grid: Array) -> tuple[Array, dict[str, Array]]:
+def with_crossings(
+    table: LoopResponses, grid: Array, options: CurveOptions = CurveOptions()
+) -> tuple[Array, dict[str, Array]]:
     """Grids (P, k), finer where a lesser singular value has a maximum that comes near the largest,
     and every curve there.
 
     Where it is the larger one between two points only, neither of these shows a maximum. It counts
     where it may be a peak (weighted or not), pass -3 dB first, or leave the shape least room.
     """
-    rows = np.arange(len(grid))
+    rows, near = np.arange(len(grid)), options.near
     values, sizes = table.with_lesser(rows, grid)
     weights, more = table.weights(grid), [[grid[:, :0][i]] for i in rows]
     for name, matrix in sizes.items():
@@ -77,15 +88,15 @@ def with_crossings(table: LoopTable, grid: Array) -> tuple[Array, dict[str, Arra
         if name == "S":
             scales.append(1.0 / counted(table, grid))
             past = np.maximum.accumulate(largest > HALF_POWER, axis=1)
-            floor = np.where(past, np.inf, NEAR * HALF_POWER)
+            floor = np.where(past, np.inf, near * HALF_POWER)
             floor[:, 1:] = np.minimum(floor[:, 1:], floor[:, :-1])  # the bracket of the first too
         for scale in scales:
             top = (scale * largest).max(axis=1, keepdims=True)
-            floor = np.minimum(floor, NEAR * top / scale)
+            floor = np.minimum(floor, near * top / scale)
         for lesser in np.moveaxis(matrix, -1, 0)[:-1]:
-            for i, j in zip(*_maxima(grid, lesser, NEAR * np.maximum(largest, floor)), strict=True):
-                more[i].append(np.linspace(grid[i, j - 1], grid[i, j + 1], FINER))
-    new = [_apart(np.concatenate(own), grid[i]) for i, own in enumerate(more)]
+            for i, j in zip(*_maxima(grid, lesser, near * np.maximum(largest, floor)), strict=True):
+                more[i].append(np.linspace(grid[i, j - 1], grid[i, j + 1], options.finer))
+    new = [_apart(np.concatenate(own), grid[i], options.apart) for i, own in enumerate(more)]
     most = max(map(len, new))
     if not most:
         return grid, values
@@ -99,12 +110,12 @@ def with_crossings(table: LoopTable, grid: Array) -> tuple[Array, dict[str, Arra
     return np.take_along_axis(joint, order, axis=1), values
 
 
-def _apart(points: Array, known: Array) -> Array:
-    """Those that are not next to each other or to known ones, of which rounding parts them."""
+def _apart(points: Array, known: Array, apart: float) -> Array:
+    """Those that are not within `apart` (relative) of each other or of known ones."""
     joint = np.concatenate([known, np.sort(points)])
     order = np.argsort(joint, kind="stable")
     gaps = np.diff(joint[order], prepend=-np.inf, append=np.inf)
-    least = APART * joint[order]
+    least = apart * joint[order]
     new = order >= len(known)
     old = np.append(~new[1:], False)  # the next one is a known one
     keep = new & (gaps[:-1] > least) & ~(old & (gaps[1:] <= least))
@@ -112,8 +123,9 @@ def _apart(points: Array, known: Array) -> Array:
 
 
 def peaks(
-    table: LoopTable, grid: Array, values: dict[str, Array]
-) -> dict[str, tuple[Array, Array]]:
+    table: LoopResponses, grid: Array, values: dict[str, Array],
+    options: CurveOptions = CurveOptions(),
+) -> dict[str, tuple[Array, Array]]:  # fmt: skip
     """Every curve's largest value (P,) and its frequency, local maxima near it zoomed into.
 
     The brackets of all curves are evaluated at once: one response of a point serves every curve.
@@ -122,7 +134,7 @@ def peaks(
     for number, (name, value) in enumerate(values.items()):
         best = np.argmax(value, axis=1)
         tops[name] = value[plants, best], grid[plants, best]
-        i, j = _maxima(grid, value, NEAR * tops[name][0])
+        i, j = _maxima(grid, value, options.near * tops[name][0])
         parts.append((np.full(len(i), number), i, j))
     curve, which, at = (np.concatenate(part) for part in zip(*parts, strict=True))
     rows = np.arange(len(which))
@@ -148,15 +160,16 @@ def _maxima(grid: Array, value: Array, least: Array) -> tuple[np.ndarray, np.nda
 
 
 def crossing_and_bandwidth(
-    table: LoopTable, grid: Array, S: Array, row: Sequence[float] | None = None
-) -> tuple[Array, Array]:
+    table: LoopResponses, grid: Array, S: Array, row: Sequence[float] | None = None,
+    options: CurveOptions = CurveOptions(),
+) -> tuple[Array, Array]:  # fmt: skip
     """The first ω with |S| = 1/√2 of every plant (NaN where there is none), and the largest ω_b
     that keeps the shape below it (0 there).
 
     S (P, k) on the grid, of the whole or of a channel's row.
     """
     # A peak between two points of the grid may pass -3 dB where both stay below.
-    i, j = _maxima(grid, S, np.full(len(S), NEAR * HALF_POWER))
+    i, j = _maxima(grid, S, np.full(len(S), options.near * HALF_POWER))
     i, j = i[S[i, j] <= HALF_POWER], j[S[i, j] <= HALF_POWER]
     where, peak = zoomed(lambda x: table.sensitivity(i, x, row), grid[i, j - 1], grid[i, j + 1])
     most = int(np.bincount(i).max(initial=0))
@@ -172,23 +185,24 @@ def crossing_and_bandwidth(
     first = np.argmax(above[good], axis=1)
     low, high = grid[good, first - 1], grid[good, first]
     each = np.arange(len(good))
-    for _ in range(SECTIONS):
+    for _ in range(options.sections):
         points = np.linspace(low, high, 11, axis=1)
         past = np.argmax(table.sensitivity(good, points, row)[:, 1:] > HALF_POWER, axis=1)
         low, high = points[each, past], points[each, past + 1]
     crossing[good], bandwidth[good] = low, low
     if table.bounds.shape is not None:
-        bandwidth[good] = _within_shape(table, grid[good], S[good], good, low, row)
+        bandwidth[good] = _within_shape(table, grid[good], S[good], good, low, row, options.near)
     return crossing, bandwidth
 
 
 def _within_shape(
-    table: LoopTable,
+    table: LoopResponses,
     grid: Array,
     S: Array,
     which: np.ndarray,
     crossing: Array,
     row: Sequence[float] | None,
+    near: float,
 ) -> Array:
     """The largest ω_b of plants `which` (P,) that keeps the shape below |S|.
 
@@ -206,7 +220,7 @@ def _within_shape(
     known = np.where(grid <= ends[:, None], room(grid, S), np.inf)
     value = np.concatenate([known, room(finer, table.sensitivity(which, finer, row))], axis=1)
     omega, value = _sorted(np.concatenate([grid, finer], axis=1), value)
-    i, j = _maxima(omega, -value, -crossing / NEAR)
+    i, j = _maxima(omega, -value, -crossing / near)
     where, least = zoomed(lambda x: -room(x, table.sensitivity(which[i], x, row)),
                            omega[i, j - 1], np.minimum(omega[i, j + 1], ends[i]))  # fmt: skip
     dips = np.concatenate([i, np.tile(np.arange(len(which)), 2)])
@@ -227,7 +241,7 @@ def _within_shape(
     return found
 
 
-def counted(table: LoopTable, omega: Array) -> Array:
+def counted(table: LoopResponses, omega: Array) -> Array:
     """The ω at which the shape is taken: without an integrator none below ω_low."""
     return omega if table.integrator else np.maximum(omega, table.bounds.omega_low)
 

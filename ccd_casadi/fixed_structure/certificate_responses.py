@@ -17,12 +17,9 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.support.arrays import Array
 
-AT_ONCE = 8192  # numbers of an array that stays in a processor's cache
-CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
-
 
 class Triangular:
-    """State spaces of one shape by their Schur forms; one alone stands for every plant's."""
+    """State spaces of one shape by their Schur forms; one alone counts for every plant."""
 
     def __init__(self, systems: Sequence[StateSpace]) -> None:
         forms = [_schur(x.A) for x in systems]
@@ -38,7 +35,7 @@ class Triangular:
         own = which if len(self.T) > 1 else np.zeros_like(which)
         p, m = self.D.shape[1:]
         found = np.empty((*s.shape, p, m), complex)
-        step = max(1, AT_ONCE // (s.shape[1] * m))
+        step = max(1, 8192 // (s.shape[1] * m))  # numbers that stay in a processor's cache
         for first in range(0, len(s), step):
             part = slice(first, first + step)
             found[part] = self._substituted(own[part], s[part])
@@ -57,7 +54,7 @@ class Triangular:
         return np.asarray(self.D[own, None] + total)
 
 
-class LoopTable:
+class LoopResponses:
     """The loops of a set of plants: `free` and `G` of the plants without and with hold and delay,
     K of the controller, which may have an `integrator`.
     """
@@ -164,13 +161,14 @@ def _length(row: Sequence[float], M: np.ndarray) -> Array:
 
 
 def norms(
-    loops: Sequence[StateSpace], period: float | None, peak: Array, at: Array
-) -> tuple[Array, np.ndarray]:
-    """‖S‖∞ (P,) of every plant's loop, and whether `peak` (P,) at ω (P,) is it.
+    loops: Sequence[StateSpace], period: float | None, peak: Array, at: Array,
+    *, tolerance: float = 1e-6,
+) -> tuple[Array, np.ndarray]:  # fmt: skip
+    """‖S‖∞ (P,) of every plant's loop, and whether `peak` (P,) at ω (P,) is it, to `tolerance`.
 
     `loops` are S, or a row of it, of sampled loops in z.
     """
     run = (replace(loop, period=period or 0.0) for loop in loops)
     each = [hinf_norm(loop, omega)[0] for loop, omega in zip(run, at, strict=True)]
     found = np.maximum(peak, each)
-    return found, np.abs(found / peak - 1.0) <= CONFIRMED
+    return found, np.abs(found / peak - 1.0) <= tolerance

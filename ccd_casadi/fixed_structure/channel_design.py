@@ -23,6 +23,7 @@ from ccd_casadi.fixed_structure.channel_structure import (
 )
 from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike
 from ccd_casadi.fixed_structure.design import (
+    DesignOptions,
     DesignSearch,
     SectionsDesign,
     in_problem_units,
@@ -32,7 +33,7 @@ from ccd_casadi.fixed_structure.design import (
 )
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
-from ccd_casadi.fixed_structure.multi_start import LocalOptimum, run_race, started
+from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum, run_race, started
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
@@ -43,9 +44,6 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent, titled
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.interchange import from_control, plant_from_control
-
-SLOWEST = 10.0  # ω₀ over ω_low/S_low, the bandwidth that S of slope one needs at least
-TIGHTENED = (1.0, 0.6, 0.3)  # of the room that S_max leaves above 1, for channels of coupled plants
 
 
 @one_blas_thread
@@ -64,6 +62,7 @@ def synthesise_sections(
     frequencies: tuple[float, float] | None = None,
     progress: Tell | None = None,
     workers: Pool | None = None,
+    options: DesignOptions | None = None,
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every plant of a set.
 
@@ -86,7 +85,7 @@ def synthesise_sections(
     starts, seed : int
         Of the multi-start search: how many controllers by rules and at random, and which.
     most_starts : int
-        Of one channel: up to so many in all, until the best was found from two of them.
+        Of one channel: up to this many in all, until the best was found from two of them.
     initial, only_initial : sequence of array, bool
         Parameters κ in SI of earlier designs, of several channels stacked, which start beside the
         others, or alone.
@@ -94,6 +93,8 @@ def synthesise_sections(
         As in `problem_for`, rad/s: give them where designs at several θ are compared.
     progress, workers : callable, Pool, optional
         Is given a line at a time; the searches are spread over them, which changes nothing else.
+    options : DesignOptions, optional
+        Numbers of the searches.
 
     Returns
     -------
@@ -103,7 +104,7 @@ def synthesise_sections(
     Raises
     ------
     UserError
-        A system is no continuous one.
+        A system is not continuous.
     PlantError
         A system cannot be a plant, or the plants cannot be in a set.
 
@@ -121,10 +122,10 @@ def synthesise_sections(
     >>> design.certified, design.certificate.words
     (True, 'stable and within every bound on 2 plants')
     """
-    scaled = _scaled(plants, bounds, M_K)
-    problem = problem_for(scaled, structure, bounds, sampling, frequencies)
+    scaled, options = _scaled(plants, bounds, M_K), options or DesignOptions()
+    problem = problem_for(scaled, structure, bounds, sampling, frequencies, margin=options.margin)
     search = DesignSearch(problem, scaled, sampling, starts, most_starts, seed, initial,
-                          only_initial, progress or silent, workers)  # fmt: skip
+                          only_initial, progress or silent, workers, options=options)  # fmt: skip
     if isinstance(problem, CompositeProblem):
         return _of_several(search, problem)
     return of_one_channel(search)
@@ -143,7 +144,8 @@ def _scaled(plants: Any, bounds: Bounds, M_K: float | None) -> list[ScaledPlant]
         if scale is None:
             space = from_control(system)
             order, gain = leading_gain(space)
-            scale = (SLOWEST * bounds.omega_low / bounds.S_low) ** order / gain if order else 1.0
+            least = bounds.omega_low / bounds.S_low  # rad/s: the bandwidth of an S of slope one
+            scale = (10.0 * least) ** order / gain if order else 1.0
         scaled[i] = plant_from_control(system, scale)
     return scaled
 
@@ -169,7 +171,7 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
         evaluations += len(field)
     elif not field or not only_initial:
         before: list[SectionsDesign] = []
-        for share in TIGHTENED:
+        for share in search.options.peak_shares:
             before = _of_channels(search, problem, alike, share, before)
             stack = _stacked(structure, before)
             evaluations += 1
@@ -180,7 +182,8 @@ def _of_several(search: DesignSearch, problem: CompositeProblem) -> SectionsDesi
     if not field:
         return search.failed()
     tell = titled(search.tell, "whole loop")
-    runners = run_race(problem, np.array(field), tell, search.workers, known=known)
+    runners = run_race(problem, np.array(field), tell, search.workers, known=known,
+                       options=search.options.multi_start)  # fmt: skip
     return search.concluded(runners, len(field), evaluations)
 
 
@@ -224,7 +227,8 @@ def _of_channels(
         if same and (not begins or again):
             found.append(found[same[0]])
             continue
-        alone = problem_for(members, own, own_limits[i], search.sampling, span_of(problem))
+        alone = problem_for(members, own, own_limits[i], search.sampling, span_of(problem),
+                            margin=problem.margin)  # fmt: skip
         title = f"channel {structure.decoupling.names[i]}"
         found.append(of_one_channel(replace(
             search, problem=alone, plants=members, initial=begins, began=perf_counter(),
@@ -243,7 +247,7 @@ def _joined(
     slowest = min(one.bandwidth / np.exp(lead) for one, lead in zip(designs, leads, strict=True))
     tau = float(np.log(slowest / problem.plants.omega_0))
     point = Point(inside, tau, assess(problem, inside, tau))
-    optima = (LocalOptimum(slowest, 1, tuple(map(float, kappa))),)
+    optima = (BandwidthOptimum(slowest, 1, tuple(map(float, kappa))),)
     starts = sum(one.starts for one in designs)
     return search.designed(point, optima, starts, sum(one.evaluations for one in designs))
 

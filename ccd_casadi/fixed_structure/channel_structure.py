@@ -10,18 +10,11 @@ import numpy as np
 import scipy
 
 from ccd_casadi.fixed_structure.bounds import ChannelBounds
-from ccd_casadi.fixed_structure.structure import Kind, Structure
+from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-
-ORTHOGONAL = 1e-9  # of UᵀU - I: with more, singular values differ between the coordinates
-PROBES = np.geomspace(1e-3, 1e3, 19)  # over ω₀
-DIAGONAL = 1e-7  # |G_ij| over the mean of |G_ii| and |G_jj| that counts as no coupling
-NOTHING = 1e-12  # the same by which no part of a plant couples channels, at its resonance either
-ABSENT = 1e-8  # share of the strongest drive or reading under which a mode is in no channel
-LEAST_GAIN = 1e-9  # of static gains, relative: a channel below it is none
 
 
 @dataclass(frozen=True)
@@ -34,18 +27,33 @@ class Decoupling:
 
     @property
     def orthogonal(self) -> bool:
-        """Whether U and V are orthogonal, so that the coordinates of channels keep all norms."""
+        """Whether U and V are orthogonal (to 1e-9), so that channels' coordinates keep norms."""
         eye = np.eye(len(self.names))
         return all(
-            M.shape[0] == M.shape[1] and np.abs(M.T @ M - eye).max() <= ORTHOGONAL
+            M.shape[0] == M.shape[1] and np.abs(M.T @ M - eye).max() <= 1e-9
             for M in (self.outputs, self.inputs)
         )
 
 
-def find_decoupling(plant: ScaledPlant) -> Decoupling:
-    """The channels of a square plant, numbered by falling static gain, free bodies suspended.
+def find_decoupling(plant: ScaledPlant, *, least_gain: float = 1e-9) -> Decoupling:
+    """Find the channels of a square plant: the singular vectors of its static gain.
 
-    Raises PlantError where the plant is not square or cannot be moved in some direction.
+    Parameters
+    ----------
+    plant : ScaledPlant
+        Free bodies count as suspended; blocks of `plant.channels` are decoupled one by one.
+    least_gain : float
+        Singular value over the largest below which the plant does not move in a direction.
+
+    Returns
+    -------
+    Decoupling
+        By falling static gain; the largest entry of each direction of outputs is positive.
+
+    Raises
+    ------
+    PlantError
+        The plant is not square, or does not move in some direction.
     """
     plant = plant.design_plant
     p, m = plant.C.shape[0], plant.B.shape[1]
@@ -61,7 +69,7 @@ def find_decoupling(plant: ScaledPlant) -> Decoupling:
         inputs.append(into @ Vt.T)
         gains.append(s)
     gain = np.concatenate(gains)
-    if not gain.min() > LEAST_GAIN * gain.max():
+    if not gain.min() > least_gain * gain.max():
         raise PlantError("does not move in every direction of its outputs; leave some of them out")
     order = np.argsort(-gain, kind="stable")
     U, V = np.hstack(outputs)[:, order], np.hstack(inputs)[:, order]
@@ -102,8 +110,21 @@ def given_decoupling(
 def channel_bounds(
     decoupling: Decoupling, given: Mapping[str, Mapping[str, float]]
 ) -> tuple[ChannelBounds, ...]:
-    """`channels` of `Bounds`: by a channel's name what it keeps for itself, in keywords.
+    """Make the `channels` of `Bounds` from the bounds of single channels.
 
+    Parameters
+    ----------
+    decoupling : Decoupling
+    given : mapping
+        By a channel's name the keywords of `ChannelBounds`; other channels have none.
+
+    Returns
+    -------
+    tuple of ChannelBounds
+        One for each channel, in their order.
+
+    Examples
+    --------
     >>> channels = given_decoupling(("z", "tilt"), [[1, 1], [1, -1]], [[1, 1], [1, -1]])
     >>> own = channel_bounds(channels, {"tilt": {"S_max": 1.5, "bandwidth_ratio": 2.0}})
     >>> [(one.name, one.S_max, one.bandwidth_ratio) for one in own]
@@ -124,15 +145,30 @@ def in_channels(plant: ScaledPlant, decoupling: Decoupling) -> ScaledPlant:
                    dC=U.T @ plant.dC, channels=())  # fmt: skip
 
 
-def channel_plant(plant: ScaledPlant, decoupling: Decoupling, number: int) -> ScaledPlant:
-    """The SISO plant u_iᵀ G v_i, with the states that take part in it or may as θ moves."""
+def channel_plant(
+    plant: ScaledPlant, decoupling: Decoupling, number: int, *, absent: float = 1e-8
+) -> ScaledPlant:
+    """Take the SISO plant u_iᵀ G v_i of a channel.
+
+    Parameters
+    ----------
+    plant, decoupling, number : ScaledPlant, Decoupling, int
+        i is `number`.
+    absent : float
+        Share of the strongest drive or reading below which a part of the plant is left out.
+
+    Returns
+    -------
+    ScaledPlant
+        With the states that take part in it or may as θ moves.
+    """
     whole = in_channels(plant, decoupling)
     b, c = whole.B[:, [number]], whole.C[[number]]
     count, group = _apart((whole.A != 0.0).tobytes(), len(whole.A))
     drive, reading = np.zeros(count), np.zeros(count)
     np.maximum.at(drive, group, np.abs(b[:, 0]))
     np.maximum.at(reading, group, np.abs(c[0]))
-    live = (drive > ABSENT * drive.max()) | (reading > ABSENT * reading.max())
+    live = (drive > absent * drive.max()) | (reading > absent * reading.max())
     at = np.flatnonzero(live[group])
     dA, dB, dC = whole.dA, whole.dB[:, :, [number]], whole.dC[:, [number]]
     return replace(
@@ -150,7 +186,11 @@ def _apart(coupled: bytes, states: int) -> tuple[int, np.ndarray]:
 
 
 def is_decoupled(plant: ScaledPlant, decoupling: Decoupling) -> bool:
-    """Whether Uᵀ G V is diagonal, at every resonance and between; U and V have to be orthogonal."""
+    """Whether Uᵀ G V is diagonal, at every resonance and between; U and V have to be orthogonal.
+
+    A part of the plant couples no channels where but one of them drives or reads it by more than
+    1e-12 of the strongest; else responses decide.
+    """
     if not decoupling.orthogonal:
         return False
     whole = in_channels(plant, decoupling)
@@ -158,25 +198,37 @@ def is_decoupled(plant: ScaledPlant, decoupling: Decoupling) -> bool:
     taken = np.zeros((count, len(whole.C)))
     for part in (np.abs(whole.B), np.abs(whole.C.T)):
         np.maximum.at(taken, group, part / part.max(axis=0))
-    if ((taken > NOTHING).sum(axis=1) <= 1).all():
+    if ((taken > 1e-12).sum(axis=1) <= 1).all():
         return True
-    if _coupled(whole, PROBES[::6]) or _coupled(whole, PROBES):
+    omega = np.geomspace(1e-3, 1e3, 19)  # over ω₀
+    if _coupled(whole, omega[::6]) or _coupled(whole, omega):
         return False
     poles = np.linalg.eigvals(whole.A)
     return not _coupled(whole, np.abs(poles[poles.imag >= 0.0]))
 
 
-def _coupled(whole: ScaledPlant, omega: Array) -> bool:
-    """Whether G is more than diagonal at some of these frequencies over ω₀."""
+def _coupled(whole: ScaledPlant, omega: Array, *, diagonal: float = 1e-7) -> bool:
+    """Whether |G_ij| is above `diagonal` of the mean of |G_ii| and |G_jj| at some ω over ω₀."""
     G = np.abs(whole.system.response(omega))
     own = np.sqrt(np.einsum("kii->ki", G))
     coupling = G / np.maximum(own[:, :, None] * own[:, None, :], 1e-300)
     coupling[:, range(len(own[0])), range(len(own[0]))] = 0.0
-    return bool(coupling.max() > DIAGONAL)
+    return bool(coupling.max() > diagonal)
 
 
 def in_units_of(plant: ScaledPlant, first: ScaledPlant) -> ScaledPlant:
-    """The same plant with time and force counted as those of another one."""
+    """Count the time and the force of a plant as those of another one.
+
+    Parameters
+    ----------
+    plant, first : ScaledPlant
+        `first` has the units.
+
+    Returns
+    -------
+    ScaledPlant
+        The same plant, with the ω₀ and the force of `first`.
+    """
     time = plant.omega_0 / first.omega_0
     drive = time * first.force / plant.force
     return replace(
@@ -187,9 +239,18 @@ def in_units_of(plant: ScaledPlant, first: ScaledPlant) -> ScaledPlant:
 
 @dataclass(frozen=True)
 class ChannelStructure:
-    """The channels and the structure of each; a parameter of channel z is named `z: gain`.
+    """A controller of several channels, K(s) = V diag(K_1(s), …, K_c(s)) Uᵀ.
 
-    `owners`: the number of the channel whose parameters each one has; empty: each its own.
+    A parameter of channel z is named `z: gain`.
+
+    Attributes
+    ----------
+    decoupling : Decoupling
+        U (p, c) and V (m, c).
+    structures : tuple of Structure
+        One for each channel.
+    owners : tuple of int
+        The number of the channel whose parameters each one has; empty: each its own.
     """
 
     decoupling: Decoupling
@@ -226,7 +287,7 @@ class ChannelStructure:
 
     @cached_property
     def apart(self) -> "ChannelStructure":
-        """The same with parameters of its own for each channel."""
+        """The same with separate parameters for each channel."""
         return replace(self, owners=())
 
     @cached_property
@@ -241,7 +302,7 @@ class ChannelStructure:
         return tuple(f"{channel}: {name}" for channel, own in pairs for name in own.names)
 
     @cached_property
-    def kinds(self) -> tuple[Kind, ...]:
+    def kinds(self) -> tuple[ParameterKind, ...]:
         """The kind of each parameter."""
         return tuple(kind for i in self.free for kind in self.structures[i].kinds)
 

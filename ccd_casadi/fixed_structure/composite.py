@@ -8,7 +8,7 @@ are the channels' moduli. Plants whose channels are coupled are bounded as a who
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,8 +25,8 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
     LoopProblem,
-    Places,
     Problem,
+    RowPlaces,
 )
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
@@ -36,11 +36,7 @@ from ccd_casadi.support.worker_process import side_by_side
 
 T = TypeVar("T")
 R = TypeVar("R")
-Rows = TypeVar("Rows", bound=Places)
-
-AT_ONCE = 6  # coupled plants of a part at most: parts are computed side by side
-NOT_THERE = -1.0  # a pole that stands for none
-ALIKE = 1e-9  # relative: responses of channels that are one problem
+Rows = TypeVar("Rows", bound=RowPlaces)
 
 
 @dataclass(frozen=True)
@@ -120,14 +116,13 @@ class CompositeProblem(LoopProblem):
             out[at] = part.problem.gains_of(own) + np.array([one, 0])
         return out
 
-    def inverse_square(self, at: Places, tau: float) -> Array:
+    def inverse_square(self, at: RowPlaces, tau: float) -> Array:
         out = np.zeros(len(at.v))
         for part, which, own in self.split(at):
             out[which] = part.problem.inverse_square(own, tau + part.lead)
         return out
 
     def plants_of(self, constraints: Constraints) -> np.ndarray:
-        """Of all."""
         out = np.zeros(len(constraints.v), int)
         for part, at, own in self.split(constraints):
             out[at] = part.members[part.problem.plants_of(own)]
@@ -141,9 +136,12 @@ def composite_problem(
     sampling: Sampling | None = None,
     frequencies: tuple[float, float] | None = None,
     margin: float = 0.0,
+    *,
+    most_coupled: int = 6,
 ) -> CompositeProblem:
     """The problem in the units of the first plant; `frequencies` (rad/s) bound those of K's roots.
 
+    Coupled plants are in parts of `most_coupled` at most, which are computed side by side.
     Raises PlantError as `plant_set` does.
     """
     first = plants[0]
@@ -164,7 +162,8 @@ def composite_problem(
                 continue
             problem = Problem(plant_set(singles[i], sampling), own, limits, box[:, place], margin)
             parts.append(Part(problem, place, members, i, lead))
-    for members in np.array_split(together, -(-len(together) // AT_ONCE)) if len(together) else ():
+    count = -(-len(together) // most_coupled)
+    for members in np.array_split(together, count) if count else ():
         matrices = plant_set([alike[j] for j in members], sampling, structure.decoupling)
         place = structure.places
         whole = LoopProblem(matrices, structure.apart, bounds, box[:, place], margin)
@@ -176,8 +175,22 @@ def composite_problem(
 def on_plants(
     problem: LoopProblem, plants: Sequence[ScaledPlant], sampling: Sampling | None
 ) -> LoopProblem:
-    """The same problem on plants that are moved a little: as many, in its units, that fall apart
-    and are alike where its own are. None of this is checked."""
+    """Put other plants into a problem, as many, in its units, close to its own.
+
+    Parameters
+    ----------
+    problem : LoopProblem
+        Its structure, bounds, box and division into parts stay.
+    plants : sequence of ScaledPlant
+        Decoupled and alike where the problem's own are; this is not checked.
+    sampling : Sampling, optional
+        None: a continuous loop.
+
+    Returns
+    -------
+    LoopProblem
+        Of the same type.
+    """
     if not isinstance(problem, CompositeProblem):
         return replace(problem, plants=plant_set(plants, sampling, alike=True))
     decoupling, parts = problem.structure.decoupling, []
@@ -217,14 +230,14 @@ def _by_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
 
 @assess.register
 def _(
-    problem: CompositeProblem, kappa: Array, tau: float, *, each: bool = False, **depths: float
+    problem: CompositeProblem, kappa: Array, tau: float, *, each: bool = False, **rest: Any
 ) -> Assessment:
     def assessed(part: Part) -> Assessment:
-        return assess(part.problem, kappa[part.place], tau + part.lead, each=each, **depths)
+        return assess(part.problem, kappa[part.place], tau + part.lead, each=each, **rest)
 
     found = _by_parts(assessed, problem.parts)
     widest = sum(one.poles.shape[1] for one in found)
-    poles = np.full((problem.count, widest), NOT_THERE, complex)
+    poles = np.full((problem.count, widest), -1.0, complex)  # stable where a plant has no pole
     at = 0
     for part, one in zip(problem.parts, found, strict=True):
         poles[part.members, at : at + one.poles.shape[1]] = one.poles
@@ -240,11 +253,11 @@ def _(
             peaks.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
             near.append((one.near.curve, one.near.plant + start, one.near.v))
     columns = (map(np.concatenate, zip(*rows, strict=True)) for rows in (peaks, near))
-    return Assessment(True, poles, Constraints(*next(columns)), Places(*next(columns)))
+    return Assessment(True, poles, Constraints(*next(columns)), RowPlaces(*next(columns)))
 
 
 @constraints.register
-def _(problem: CompositeProblem, kappa: Array, tau: float, at: Places) -> Constraints:
+def _(problem: CompositeProblem, kappa: Array, tau: float, at: RowPlaces) -> Constraints:
     (value, to_tau), to_kappa = np.zeros((2, len(at.v))), np.zeros((len(at.v), len(kappa)))
     for part, which, own in problem.split(at):
         inside = constraints(part.problem, kappa[part.place], tau + part.lead, own)
@@ -273,6 +286,7 @@ def _(
     tau: float,
     rows: Constraints,
     beside: Sequence[CompositeProblem] = (),
+    **rest: Any,
 ) -> Array:
     k, n = len(beside), len(kappa)
 
@@ -281,7 +295,7 @@ def _(
         place = np.concatenate([np.arange(k), k + part.place, [k + n]])
         spread = np.asarray(np.arange(k + n + 1) == place[:, None], float)
         near = [other.parts[number].problem for other in beside]
-        inner = hessians(part.problem, kappa[part.place], tau + part.lead, own, near)
+        inner = hessians(part.problem, kappa[part.place], tau + part.lead, own, near, **rest)
         return np.asarray(spread.T @ inner @ spread)
 
     out, splits = np.zeros((len(rows.v), k + n + 1, k + n + 1)), problem.split(rows)
@@ -291,8 +305,11 @@ def _(
     return out
 
 
-def answer_alike(a: Sequence[ScaledPlant], b: Sequence[ScaledPlant]) -> bool:
-    """Whether two channels' plants answer alike; so many frequencies tell rational functions."""
+def answer_alike(
+    a: Sequence[ScaledPlant], b: Sequence[ScaledPlant], *, tolerance: float = 1e-9
+) -> bool:
+    """Whether two channels' plants answer alike, to `tolerance` (relative), at enough frequencies
+    to tell rational functions of their order apart."""
     first, second = plant_set(a), plant_set(b)
     if first.poles.shape != second.poles.shape:
         return False
@@ -300,4 +317,4 @@ def answer_alike(a: Sequence[ScaledPlant], b: Sequence[ScaledPlant]) -> bool:
     which = np.repeat(np.arange(len(a)), len(v))
     v = np.tile(v, len(a))
     one, other = first.responses(which, v)[0], second.responses(which, v)[0]
-    return bool((np.abs(one - other) <= ALIKE * np.abs(one)).all())
+    return bool((np.abs(one - other) <= tolerance * np.abs(one)).all())

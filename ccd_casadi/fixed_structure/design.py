@@ -16,11 +16,11 @@ from ccd_casadi.fixed_structure.composite import box_of, composite_problem
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Envelope, Point, ascend, envelope_of, optimality
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopProblem, Problem
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.multi_start import (
-    SAME,
-    LocalOptimum,
-    Runner,
+    BandwidthOptimum,
+    MultiStartOptions,
+    SearchRun,
     arrivals,
     distinct,
     finished,
@@ -29,7 +29,7 @@ from ccd_casadi.fixed_structure.multi_start import (
     run_race,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
-from ccd_casadi.fixed_structure.structure import Kind, Structure
+from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -38,7 +38,44 @@ from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import NotebookHtml, Tell, silent
 from ccd_casadi.support.text import HZ, number
 
-MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
+
+@dataclass(frozen=True)
+class DesignOptions:
+    """Numbers of a design: where its searches start, how often, and what they leave of a bound.
+
+    Attributes
+    ----------
+    margin : float
+        ln: a design lies this far within its bounds.
+    crossovers : tuple of float
+        Of starts, over ω₀ = √(M_K/mass) about.
+    pool : int
+        Random starts that are tried for stability for each one that is kept.
+    batch : int
+        Controllers that one task assesses.
+    reworks : int
+        Searches at most from the best ends with one section moved or drawn anew.
+    reworked : int
+        Best ends that are reworked.
+    repeats : int
+        Times that the best of a search is to be found, from starts apart.
+    least_starts : int
+        Of a search that may add starts: two of four may end in a lesser one.
+    peak_shares : tuple of float
+        Of S_max - 1, tried for coupled channels.
+    multi_start : MultiStartOptions
+    """
+
+    margin: float = 1e-6
+    crossovers: tuple[float, float] = (0.03, 10.0)
+    pool: int = 12
+    batch: int = 16
+    reworks: int = 2
+    reworked: int = 3
+    repeats: int = 2
+    least_starts: int = 12
+    peak_shares: tuple[float, ...] = (1.0, 0.6, 0.3)
+    multi_start: MultiStartOptions = field(default_factory=MultiStartOptions)
 
 
 class SectionsOutcome(StrEnum):
@@ -90,7 +127,7 @@ class SectionsDesign(NotebookHtml):
     at_box: tuple[tuple[str, str, float], ...]
     kkt_residual: float
     short: dict[str, float]
-    local_optima: tuple[LocalOptimum, ...]
+    local_optima: tuple[BandwidthOptimum, ...]
     starts: int
     evaluations: int
     seed: int
@@ -104,14 +141,25 @@ class SectionsDesign(NotebookHtml):
 
 
 def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:
-    """SI parameters κ in the units of the problem."""
+    """Convert parameters of a controller to the units of a problem.
+
+    Parameters
+    ----------
+    problem, kappa : LoopProblem, array (n,)
+        κ: logarithms of parameters in rad/s and N/m.
+
+    Returns
+    -------
+    array (n,)
+        κ with frequencies over ω₀ and gains over the force per displacement of the problem.
+    """
     P = problem.plants
     return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
 
 
 def span_of(problem: LoopProblem) -> tuple[float, float]:
     """The bounds of frequencies of K's roots in rad/s."""
-    index = problem.structure.kinds.index(Kind.FREQUENCY) if len(problem.box[0]) > 1 else 0
+    index = problem.structure.kinds.index(ParameterKind.FREQUENCY) if len(problem.box[0]) > 1 else 0
     low, high = np.exp(problem.box[:, index]) * problem.plants.omega_0
     return float(low), float(high)
 
@@ -132,13 +180,14 @@ class DesignSearch:
     tell: Tell = silent
     workers: Pool | None = None
     began: float = field(default_factory=perf_counter)
+    options: DesignOptions = DesignOptions()
 
     def inside(self, kappas: Sequence[Array]) -> list[Array]:
         """Controllers κ in SI in the units of the problem and in its box."""
         return [np.clip(in_problem_units(self.problem, one), *self.problem.box) for one in kappas]
 
     def judged(self, inside: Array) -> tuple[Array, StateSpace, SetCertificate]:
-        """κ in SI of one in the problem's units, its controller, and what the judge says of it."""
+        """κ in SI of one in the problem's units, its controller, and its certificate."""
         structure, P = self.problem.structure, self.problem.plants
         kappa = structure.in_units(inside, P.omega_0, P.force)
         K = structure.state_space(kappa)
@@ -146,7 +195,7 @@ class DesignSearch:
                                  integrator=structure.integrator, workers=self.workers)  # fmt: skip
 
     def designed(
-        self, point: Point, optima: tuple[LocalOptimum, ...], starts: int, evaluations: int
+        self, point: Point, optima: tuple[BandwidthOptimum, ...], starts: int, evaluations: int
     ) -> SectionsDesign:
         """The design at an end: certified where the judge confirms what the search found."""
         problem = self.problem
@@ -157,7 +206,7 @@ class DesignSearch:
         peaks = point.assessment.peaks
         assert peaks is not None
         for name, value in zip(problem.kinds_of(peaks), peaks.value, strict=True):
-            if value > 2.0 * MARGIN:
+            if value > 2.0 * problem.margin:
                 short[name] = max(short.get(name, 0.0), float(np.exp(value)))
         outcome, words = SectionsOutcome.CERTIFIED, judged.words
         if short:
@@ -186,15 +235,17 @@ class DesignSearch:
             np.nan, None, {}, (), np.nan, {}, (), 0, 0, self.seed, perf_counter() - self.began,
         )  # fmt: skip
 
-    def concluded(self, runners: Sequence[Runner], starts: int, spent: int = 0) -> SectionsDesign:
+    def concluded(
+        self, runners: Sequence[SearchRun], starts: int, spent: int = 0
+    ) -> SectionsDesign:
         """The best end that the judge confirms, brought within its bounds; `spent`: loops that were
-        looked at before."""
-        problem, ends = self.problem, finished(runners)
+        assessed before."""
+        problem, ends = self.problem, finished(runners, self.options.multi_start)
         evaluations = spent + sum(runner.evaluations for runner in runners)
         best: SectionsDesign | None = None
-        optima = local_optima(problem, ends)
+        optima = local_optima(problem, ends, self.options.multi_start)
         for point in (runner.point for runner in ends):
-            if point.assessment.violation > MARGIN:
+            if point.assessment.violation > problem.margin:
                 again = ascend(problem, point, iterations=30, restoring=True, radius=0.02)
                 evaluations += again.evaluations
                 point = again.point
@@ -211,33 +262,43 @@ class DesignSearch:
         return best
 
 
-LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
-CROSSOVERS = (0.03, 10.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
-REDRAWS = 2  # searches at most from the best ends, one section of each elsewhere or drawn anew
-REDRAWN = 3  # ends
-TWICE = 2  # times that the best of a search was found, from starts apart
-LEAST_STARTS = 12  # of a search that may go on: two of four may come to one of the lesser optima
-AT_ONCE = 16  # controllers that a process looks at
-POOL = 12  # random starts tried for stability for each one that is kept
-
-
 def problem_for(
     plants: Sequence[ScaledPlant],
     structure: Structure | ChannelStructure,
     bounds: Bounds,
     sampling: Sampling | None = None,
     frequencies: tuple[float, float] | None = None,
+    *,
+    margin: float = DesignOptions.margin,
 ) -> LoopProblem:
-    """The problem in the units of the first plant, of one channel or of several.
+    """Make the problem of a controller on a set of plants, in the units of the first plant.
 
-    `frequencies` (rad/s) bound those of K's roots; by default 1e-3 ω₀ and 30 times the fastest
-    pole of any plant, sampled 2/T at most. The gain lies within a factor 1e6 of M_K.
+    Parameters
+    ----------
+    plants, structure, bounds : sequence of ScaledPlant, Structure or ChannelStructure, Bounds
+    sampling : Sampling, optional
+        None: a continuous loop.
+    frequencies : tuple of two floats, optional
+        Bounds of the frequencies of K's roots, rad/s; by default 1e-3 ω₀ and 30 times the fastest
+        pole of any plant, sampled 2/T at most. The gain lies within a factor 1e6 of M_K.
+    margin : float
+        ln: how far inside every bound its searches aim.
+
+    Returns
+    -------
+    LoopProblem
+        A `CompositeProblem` for several channels, else a `Problem`.
+
+    Raises
+    ------
+    PlantError
+        As `plant_set` does.
     """
     if isinstance(structure, ChannelStructure):
-        return composite_problem(plants, structure, bounds, sampling, frequencies, MARGIN)
+        return composite_problem(plants, structure, bounds, sampling, frequencies, margin)
     family = plant_set(plants, sampling)
     box = box_of(structure, family.poles, family.omega_0, sampling, frequencies)
-    return Problem(family, structure, bounds, box, MARGIN)
+    return Problem(family, structure, bounds, box, margin)
 
 
 def of_one_channel(search: DesignSearch) -> SectionsDesign:
@@ -245,88 +306,95 @@ def of_one_channel(search: DesignSearch) -> SectionsDesign:
     rules and at random, then from the best ends with one section of each put elsewhere or drawn
     anew; in batches of starts, up to `most_starts`, until the best was found twice."""
     problem, starts, workers = cast(Problem, search.problem), search.starts, search.workers
+    options, rules = search.options, search.options.multi_start
     rng, names = np.random.default_rng(search.seed), problem.structure.names
     pool = stabilising(problem, np.reshape(search.inside(search.initial), (-1, len(names))))
     known = len(pool)
     if not search.only_initial:
-        pool = np.concatenate([pool, _pool(problem, starts, rng, workers)])
+        pool = np.concatenate([pool, _pool(problem, starts, rng, workers, options)])
     if not len(pool):
         return search.failed()
     last, begun = search.only_initial, len(pool)
-    first = run_race(problem, pool, search.tell, workers, known=known, last=last)
+    first = run_race(problem, pool, search.tell, workers, known=known, last=last, options=rules)
     if last:
         return search.concluded(first, begun)
     runners = _reworked(search, problem, first, rng)
-    found, batch = arrivals(first, runners[0]) - max(known - 1, 0), 0  # known ones may be alike
-    least = min(LEAST_STARTS, search.most_starts)
-    while begun < least or (found < TWICE and begun + starts <= search.most_starts):
+    # known ones may be alike
+    found, batch = arrivals(first, runners[0], rules) - max(known - 1, 0), 0
+    least = min(options.least_starts, search.most_starts)
+    while begun < least or (found < options.repeats and begun + starts <= search.most_starts):
         batch += 1
         rng = np.random.default_rng((search.seed, batch))
-        pool = _pool(problem, starts, rng, workers)
+        pool = _pool(problem, starts, rng, workers, options)
         begun += len(pool)
-        before, best = arrivals(runners, runners[0]), runners[0]
-        field = run_race(problem, pool, search.tell, workers, runners, last=False)
-        if field[0].merit > best.merit + SAME:
+        before, best = arrivals(runners, runners[0], rules), runners[0]
+        field = run_race(problem, pool, search.tell, workers, runners, last=False, options=rules)
+        if field[0].merit > best.merit + rules.same:
             runners = _reworked(search, problem, field, rng)
-            found = arrivals(field, runners[0])
+            found = arrivals(field, runners[0], rules)
         else:
-            runners, found = field, found + max(arrivals(field, field[0]) - before, 0)
+            runners, found = field, found + max(arrivals(field, field[0], rules) - before, 0)
     return replace(search.concluded(runners, begun), found=found)
 
 
 def _reworked(
-    search: DesignSearch, problem: Problem, runners: list[Runner], rng: np.random.Generator
-) -> list[Runner]:
+    search: DesignSearch, problem: Problem, runners: list[SearchRun], rng: np.random.Generator
+) -> list[SearchRun]:
     """Searches from the best ends with one section of each put elsewhere or drawn anew, as often as
     that helps, beside those of before."""
-    workers, tried = search.workers, list[Point]()
-    for _ in range(REDRAWS):
-        best, ends = runners[0].merit, distinct(runners, REDRAWN)
+    workers, tried, options = search.workers, list[Point](), search.options
+    for _ in range(options.reworks):
+        best = runners[0].merit
+        ends = distinct(runners, options.reworked, options.multi_start)
         fresh = [end for end in ends if not any(end is other for other in tried)]
         tried += fresh
         count = max(search.starts // 2, 1)
         moved = stabilising(problem, reinserted(problem, fresh))[:count]
         more, like = count - len(moved), [end.kappa for end in ends]
-        drawn = stabilising(problem, redrawn(problem, like, POOL // 2 * more, rng))
-        pool = np.concatenate([moved, _nearest(problem, drawn, more, workers)])
-        runners = run_race(problem, pool, search.tell, workers, runners, known=len(moved))
-        if runners[0].merit < best + SAME:
+        drawn = stabilising(problem, redrawn(problem, like, options.pool // 2 * more, rng))
+        pool = np.concatenate([moved, _nearest(problem, drawn, more, workers, options.batch)])
+        runners = run_race(problem, pool, search.tell, workers, runners, known=len(moved),
+                           options=options.multi_start)  # fmt: skip
+        if runners[0].merit < best + options.multi_start.same:
             break
     return runners
 
 
-def _pool(problem: Problem, starts: int, rng: np.random.Generator, workers: Pool | None) -> Array:
+def _pool(
+    problem: Problem, starts: int, rng: np.random.Generator, workers: Pool | None,
+    options: DesignOptions = DesignOptions(),
+) -> Array:  # fmt: skip
     """Half by rules, half at random, of those that are stable; the nearest to the bounds of each,
     and the fastest by rule, which none at a modest bandwidth leads to.
 
-    Where none is stable the search for one goes on with slower crossovers.
+    Where none is stable slower crossovers are tried.
     """
-    low, high = CROSSOVERS
+    low, high = options.crossovers
     for _ in range(3):
         rules = stabilising(problem, by_rules(problem, np.geomspace(low, high, 12)))
-        draws = np.exp(rng.uniform(np.log(low), np.log(high), POOL * starts))
+        draws = np.exp(rng.uniform(np.log(low), np.log(high), options.pool * starts))
         random = stabilising(problem, at_random(problem, draws, rng))
         if len(rules) + len(random):
             half = max(starts // 2, 1)
             fastest = rules[-1:] if half > 2 else rules[:0]
             rules = rules[: len(rules) - len(fastest)]
-            near = _nearest(problem, rules, half - len(fastest), workers)
-            far = _nearest(problem, random, 4 * half, workers)
+            near = _nearest(problem, rules, half - len(fastest), workers, options.batch)
+            far = _nearest(problem, random, 4 * half, workers, options.batch)
             chosen = rng.permutation(len(far))[: max(starts - len(near) - len(fastest), half)]
             return np.concatenate([near, fastest, far[chosen]])
         low, high = 0.03 * low, low
     return np.zeros((0, len(problem.structure.names)))
 
 
-def _nearest(problem: Problem, kappa: Array, count: int, workers: Pool | None) -> Array:
+def _nearest(problem: Problem, kappa: Array, count: int, workers: Pool | None, batch: int) -> Array:
     """The `count` controllers that miss the bounds least at a modest bandwidth."""
-    parts = {i: (problem, kappa[i : i + AT_ONCE]) for i in range(0, len(kappa), AT_ONCE)}
+    parts = {i: (problem, kappa[i : i + batch]) for i in range(0, len(kappa), batch)}
     misses = dict(results(workers, _misses, parts))
     return kappa[np.argsort([miss for i in parts for miss in misses[i]])[:count]]
 
 
 def _misses(problem: Problem, kappa: Array) -> list[float]:
-    return [assess(problem, one, FIRST).violation for one in kappa]
+    return [assess(problem, one, problem.first_tau).violation for one in kappa]
 
 
 def bandwidth_envelope(
@@ -335,9 +403,18 @@ def bandwidth_envelope(
     design: SectionsDesign,
     sampling: Sampling | None = None,
 ) -> Envelope | None:
-    """The gradients of ω_b*(θ) in rad/s at a design that is optimal on these plants.
+    """Find the gradients of ω_b*(θ) at a design that is optimal on these plants.
 
-    None where a loop is unstable or the point is not stationary to 1e-3. Plants carry dA, dB, dC.
+    Parameters
+    ----------
+    plants : sequence of ScaledPlant
+        With their derivatives dA, dB, dC to θ.
+    bounds, design, sampling : Bounds, SectionsDesign, Sampling, optional
+
+    Returns
+    -------
+    Envelope or None
+        In rad/s; None where a loop is unstable or the point is not stationary.
     """
     problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
     kappa = in_problem_units(problem, design.kappa)
@@ -350,14 +427,15 @@ def bandwidth_envelope(
     return None if envelope is None else envelope.times(design.bandwidth)
 
 
-def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:
-    """The point with the largest ω_b of this κ; the judge's is lower, by its own grid."""
+def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float, *, off: float = 1e-3) -> Point:
+    """The point with the largest ω_b of this κ; the judge's is lower by its own grid, by less than
+    `off` (relative)."""
     assessment = assess(problem, kappa, tau)
     peaks = assessment.peaks
     if peaks is not None:
         rising = peaks.to_tau > 0.0
         room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=np.inf))
-        if abs(room) < LOWER_AT_MOST:
+        if abs(room) < off:
             tau += room
             assessment = assess(problem, kappa, tau)
     return Point(kappa, tau, assessment)

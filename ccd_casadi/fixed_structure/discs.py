@@ -7,14 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.fixed_structure.affine import Affine, inverse
-from ccd_casadi.fixed_structure.boxes import Axis, Pair
+from ccd_casadi.fixed_structure.boxes import FrequencyAxis, Pair
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.lti.state_space import sigma_max
 from ccd_casadi.support.arrays import Array
-
-FIRST = 1e30  # share of what is divided before anything else: where modes are not enclosed
-CANCELLED = 1e3  # times what is of first order: there the second says what to divide
-TURNS = np.exp(1j * np.pi * np.arange(-2, 3) / 4)  # half planes that 1/D is looked for in
 
 
 @dataclass(frozen=True)
@@ -28,8 +24,9 @@ class Discs:
 
 
 def discs_of(
-    plant: ModalSum, names: tuple[str, ...], low: Array, high: Array, axis: Axis, free: bool
-) -> tuple[Discs, Discs, np.ndarray]:
+    plant: ModalSum, names: tuple[str, ...], low: Array, high: Array, axis: FrequencyAxis,
+    free: bool,
+) -> tuple[Discs, Discs, np.ndarray]:  # fmt: skip
     """Of all modes as the loop has them, and where `free` without hold and delay; where all
     flexible modes stay damped (N,)."""
     free &= axis.period is not None
@@ -63,8 +60,8 @@ def discs_of(
         if free:
             s = axis.s.of(len(rows))
             _fill(bare, i, rows, [(s - p, residue) for p, residue in poles], decay, strength)
-    if q:
-        held.shares[:, -q:] = np.where(known, held.shares[:, -q:], FIRST * (high - low)[-q:])
+    if q:  # where modes are not enclosed their parameters are divided before anything else
+        held.shares[:, -q:] = np.where(known, held.shares[:, -q:], 1e30 * (high - low)[-q:])
     return held, bare if free else held, damped
 
 
@@ -93,9 +90,10 @@ def _fill(
     near = ~(radius <= apart) | np.isinf(radius)
     discs.middle[i] = np.where(near, middle, whole.centre)
     discs.radius[i] = np.where(near, apart, radius) * (1.0 + 1e-12)
-    # where the first order cancels, as at rest, what is left is due to what moves the poles
+    # Where the first order cancels, as at rest, and the rest is a thousand times as large, what is
+    # left is due to what moves the poles.
     beyond = whole.rest * moves / np.maximum(moves.sum(axis=0), 1e-300)
-    beyond = np.where(whole.rest > CANCELLED * whole.reach, beyond, 0.0)
+    beyond = np.where(whole.rest > 1e3 * whole.reach, beyond, 0.0)
     discs.shares[i, rows] = np.where(near, moves, whole.reaches + beyond)
 
 
@@ -104,14 +102,16 @@ def quotient(
 ) -> tuple[np.ndarray, Array, Array]:
     """Centre and radius of a disc around N/D, and how each variable moves it (n, N); Re D >= least.
 
-    1/D lies in that of 1/D as a `form`, or where Re e^{-jθ}D >= d in the disc of diameter 1/d that
-    touches 0; N then turns and scales the latter, which keeps 0 on its edge. Around 0, |N|/d holds.
+    1/D lies in that of 1/D as a `form`, or where Re e^{-jθ}D >= d, θ = -π/2, -π/4, …, π/2, in the
+    disc of diameter 1/d that touches 0; N then turns and scales the latter, which keeps 0 on its
+    edge. Around 0, |N|/d holds.
     """
     form = inverse(D) if form is None else form
-    x, y = TURNS.real[:, None], TURNS.imag[:, None]
+    turns = np.exp(1j * np.pi * np.arange(-2, 3) / 4)  # e^{jθ}
+    x, y = turns.real[:, None], turns.imag[:, None]
     along = x[..., None] * D.slope.real + y[..., None] * D.slope.imag
     d = x * D.centre.real + y * D.centre.imag - np.abs(along).sum(1) - D.rest
-    d[len(TURNS) // 2] = np.maximum(d[len(TURNS) // 2], least)
+    d[len(turns) // 2] = np.maximum(d[len(turns) // 2], least)
     best = np.argmax(d, axis=0)
     d = d[best, np.arange(len(best))]
     half = np.where(d > 0.0, 0.5 / np.where(d > 0.0, d, 1.0), np.inf) * (1.0 + 1e-15)
@@ -125,7 +125,7 @@ def quotient(
     bent = np.where(longer < 1.0, aside / np.where(longer < 1.0, 1.0 - longer, 1.0), np.inf)
     touching = size * half * grown * (1.0 + bent)
     chosen = ~(outer <= touching)
-    edge = N.centre * TURNS[best].conj() * half * grown
+    edge = N.centre * turns[best].conj() * half * grown
     moves = D.reaches / np.where(chosen, d, D.middle) + np.abs(along)
     middle, radius = np.where(chosen, edge, N.centre * centre), np.where(chosen, touching, outer)
     plain = 2.0 * N.size * half
@@ -135,14 +135,20 @@ def quotient(
 
 
 GUARD = 64.0 * 2.2e-16  # several times what products, inverses and norms of a few rows lose
-LEAST = 1e-3  # of the largest term: by how much a term counts at least where τ is chosen
-NEAREST = 0.05  # to where P⁻¹ - N is singular: the first guess stays so far away
 
 
 @dataclass(frozen=True)
-class Terms:
-    """n terms of N boxes: `radius` (N, n), `columns` c (n, p), `rows` q (N, n, p) and `inputs` b
-    (n, m), one of which is 0; by default b is."""
+class RankOneDiscs:
+    """Σ δ_i c_i q_iᵀ, |δ_i| <= radius_i, of n terms on N boxes.
+
+    Attributes
+    ----------
+    columns, rows : array (n, p), (N, n, p)
+        c and q.
+    radius : array (N, n)
+    inputs : array (n, m), optional
+        b, where a term adds δ_i c_i b_iᵀ; q or b is 0, by default b is.
+    """
 
     columns: Array
     rows: np.ndarray
@@ -150,11 +156,39 @@ class Terms:
     inputs: Array | None = None
 
     def pushes(self, B: np.ndarray, Z: np.ndarray) -> Array:
-        """How far each moves e per radius, to first order (N, n): |B c_i|(|q_iᵀZ| + |b_i|)."""
+        """How far each moves e of `largest` per radius, to first order (N, n):
+        |B c_i|(|q_iᵀZ| + |b_i|)."""
         return _lengths(B @ self.columns.T, 1) * self._seen(self.rows @ Z)
 
     def largest(self, A: np.ndarray, B: np.ndarray, Z: np.ndarray) -> Array:
-        """γ (N,) of A (N, k, m), B (N, k, p), Z (N, p, m); infinite where none is found."""
+        """Bound ‖e‖ <= γ‖f‖ over all discs, of
+
+            e = Af + Bu,   u = Σ w_i c_i,   w_i = δ_i(q_iᵀ(Zf + u) + b_iᵀf),   |δ_i| <= r_i
+
+        so that with D = Σ δ_i c_i q_iᵀ and b = 0, e = (A + B(1 - D)⁻¹DZ)f. For every τ > 0 the sum
+        of τ_i(r_i²|q_iᵀ(Zf + u) + b_iᵀf|² - |w_i|²) is not negative. Added to ‖e‖² - γ²‖f‖², whose
+        largest value over w and u is to be 0 (S-procedure), it gives, where P⁻¹ > N,
+
+            γ² = λ_max(AᴴA + ZᴴQZ + Q_b + Xᴴ(P⁻¹ - N)⁻¹X),   X = BᴴA + QZ,   N = BᴴB + Q,
+            P = Σ c_i c_iᵀ/τ_i,   Q = Σ τ_i r_i² q̄_i q_iᵀ,   Q_b = Σ τ_i r_i² b_i b_iᵀ
+
+        as Σ τ_i|w_i|² >= uᴴP⁻¹u. With p = 1, |D| <= R = Σ r_i |c_i| |q_i| < 1, and D/(1 - D) lies
+        in the disc of centre R²/(1 - R²) and radius R/(1 - R²).
+
+        Parameters
+        ----------
+        A, B, Z : array (N, k, m), (N, k, p), (N, p, m)
+
+        Returns
+        -------
+        array (N,)
+            γ with its rounding; infinite where no τ is found with P⁻¹ > N.
+
+        References
+        ----------
+        S. Boyd, L. El Ghaoui, E. Feron and V. Balakrishnan, Linear Matrix Inequalities in System
+        and Control Theory, SIAM 1994, section 2.6.3.
+        """
         if B.shape[2] == 1:
             R = (_lengths(self.rows, 2) * np.abs(self.columns[:, 0]) * self.radius).sum(axis=1)
             good, BZ = R < 1.0, B @ Z
@@ -176,13 +210,14 @@ class Terms:
         """The lengths of what each sees of f (N, n)."""
         return _lengths(rows, 2) + (0.0 if self.inputs is None else _lengths(self.inputs, 1))
 
-    def _guess(self, gain: Array, seen: Array, size: Array) -> Array:
-        """τ (N, n) where each term moves e, of `size`, by its radius times `gain` and `seen`."""
+    def _guess(self, gain: Array, seen: Array, size: Array, *, nearest: float = 0.05) -> Array:
+        """τ (N, n) where each term moves e, of `size`, by its radius times `gain` and `seen`; not
+        closer than `nearest` to where P⁻¹ - N is singular."""
         total = size + (gain * seen * self.radius).sum(axis=1, keepdims=True)
         tau = _share(total * gain, self.radius * seen)
         P, Q, _ = self._sums(tau)
         near = np.sqrt(np.abs(np.einsum("Nab,Nba->N", P, Q)))[:, None]
-        return tau * np.where(near < np.inf, 1.0 / np.maximum(1.0 - near, NEAREST), 1.0)
+        return tau * np.where(near < np.inf, 1.0 / np.maximum(1.0 - near, nearest), 1.0)
 
     def _sums(self, tau: Array) -> tuple[Array, np.ndarray, Array | float]:
         """P, Q and Q_b (N, ·, ·)."""
@@ -239,9 +274,9 @@ def norm(M: np.ndarray, loosely: bool = False) -> Array:
     return sigma_max(M)
 
 
-def _share(above: Array, below: Array) -> Array:
-    """The quotient, terms that are far smaller than others as if they were not."""
-    parts = (part + LEAST * part.max(axis=1, keepdims=True) + 1e-300 for part in (above, below))
+def _share(above: Array, below: Array, *, least: float = 1e-3) -> Array:
+    """The quotient; a term counts as the share `least` of the largest at least."""
+    parts = (part + least * part.max(axis=1, keepdims=True) + 1e-300 for part in (above, below))
     above, below = parts
     found = above / below
     return np.where(np.isfinite(found), np.clip(found, 1e-100, 1e100), 1.0)

@@ -1,41 +1,40 @@
 """Enclosures of S, KS, T and GS over a range of frequencies and a box of uncertain parameters.
 
 At one frequency each mode enters the plant once, with a matrix of rank one, so that the set of
-plants is a sum of one region per mode. Each is enclosed by a disc (`mode_discs`); the work grows
+plants is a sum of one region per mode. Each is enclosed by a disc (`discs_of`); the work grows
 with their number and not with that of the boxes' corners. With K = K̂/y and W = M⁻¹,
 
     S = yW,  KS = K̂W,  T = W GK̂,  GS = yW G,   M = y + GK̂,  G = Σ_i g_i c_i b_iᵀ.
 
-Free bodies are infinite at 0 Hz, and far above all else beside it: up to ω_low what `_at_rest`
-finds holds, too.
-
-The largest norms over all discs are those of `largest_norm`: every disc counts along its own
-direction, so that modes which move one channel leave the others alone, and to all orders. What y
-and K̂ differ by are Δ in M and a factor 1 + E of K̂. With M₁ = M + Δ of any M of the discs,
-
-    S₁ - S = T - T₁ = M₁⁻¹(Δ_y T - Δ_GK S),   S₂ = (1 + T₁E)⁻¹S₁,   T₂ = T₁ + T₁E S₂.
-
-A box is divided along what moves M, of several outputs the figure furthest above its bound.
-
-y is that of `boxes`. Where M is regular on the whole axis for all of a connected set of plants, no
-pole crosses it: they are all stable or none is (zero exclusion).
+`LoopFamily.enclose` has the chain of inequalities from the discs to the figures. y is that of
+`boxes`. Free bodies are infinite at 0 Hz, and far above all else beside it: up to ω_low what
+`_at_rest` finds holds, too. Where M is regular on the whole axis for all of a connected set of
+plants, no pole crosses it: they are all stable or none is (zero exclusion).
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.boxes import Axis, Boxes, Chart, axis_of, gain_of
-from ccd_casadi.fixed_structure.discs import GUARD, Terms, discs_of, norm
+from ccd_casadi.fixed_structure.boxes import Boxes, Chart, FrequencyAxis, axis_of, gain_of
+from ccd_casadi.fixed_structure.discs import GUARD, Discs, RankOneDiscs, discs_of, norm
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.support.arrays import Array
 
 Range = tuple[Array, Array]  # not below a figure anywhere on a box, and not above it
-RANK = 1e-9  # relative: directions of the outputs that free bodies move by less are not moved
-FAR = 0.5  # relative: a gain that moves more over a box is bounded, not followed
-ENDLESS = 1e100  # rad/s: where weights are at their ends
+
+
+@dataclass(frozen=True)
+class EnclosureOptions:
+    """Numbers of the enclosures."""
+
+    rank: float = 1e-9  # relative: free bodies do not move outputs along directions below it
+    followed_gain: float = 0.5  # relative: a gain that moves more over a box is bounded only
+    wide_discs: float = 0.5  # their sum over ‖M‖ above which parameters are divided before ω
+    largest_frequency: float = 1e100  # rad/s: weights and shapes are at their ends there
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,153 @@ class Enclosures:
     lowest: Array
     spread: Array
     bounded: np.ndarray
+
+
+class FigureBounds(NamedTuple):
+    """A norm on N boxes: at most `upper`, at least `lower` (N,), and what makes it uncertain: each
+    disc by `by_disc` per radius (N, n), to first order, and all else by `beside` (N,)."""
+
+    upper: Array
+    lower: Array
+    by_disc: Array
+    beside: Array
+
+
+@dataclass(frozen=True)
+class LoopDiscs:
+    """The loops of N boxes with every mode in a disc, by the numbers of `LoopFamily.enclose`.
+
+    Attributes
+    ----------
+    held, free : Discs
+        The n modes with and without hold and delay, as `discs_of` has them.
+    m, r, g, e : array (N, n)
+        Middles and radii of `held`, then of `free`; 0 where a box is not `good`.
+    c, b : array (n, p), (n, m)
+        The modes' directions of outputs and inputs.
+    K : array (N, m, p)
+        K_c.
+    finite, good : array (n, N), (N,)
+        Which discs are finite; where every inequality of the chain holds.
+    y, y_max, delta_y : array (N,)
+        y_c, max |y|, and δ_y of (3).
+    epsilon, grain : array (N,)
+        ε of (7); the norm of the part of K̂ that is bounded only.
+    terms : RankOneDiscs
+        M_d = y_c + Σ g_i c_i b_iᵀK_c as M_c and its discs; `rows` are b_iᵀK_c W.
+    W, w : array (N, p, p), (N,)
+        (1)
+    a, delta_GK, a1, t, u1, q, a2, u2, d : array (N,)
+        (2) to (10)
+    """
+
+    held: Discs
+    free: Discs
+    m: Array
+    r: Array
+    g: np.ndarray
+    e: Array
+    c: Array
+    b: Array
+    K: np.ndarray
+    finite: np.ndarray
+    good: np.ndarray
+    y: np.ndarray
+    y_max: Array
+    delta_y: Array
+    epsilon: Array
+    grain: Array
+    terms: RankOneDiscs
+    W: np.ndarray
+    w: Array
+    a: Array
+    delta_GK: Array
+    a1: Array
+    t: Array
+    u1: Array
+    q: Array
+    a2: Array
+    u2: Array
+    d: Array
+
+    @property
+    def unit(self) -> Array:
+        """1 (N, p, p)."""
+        return np.tile(np.eye(self.W.shape[1]), (len(self.w), 1, 1))
+
+    @property
+    def yW(self) -> np.ndarray:
+        """S at the middles of all discs (N, p, p)."""
+        return np.asarray(self.y[:, None, None] * self.W)
+
+    @property
+    def off_middle(self) -> Array:
+        """‖S₂ - y_c W‖ and ‖T₂ - (1 - y_c W)‖ (N,) at most, by (9) and (10)."""
+        return np.asarray(np.abs(self.y) * self.a * self.d + self.u2)
+
+    def S(self) -> FigureBounds:
+        """Enclose ‖S₂‖ by (11)."""
+        size = np.abs(self.y)
+        upper = np.fmin(size * self.a + self.u2, self.y_max * self.a2)
+        by_disc = size[:, None] * self.terms.pushes(self.W, self.unit)
+        return FigureBounds(upper, size * self.w - self.off_middle, by_disc, self.u2)
+
+    def T(self) -> FigureBounds:
+        """Enclose ‖T₂‖ by (12)."""
+        rounding = GUARD * (1.0 + np.abs(self.y) * self.w)
+        lower = norm(self.unit - self.yW) - rounding - self.off_middle
+        return FigureBounds(self.t + self.u2, lower, self.terms.pushes(self.yW, self.unit), self.u2)
+
+    def KS(self) -> FigureBounds:
+        """Enclose ‖K̂M₂⁻¹‖ by (13) to (16)."""
+        KW, rounding = self.K @ self.W, GUARD * norm(self.K) * self.w
+        k = self.terms.largest(KW, KW, self.unit) + rounding
+        k1 = k * (1.0 + self.a1 * (self.delta_GK + self.delta_y))
+        v = self.epsilon * self.a2 * (norm(self.K) + k1 * (self.y_max + self.delta_GK))
+        least = norm(KW) - rounding - k * self.d - k1 + k - v
+        lower = (1.0 - self.epsilon) * least - self.grain * self.a2
+        upper = (1.0 + self.epsilon) * (k1 + v) + self.grain * self.a2
+        return FigureBounds(upper, lower, self.terms.pushes(KW, self.unit), upper - k)
+
+    def GS(self) -> FigureBounds:
+        """Enclose ‖yM₂⁻¹G‖ by (17) to (19)."""
+        c, b, rows = self.c, self.b, self.terms.rows
+        G = (c.T * self.g[:, None]) @ b
+        WG, by_all = self.W @ G, _lengths(c) * _lengths(b)
+        rounding = GUARD * self.w * (np.abs(self.g) @ by_all)
+        both = RankOneDiscs(
+            np.concatenate([c, c]), np.concatenate([rows, 0.0 * rows], axis=1),
+            np.concatenate([self.r, self.e], axis=1), np.concatenate([0.0 * b, b]),
+        )  # fmt: skip
+        h = both.largest(WG, self.W, G) + rounding
+        moved = self.a1 * (self.delta_GK + self.delta_y)
+        d_G = self.e @ by_all + (self.r * _lengths(c) * _lengths(rows @ G)).sum(axis=1)
+        least = np.abs(self.y) * (norm(WG) - rounding - self.a * d_G)
+        least = least - (self.delta_y + self.y_max * moved) * h
+        upper = self.y_max * h * (1.0 + moved) / (1.0 - self.q)
+        by_disc = both.pushes(self.W, G)
+        return FigureBounds(upper, least / (1.0 + self.q), by_disc, (moved + self.q) * h)
+
+    def spread(self, worst: np.ndarray, figures: dict[str, FigureBounds]) -> Array:
+        """How much each coordinate moves the loop (1 + n_p, N): along what moves M, of several
+        outputs the figure `worst` (N,) that is furthest above its bound."""
+        n, rows = len(self.c), self.terms.rows
+        weight = _lengths(self.c) * _lengths(self.b @ self.K)
+        own = self.r * np.abs(np.einsum("Nip,ip->Ni", rows, self.c))  # near 1 it moves 1/M less
+        weight = weight * np.where(own < 1.0, (1.0 - own) / (1.0 + own), 1.0)
+        weight = np.where(np.tile(self.finite.T, 2), np.tile(weight, 2), 1.0)
+        weight[:, n:] = 0.0
+        rest = self.delta_y + self.y_max * self.epsilon
+        for name, figure in figures.items():
+            here = self.good & (worst == name)
+            weight[here, : figure.by_disc.shape[1]] = figure.by_disc[here]
+            rest[here] = np.where(np.isfinite(figure.beside), figure.beside, 0.0)[here]
+        found = np.zeros_like(self.held.shares[0])
+        for by, discs in ((weight[:, :n], self.held), (weight[:, n:], self.free)):
+            shares = np.where(np.isfinite(discs.shares), discs.shares, 0.0)
+            found += np.einsum("Ni,ikN->kN", by, shares)
+        found[0] += rest
+        return found
 
 
 @dataclass(frozen=True)
@@ -71,10 +217,59 @@ class LoopFamily:
     unit: float
     period: float | None
     delay: float
+    options: EnclosureOptions = EnclosureOptions()
 
     def enclose(self, boxes: Boxes) -> Enclosures:
-        """All bounds on all boxes."""
-        found = self._on_the_way(boxes)
+        """Enclose every figure over its bound on every box.
+
+        On one box y = y_c + Δ_y, g_i lies in the disc of middle m_i and radius r_i, and
+        K̂ = K_c(1 + E) + F, or (1 + E')K_c + F, where F has the channels whose gain is bounded
+        only; E is 0 there, F elsewhere. M₂ = y + GK̂ is reached from the discs alone in two steps:
+
+            M_d = y_c + Σ g_i c_i b_iᵀK_c,   M₁ = M_d + Δ_y + Δ_GK,   M₂ = M₁(1 + T₁E)
+
+        with Δ_GK = GF and the rounding of M and W, S_d = y_c M_d⁻¹, S₁ = yM₁⁻¹, S₂ = yM₂⁻¹ and
+        T = 1 - S of each. Largest singular values then keep, on the box,
+
+            (1)   W = M_d⁻¹ at the middles of all discs,   w = ‖W‖
+            (2)   ‖M_d⁻¹‖ <= a                                        `RankOneDiscs.largest`
+            (3)   |Δ_y| <= δ_y,   ‖Δ_GK‖ <= δ_GK,   δ = δ_y + δ_GK
+            (4)   ‖M₁⁻¹‖ <= a₁ = a/(1 - aδ)                           where aδ < 1
+            (5)   ‖T_d‖ <= t                                          `RankOneDiscs.largest`
+            (6)   ‖S₁ - S_d‖ = ‖T₁ - T_d‖ <= u₁ = a₁(|y_c| a δ_GK + t δ_y)
+            (7)   ‖T₁E‖ <= q = ε(t + u₁),   ‖E‖, ‖E'‖ <= ε             where q < 1
+            (8)   ‖M₂⁻¹‖ <= a₂ = a₁/(1 - q)
+            (9)   ‖S₂ - S_d‖ = ‖T₂ - T_d‖ <= u₂ = u₁ + q max|y| a₂
+            (10)  ‖M_d⁻¹ - W‖ <= ad,   d = Σ r_i |c_i| |b_iᵀK_c W|
+
+        by (4) a Neumann series, (6) S₁ - S_d = M₁⁻¹(Δ_y T_d - Δ_GK S_d), (8) M₂⁻¹ =
+        (1 + T₁E)⁻¹M₁⁻¹, (9) S₁ - S₂ = T₁E S₂, (10) M_d⁻¹ - W = M_d⁻¹(M_c - M_d)W. The figures:
+
+            (11)  |y_c| w - |y_c| ad - u₂ <= ‖S₂‖ <= min(|y_c| a + u₂, max|y| a₂)
+            (12)  ‖1 - y_c W‖ - |y_c| ad - u₂ <= ‖T₂‖ <= t + u₂
+            (13)  ‖K_c M_d⁻¹‖ <= k                                    `RankOneDiscs.largest`
+            (14)  ‖K_c M₁⁻¹‖ <= k₁ = k(1 + a₁δ)
+            (15)  ‖K_c T₁E M₂⁻¹‖ <= v = ε a₂(‖K_c‖ + k₁(max|y| + δ_GK))
+            (16)  ‖K̂M₂⁻¹‖ <= (1 + ε)(k₁ + v) + ‖F‖a₂,
+                  ‖K̂M₂⁻¹‖ >= (1 - ε)(‖K_c W‖ - kd - (k₁ - k) - v) - ‖F‖a₂
+            (17)  ‖M_d⁻¹G‖ <= h,   G in its discs, of radius e_i      `RankOneDiscs.largest`
+            (18)  ‖yM₂⁻¹G‖ <= max|y| h(1 + a₁δ)/(1 - q)
+            (19)  ‖yM₂⁻¹G‖ >= (|y_c|(‖WG_c‖ - a d_G) - (δ_y + max|y| a₁δ)h)/(1 + q),
+                  d_G = Σ e_i |c_i| |b_i| + Σ r_i |c_i| |b_iᵀK_c W G_c|
+
+        each lower bound, k and h less or more the rounding of its matrix, `GUARD` times its size.
+
+        Parameters
+        ----------
+        boxes : Boxes
+            N boxes of frequency (by their charts) and of the parameters `names`.
+
+        Returns
+        -------
+        Enclosures
+            Infinite above and 0 below where an inequality above does not hold.
+        """
+        found = self._with_finite_modes(boxes)
         slow = self.bounds.omega_low / self.unit * (self.period or 1.0)
         near = (boxes.low[0] == 0.0) | (boxes.high[0] <= slow)
         near &= np.isin(boxes.chart, (Chart.LOW, Chart.SAMPLED))
@@ -88,23 +283,94 @@ class LoopFamily:
         bounded[near] |= rest.bounded
         return Enclosures(found.names, highest, found.lowest, spread, bounded)
 
+    def _with_finite_modes(self, boxes: Boxes) -> Enclosures:
+        """The figures of (11) to (19) over their bounds, on boxes on which every mode is finite."""
+        loop = self._loop_discs(boxes)
+        compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
+        figures = {"S": loop.S(), "T": loop.T()}
+        found = self._of_S(boxes, figures["S"][:2], loop.a2)
+        if level is not None:
+            figures["KS"] = loop.KS()
+            found += self._weighted(boxes, level, figures["KS"][:2], figures["T"][:2])
+        if compliance is not None:
+            figures["GS"] = loop.GS()
+            upper, lower, *_ = figures["GS"]
+            limit = compliance * self._inside(boxes)
+            found.append(("GS", upper / limit, lower / limit))
+        names, most_at, least_at = zip(*found, strict=True)
+        highest, lowest = np.array(most_at), np.array(least_at)
+        highest = np.where(loop.good & ~np.isnan(highest), highest, np.inf)
+        lowest = np.where(loop.good & np.isfinite(lowest), lowest, 0.0)
+        of = np.array([name if name in figures else "S" for name in names])
+        several = figures if len(self.outputs) > 1 else {}
+        spread = loop.spread(of[np.argmax(highest, axis=0)], several)
+        return Enclosures(names, highest, lowest, spread, loop.good)
+
+    def _loop_discs(self, boxes: Boxes) -> LoopDiscs:
+        """(1) to (10) on boxes; where one of them does not hold it is one that does."""
+        axis = axis_of(boxes, self.period, self.delay)
+        held, free, damped = self._discs(boxes, axis)
+        gains, epsilon, bounded, grain = self._gains(axis)
+        finite = np.isfinite(held.middle + held.radius + free.middle + free.radius)
+        good = finite.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
+        y, y_max, delta_y = self._y(axis)
+        K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
+        c, b = self.plant.reading, self.plant.drive
+        rows = b @ K
+        m, r, g, e = (np.where(good, part, 0.0).T
+                      for part in (held.middle, held.radius, free.middle, free.radius))  # fmt: skip
+        unit = np.tile(np.eye(c.shape[1]), (len(good), 1, 1))
+        M = y[:, None, None] * unit + (c.T * m[:, None]) @ rows
+        good &= np.linalg.det(M) != 0.0
+        W = np.linalg.inv(np.where(good[:, None, None], M, unit))
+        w, yW = norm(W), y[:, None, None] * W
+        terms = RankOneDiscs(c, rows @ W, r)
+        # (3): what is bounded only, and the rounding of M and W
+        each = _lengths(c)[:, None] * np.abs(b @ self.inputs) * np.linalg.norm(self.outputs, axis=0)
+        sizes = np.abs(y) + ((np.abs(m) + r) * (_lengths(c) * _lengths(rows))).sum(axis=1)
+        delta_GK = np.einsum("Ni,ic,Nc->N", np.abs(m) + r, each, bounded)
+        delta_GK += GUARD * sizes * (1.0 + sizes * w)
+        a = terms.largest(W, W, unit)  # (2)
+        good &= damped & (a * (delta_GK + delta_y) < 1.0)
+        a = np.where(good, a, 1.0)
+        a1 = a / np.where(good, 1.0 - a * (delta_GK + delta_y), 1.0)  # (4)
+        t = terms.largest(unit - yW, -yW, unit) + GUARD * (1.0 + np.abs(y) * w)  # (5)
+        u1 = a1 * (np.abs(y) * a * delta_GK + t * delta_y)  # (6)
+        q = epsilon * (t + u1)  # (7)
+        good &= q < 1.0
+        q = np.where(good, q, 0.0)
+        a2 = a1 / (1.0 - q)  # (8)
+        u2 = u1 + q * y_max * a2  # (9)
+        d = (r * _lengths(c) * _lengths(terms.rows)).sum(axis=1)  # (10)
+        return LoopDiscs(
+            held, free, m, r, g, e, c, b, K, finite, good, y, y_max, delta_y, epsilon, grain, terms,
+            W, w, a, delta_GK, a1, t, u1, q, a2, u2, d,
+        )  # fmt: skip
+
     def _at_rest(self, boxes: Boxes) -> Enclosures:
         """The same, upper bounds alone, on boxes at rest, of a plant with free bodies.
 
         G = G_r + F, G_r = R/s². With P the projection on what free bodies do not move, P R = 0, and
-        q = y²/μ, μ the size of y² G_r K̂, N = q(1 - P) + P, so that N G_r = q G_r is finite, M is
-        taken times N:
+        q = max|y|²/μ, μ the size of y² G_r K̂, N = q(1 - P) + P, so that N G_r = q G_r is finite,
+        M is taken times N, ‖N‖ <= n = max(q, ‖P‖):
 
-            M = y N + q G_r K̂ + N F K̂,   |M - y P - (q G_r + P F) K̂| <= |q| (|y| + |F K̂|)
+            NM = y N + q G_r K̂ + N F K̂,   M_d = y_c P + (q G_r + P F) K_c on the discs
 
-        S = y M⁻¹N,  KS = K̂ M⁻¹N,  T = 1 - S,  GS = y M⁻¹N G;   |N| <= max(|q|, |P|)
+            (1)  W = M_d⁻¹ at the middles,   ‖M_d⁻¹‖ <= a
+            (2)  ‖NM - M_d‖ <= δ = q(max|y| + Σ_F (|m_i| + r_i) |c_i| |b_iᵀK_c|) + ‖P‖δ_y + ...
+            (3)  ‖(NM₁)⁻¹‖ <= a₁ = a/(1 - aδ)                         where aδ < 1
+            (4)  ‖T₁E‖ <= ε(1 + max|y| n a₁),   T₁ = 1 - y(NM₁)⁻¹N     where that is below 1
+            (5)  ‖(NM₂)⁻¹N‖ <= a₂ = n a₁/(1 - ε(1 + max|y| n a₁))
+
+            ‖S‖ <= max|y| a₂,  ‖K̂S/y‖ <= ((1 + ε)‖K_c‖ + ‖F_K‖)a₂,  ‖T‖ <= 1 + ‖S‖,
+            ‖GS‖ <= max|y| a₂/n (‖q G_r‖ + n‖F‖)
+
+        with F_K the gains that are bounded only; δ has their part and the rounding, too.
         """
         axis = axis_of(boxes, self.period, self.delay, at_rest=True)
         compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
-        held, free, damped = discs_of(
-            self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
-        )
-        gains, loose, faint = self._gains(axis)
+        held, free, damped = self._discs(boxes, axis)
+        gains, epsilon, _, grain = self._gains(axis)
         finite = np.isfinite(held.middle + held.radius + free.middle + free.radius).all(axis=0)
         good = finite & np.isfinite(gains).all(axis=1) & damped
         m, r, g, e = (np.where(good, part, 0.0).T
@@ -112,48 +378,44 @@ class LoopFamily:
         K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
         c, b, rigid = self.plant.reading, self.plant.drive, self.plant.rigid
         U, s, _ = np.linalg.svd(c[rigid].T, full_matrices=False)
-        U = U[:, s > RANK * s[0]]
+        U = U[:, s > self.options.rank * s[0]]
         unit = np.eye(c.shape[1])
         P = unit - U @ U.T
-        held_too = float(U.shape[1] < len(unit))  # |P|
-        size = norm((c[rigid].T * m[:, None, rigid]) @ (b @ K)[:, rigid])
-        good &= size > 0.0
-        size = np.where(good, size, 1.0)
+        P_norm = float(U.shape[1] < len(unit))
+        mu = norm((c[rigid].T * m[:, None, rigid]) @ (b @ K)[:, rigid])
+        good &= mu > 0.0
+        mu = np.where(good, mu, 1.0)
         for part in (m, r, g, e):
-            part[:, rigid] /= size[:, None]
-        q = axis.y.size**2 / size
-        n = np.maximum(q, held_too)
+            part[:, rigid] /= mu[:, None]
+        q = axis.y.size**2 / mu
+        n = np.maximum(q, P_norm)
         columns = np.where(rigid[:, None], c, c @ P)
         rows, one = b @ K, np.ones(len(good))
-        y, most, moved = one, one, 0.0 * one
-        if self._integrator:
-            y, most, moved = axis.y.centre, axis.y.size, axis.y.reach + axis.y.rest
+        y, y_max, delta_y = self._y(axis)
         M = y[:, None, None] * P + (columns.T * m[:, None]) @ rows
         good &= np.linalg.det(M) != 0.0
         W = np.linalg.inv(np.where(good[:, None, None], M, unit))
         sizes = (np.abs(m) + r) * _lengths(c) * _lengths(rows)
-        unknown = q * (most + sizes[:, ~rigid].sum(axis=1)) + held_too * moved
-        grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
-        unknown += grain * ((np.abs(m) + r) * _lengths(c) * _lengths(b)).sum(axis=1)
-        total = sizes.sum(axis=1) + held_too * np.abs(y)
-        unknown += GUARD * total * (1.0 + total * norm(W))
+        delta = q * (y_max + sizes[:, ~rigid].sum(axis=1)) + P_norm * delta_y  # (2)
+        delta += grain * ((np.abs(m) + r) * _lengths(c) * _lengths(b)).sum(axis=1)
+        total = sizes.sum(axis=1) + P_norm * np.abs(y)
+        delta += GUARD * total * (1.0 + total * norm(W))
         ones = np.tile(unit, (len(good), 1, 1))
-        a = Terms(columns, rows @ W, r, None).largest(W, W, ones)
-        good &= a * unknown < 1.0
-        after = np.where(good, a, 1.0) / np.where(good, 1.0 - a * unknown, 1.0)
-        loose = loose * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
-        by = loose * (1.0 + most * n * after)  # of T₁E
-        good &= by < 1.0
-        over = n * after / np.where(good, 1.0 - by, 1.0)  # ‖M⁻¹N‖
-        S, none = most * over, 0.0 * one
-        found = self._of_S(boxes, (S, none), over)
+        a = RankOneDiscs(columns, rows @ W, r, None).largest(W, W, ones)  # (1)
+        good &= a * delta < 1.0
+        a1 = np.where(good, a, 1.0) / np.where(good, 1.0 - a * delta, 1.0)  # (3)
+        T1E = epsilon * (1.0 + y_max * n * a1)  # (4)
+        good &= T1E < 1.0
+        a2 = n * a1 / np.where(good, 1.0 - T1E, 1.0)  # (5)
+        S, none = y_max * a2, 0.0 * one
+        found = self._of_S(boxes, (S, none), a2)
         if level is not None:
-            KS = ((1.0 + loose) * norm(K) + grain) * over
+            KS = ((1.0 + epsilon) * norm(K) + grain) * a2
             found += self._weighted(boxes, level, (KS, none), (1.0 + S, none))
         if compliance is not None:
             G = (np.abs(g) + e) * _lengths(c) * _lengths(b)
             NG = G[:, rigid].sum(axis=1) + n * G[:, ~rigid].sum(axis=1)
-            GS = most * over / n * NG / (compliance * self._inside(boxes))
+            GS = y_max * a2 / n * NG / (compliance * self._inside(boxes))
             found.append(("GS", GS, none))
         most_at = np.array([most_of for _, most_of, _ in found])
         highest = np.where(good & np.isfinite(most_at), most_at, np.inf)
@@ -161,108 +423,10 @@ class LoopFamily:
         shares = np.where(np.isfinite(held.shares), held.shares, 0.0)
         spread = np.einsum("Ni,ikN->kN", weight, shares)
         # Figures fall with ω; what is not bounded is so by ω, too, unless the discs are wide.
-        wide = ~good & ((r * weight).sum(axis=1) > FAR * norm(M))
-        spread[0] += np.where(wide, unknown, unknown + spread.sum(axis=0) + 1e-300)
+        wide = ~good & ((r * weight).sum(axis=1) > self.options.wide_discs * norm(M))
+        spread[0] += np.where(wide, delta, delta + spread.sum(axis=0) + 1e-300)
         names = tuple(name for name, *_ in found)
         return Enclosures(names, highest, np.zeros_like(highest), spread, good)
-
-    def _on_the_way(self, boxes: Boxes) -> Enclosures:
-        """The same on boxes on which every mode is finite."""
-        axis = axis_of(boxes, self.period, self.delay)
-        compliance, level = self.bounds.compliance_max, self.bounds.weighted_level
-        held, free, damped = discs_of(
-            self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance is not None
-        )
-        gains, loose, faint = self._gains(axis)
-        finite = np.isfinite(held.middle + held.radius + free.middle + free.radius)
-        good = finite.all(axis=0) & np.isfinite(gains).all(axis=1) & np.isfinite(axis.y.rest)
-        one = np.ones(len(good))
-        y, moved, most = one, 0.0 * one, one
-        if self._integrator:
-            y, moved, most = axis.y.centre, axis.y.reach + axis.y.rest, axis.y.size
-        K = np.einsum("mc,Nc,pc->Nmp", self.inputs, np.where(good, gains.T, 0.0).T, self.outputs)
-        c, b = self.plant.reading, self.plant.drive
-        rows = b @ K
-        m, r, g, e = (np.where(good, part, 0.0).T
-                      for part in (held.middle, held.radius, free.middle, free.radius))  # fmt: skip
-        weight = _lengths(c) * _lengths(rows)
-        unit = np.tile(np.eye(c.shape[1]), (len(good), 1, 1))
-        y_unit = y[:, None, None] * unit
-        M = y_unit + (c.T * m[:, None]) @ rows
-        sizes = np.abs(y) + ((np.abs(m) + r) * weight).sum(axis=1)
-        good &= np.linalg.det(M) != 0.0
-        W = np.linalg.inv(np.where(good[:, None, None], M, unit))
-        yW, KW = y[:, None, None] * W, K @ W
-        # what is left of Δ besides the discs, with the rounding of M and W; then E
-        grain = np.linalg.norm(faint, axis=1) * norm(self.inputs) * norm(self.outputs)
-        apart = (
-            _lengths(c)[:, None] * np.abs(b @ self.inputs) * np.linalg.norm(self.outputs, axis=0)
-        )
-        faintly = np.einsum("Ni,ic,Nc->N", np.abs(m) + r, apart, faint)
-        w, k = norm(W), norm(KW)
-        faintly += GUARD * sizes * (1.0 + sizes * w)
-        discs = Terms(c, rows @ W, r)
-        a = discs.largest(W, W, unit)
-        good &= damped & (a * (faintly + moved) < 1.0)
-        a = np.where(good, a, 1.0)
-        after = a / np.where(good, 1.0 - a * (faintly + moved), 1.0)  # ‖M₁⁻¹‖
-        loose = loose * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
-        T_most = discs.largest(unit - yW, -yW, unit) + GUARD * (1.0 + np.abs(y) * w)
-        unknown = after * (np.abs(y) * a * faintly + T_most * moved)  # of S and T
-        by = loose * (T_most + unknown)  # of T₁E
-        good &= by < 1.0
-        by = np.where(good, by, 0.0)
-        over = after / (1.0 - by)
-        unknown += by * most * over
-        aside = (r * _lengths(c) * _lengths(discs.rows)).sum(axis=1)
-        near = np.abs(y) * a * aside + unknown
-        pushes = {"S": (np.abs(y)[:, None] * discs.pushes(W, unit), unknown),
-                  "T": (discs.pushes(yW, unit), unknown)}  # fmt: skip
-        upper = np.fmin(np.abs(y) * a + unknown, most * over)
-        found = self._of_S(boxes, (upper, np.abs(y) * w - near), over)
-        if level is not None:
-            lost = GUARD * norm(K) * w
-            size = discs.largest(KW, KW, unit) + lost
-            first = size * (1.0 + after * (faintly + moved))
-            turned = loose * over * (norm(K) + first * (most + faintly))  # of K̂T₁E M₂⁻¹
-            lower = (1.0 - loose) * (k - lost - size * aside - first + size - turned) - grain * over
-            upper = (1.0 + loose) * (first + turned) + grain * over
-            T = T_most + unknown, norm(unit - yW) - GUARD * (1.0 + np.abs(y) * w) - near
-            found += self._weighted(boxes, level, (upper, lower), T)
-            pushes["KS"] = discs.pushes(KW, unit), upper - size
-        if compliance is not None:
-            G = (c.T * g[:, None]) @ b
-            WG, by_all = W @ G, _lengths(c) * _lengths(b)
-            lost, other = GUARD * w * (np.abs(g) @ by_all), after * (faintly + moved)
-            both = Terms(
-                np.concatenate([c, c]), np.concatenate([discs.rows, 0.0 * discs.rows], axis=1),
-                np.concatenate([r, e], axis=1), np.concatenate([0.0 * b, b]),
-            )  # fmt: skip
-            h = both.largest(WG, W, G) + lost
-            aside = e @ by_all + (r * _lengths(c) * _lengths(discs.rows @ G)).sum(axis=1)
-            lower = np.abs(y) * (norm(WG) - lost - a * aside) - (moved + most * other) * h
-            upper, inside = most * h * (1.0 + other), compliance * self._inside(boxes)
-            found.append(("GS", upper / (1.0 - by) / inside, lower / (1.0 + by) / inside))
-            pushes["GS"] = both.pushes(W, G), (other + by) * h
-        names, most_at, least_at = zip(*found, strict=True)
-        highest, lowest = np.array(most_at), np.array(least_at)
-        highest = np.where(good & ~np.isnan(highest), highest, np.inf)
-        lowest = np.where(good & np.isfinite(lowest), lowest, 0.0)
-        # what moves the loop: of several outputs the figure that is furthest above its bound
-        of = np.array([name if name in pushes else "S" for name in names])
-        own = r * np.abs(np.einsum("Nip,ip->Ni", discs.rows, c))  # near 1 a disc moves 1/M less
-        weight = weight * np.where(own < 1.0, (1.0 - own) / (1.0 + own), 1.0)
-        worst, n = of[np.argmax(highest, axis=0)], len(c)
-        weight = np.where(np.tile(finite.T, 2), np.tile(weight, 2), 1.0)
-        weight[:, n:], rest = 0.0, moved + most * loose
-        for name, (by_disc, beside) in (pushes if len(self.outputs) > 1 else {}).items():
-            here, beside = good & (worst == name), np.where(np.isfinite(beside), beside, 0.0)
-            weight[here, : by_disc.shape[1]], rest[here] = by_disc[here], beside[here]
-        spread = np.zeros_like(held.shares[0])
-        for by, own in ((weight[:, :n], held.shares), (weight[:, n:], free.shares)):
-            spread += np.einsum("Ni,ikN->kN", by, np.where(np.isfinite(own), own, 0.0))
-        spread[0] += rest
-        return Enclosures(names, highest, lowest, spread, good)
 
     @property
     def _integrator(self) -> bool:
@@ -270,29 +434,45 @@ class LoopFamily:
         known = [own.integrator for own, _ in self.parts]
         return any(known) if len(self.outputs) == 1 else all(known)
 
-    def _gains(self, axis: Axis) -> tuple[np.ndarray, Array, Array]:
-        """K̂ of every channel in the middle (N, c), and how far K̂ lies from it at most, relative
-        (N,); where that is far, as at infinity, the middle is 0 and |K̂| is in the last (N, c).
+    def _discs(self, boxes: Boxes, axis: FrequencyAxis) -> tuple[Discs, Discs, np.ndarray]:
+        """`discs_of` the modes on boxes, those without hold and delay where GS is bounded."""
+        compliance = self.bounds.compliance_max is not None
+        return discs_of(self.plant, self.names, boxes.low[1:], boxes.high[1:], axis, compliance)
+
+    def _y(self, axis: FrequencyAxis) -> tuple[np.ndarray, Array, Array]:
+        """y_c, max |y| and δ_y (N,); y is 1 without an integrator."""
+        if self._integrator:
+            return axis.y.centre, axis.y.size, axis.y.reach + axis.y.rest
+        one = np.ones(len(axis.y.rest))
+        return one, one, 0.0 * one
+
+    def _gains(self, axis: FrequencyAxis) -> tuple[np.ndarray, Array, Array, Array]:
+        """K̂ of every channel in the middle (N, c); ε (N,), by the largest relative distance of K̂
+        from it; and where that is far, as at infinity, the middle is 0 and |K̂| is in the third
+        (N, c), whose norm, that of F, is the last (N,).
 
         Where several channels share an output, E would not be a factor of theirs alone: how far
-        they lie from the middle is in the last too."""
-        found, faint, loose = [], [], np.zeros(len(axis.x.centre))
+        they lie from the middle is in the third too."""
+        found, bounded, epsilon = [], [], np.zeros(len(axis.x.centre))
         own = self.outputs.shape[0] == self.outputs.shape[1]
         for structure, kappa in self.parts:
             K = gain_of(structure, kappa, axis, self._integrator)
             radius = K.reach + K.rest
-            near = radius < FAR * np.abs(K.centre)
+            near = radius < self.options.followed_gain * np.abs(K.centre)
             found.append(np.where(near, K.centre, 0.0))
-            faint.append(np.where(near, 0.0 if own else radius, np.abs(K.centre) + radius))
-            loose = np.maximum(loose, np.where(near & own, radius / np.abs(K.centre), 0.0))
-        return np.array(found).T, loose, np.array(faint).T
+            bounded.append(np.where(near, 0.0 if own else radius, np.abs(K.centre) + radius))
+            epsilon = np.maximum(epsilon, np.where(near & own, radius / np.abs(K.centre), 0.0))
+        epsilon = epsilon * max(np.linalg.cond(part) for part in (self.outputs, self.inputs))
+        rest = np.array(bounded).T
+        grain = np.linalg.norm(rest, axis=1) * norm(self.inputs) * norm(self.outputs)
+        return np.array(found).T, epsilon, rest, grain
 
     def _inside(self, boxes: Boxes) -> Array:
         """1, and infinite at the point that is not part of the axis."""
         return np.where(boxes.chart == Chart.POINT, np.inf, 1.0)
 
-    def _of_S(self, boxes: Boxes, S: Range, over: Array) -> list[tuple[str, Array, Array]]:
-        """(name, figure over its bound at most, at least) of every bound on S; `over`: ‖S/y‖."""
+    def _of_S(self, boxes: Boxes, S: Range, a2: Array) -> list[tuple[str, Array, Array]]:
+        """(name, figure over its bound at most, at least) of every bound on S; ‖S/y‖ <= `a2`."""
         b, inside = self.bounds, self._inside(boxes)
         low, high = boxes.omega(self.unit, self.period)
         point = boxes.chart == Chart.POINT
@@ -306,10 +486,11 @@ class LoopFamily:
         if b.shape is not None:
             until = below if b.shape_ends is ShapeEnd.CROSSING else inside
             until = np.where(low >= self.corner * (1.0 - 1e-12), np.inf, until)
-            ends = [np.clip(omega / self.bandwidth, 1e-300, ENDLESS) for omega in (low, high)]
+            top = self.options.largest_frequency
+            ends = [np.clip(omega / self.bandwidth, 1e-300, top) for omega in (low, high)]
             room = [b.room(x) * np.sqrt(0.5) / self.bandwidth * until for x in ends]
             # |y| <= ω/unit, so that near 0 |S|/ω is bounded with an integrator
-            rising = over / self.unit if self._integrator else S[0] / np.maximum(low, b.omega_low)
+            rising = a2 / self.unit if self._integrator else S[0] / np.maximum(low, b.omega_low)
             rising = np.minimum(rising, S[0] / np.maximum(low, 1e-300))
             least = S[1] / np.maximum(high, b.omega_low)
             found.append(("SHAPE", rising / room[0], least / room[1]))
@@ -320,7 +501,8 @@ class LoopFamily:
     ) -> list[tuple[str, Array, Array]]:
         """The same of KS and T; |W_KS| and |W_T| are monotone in ω."""
         assert self.bounds.weights is not None
-        ends = [np.minimum(omega, ENDLESS) for omega in boxes.omega(self.unit, self.period)]
+        top = self.options.largest_frequency
+        ends = [np.minimum(omega, top) for omega in boxes.omega(self.unit, self.period)]
         weights = np.abs([self.bounds.weights.responses(omega) for omega in ends])[:, 1:]
         limit = level * self._inside(boxes)
         return [(name, weights[:, i].max(axis=0) * most / limit,

@@ -14,7 +14,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Constraints,
     LoopCurve,
     LoopProblem,
-    Places,
+    RowPlaces,
 )
 from ccd_casadi.kernels.loop_grid import NONE, Answers, maxima, merged, second, unseen
 from ccd_casadi.kernels.loop_point import LoopArrays, close, levels, rows
@@ -22,18 +22,31 @@ from ccd_casadi.kernels.modes import form_slopes
 from ccd_casadi.lti.state_space import RootOptions
 from ccd_casadi.support.arrays import Array
 
-HIDDEN = 1e-2  # ln of the share of its bound above which a maximum between grid points is sought
-FAR = 1e3  # times the last root: there curves are what they are at infinity but for 1e-6
-APART = 1e-8  # relative: grid points that are closer count as one
-CLOSINGS = 40  # of a peak's bracket at most; most need four, a curve's kink all
-FLAT = 1e-9  # slope at a maximum
-NARROW = 1e-6  # of its first width: a bracket that is left alone, as at a kink
-# Sorted singular values may have two maxima between neighbours of the grid, where the smooth ones
-# cross, or one and a crossing, past which the slope has no change of sign: brackets of a maximum
-# above -CLOSE are looked at again at so many places and at the maximum (an even number: the middle
-# of a regular grid's bracket is the maximum itself).
-CLOSE = 0.1
-FINER = 12
+
+@dataclass(frozen=True)
+class PeakOptions:
+    """Numbers of the search for peaks; levels are ln of a gain over its bound.
+
+    Sorted singular values may have two maxima between neighbours of the grid, where the smooth ones
+    cross, or one and a crossing, past which the slope has no change of sign: brackets of a maximum
+    above -`crossing_level` are evaluated again at `crossing_points` and at the maximum (an even
+    number: the middle of a regular grid's bracket is the maximum itself).
+    """
+
+    hidden: float = 1e-2  # ln below a bound within which a maximum between grid points is sought
+    top: float = 1e3  # over the last root: curves are there what they are at infinity but for 1e-6
+    apart: float = 1e-8  # relative: grid points that are closer count as one
+    iterations: int = 40  # in a peak's bracket at most; most need four, a curve's kink all
+    slope: float = 1e-9  # at a maximum
+    width: float = 1e-6  # of its first width: a bracket that is left alone, as at a kink
+    crossing_level: float = 0.1
+    crossing_points: int = 12
+    # Lower peaks are none of ours: of several channels above that of S = I, whose singular values
+    # ripple around 1 wherever the loop has no gain.
+    depth: float = -1.0
+    depth_of_several: float = -0.4
+    near: float = 0.5  # ln below a bound within which points of the base grid count too
+    near_of_several: float = 0.4
 
 
 @dataclass(frozen=True)
@@ -48,23 +61,26 @@ class Brackets(Columns):
 
 
 def frequency_grid(
-    problem: LoopProblem, roots: np.ndarray, poles: np.ndarray
-) -> tuple[Array, np.ndarray, Answers]:
-    """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base,
-    and what the plants answer there.
+    problem: LoopProblem, roots: np.ndarray, poles: np.ndarray,
+    options: PeakOptions = PeakOptions(),
+) -> tuple[Array, np.ndarray, Answers]:  # fmt: skip
+    """The frequencies v (P, k), ascending, on which peaks are searched; which are of the base, and
+    what the plants answer there.
 
-    `roots`: the zeros and the poles of K. A loop may be faster than the base: the grid goes on past
+    `roots`: the zeros and the poles of K. A loop may be faster than the base: the grid extends past
     its last root.
     """
     fixed, base = problem.fixed, problem.base
     own, ends = roots[np.abs(roots) > 0.0], (float(base[0]), float(base[-1]))
-    v, place = merged(fixed, own, poles, np.array(RootOptions.flanks), ends, APART, FAR)
+    v, place = merged(
+        fixed, own, poles, np.array(RootOptions.flanks), ends, options.apart, options.top
+    )
     return v, (place >= 0) & (place < len(base)), Answers(place, *problem.answers)
 
 
 def local_peaks(
     loop: LoopArrays, curves: np.ndarray, v: Array, value: Array, depth: float, begin: Array,
-    end: Array,
+    end: Array, options: PeakOptions = PeakOptions(),
 ) -> Brackets:  # fmt: skip
     """The local maxima above `depth` of the levels `value` at v (P, k).
 
@@ -78,16 +94,19 @@ def local_peaks(
     found = Brackets(curves[c], i + k * P, v[i, at], low, beside[:, 1])
     if first == 1:
         return found
-    near = np.flatnonzero((value[i, at, c, k] > -CLOSE) & (found.low < found.high))
-    inside = np.geomspace(found.low[near], found.high[near], FINER, axis=1)
+    close = options.crossing_level
+    near = np.flatnonzero((value[i, at, c, k] > -close) & (found.low < found.high))
+    inside = np.geomspace(found.low[near], found.high[near], options.crossing_points, axis=1)
     inside = np.sort(np.concatenate([inside, found.start[near, None]], axis=1), axis=1)
-    level = levels(found.curve[near, None], i[near], inside, loop, -2.0 * CLOSE, NONE)
+    level = levels(found.curve[near, None], i[near], inside, loop, -2.0 * close, NONE)
     return split(found, near, inside, level[:, :, 0], P, first)
 
 
-def hidden_peaks(curves: np.ndarray, v: Array, value: Array) -> Brackets:
+def hidden_peaks(
+    curves: np.ndarray, v: Array, value: Array, options: PeakOptions = PeakOptions()
+) -> Brackets:
     """Steps of the grid near a bound in which a flat maximum may lie that no grid point shows."""
-    found, ends = unseen(value, v, -HIDDEN)
+    found, ends = unseen(value, v, -options.hidden)
     (i, c, k), (low, end) = found.T, ends.T
     return Brackets(curves[c], i + k * len(v), end, low, end)
 
@@ -122,23 +141,35 @@ def split(
     return brackets.only(kept).and_those(bracketed(known.row, own), bracketed(above, beside))
 
 
-def closed_on_peaks(loop: LoopArrays, peaks: Brackets) -> tuple[Array, np.ndarray]:
+def closed_on_peaks(
+    loop: LoopArrays, peaks: Brackets, options: PeakOptions = PeakOptions()
+) -> tuple[Array, np.ndarray]:
     """The maxima in brackets, and which of them lie inside."""
-    P = len(loop.terms)
+    P, rules = len(loop.terms), (options.slope, options.width, float(options.iterations))
     ends = (peaks.start, peaks.low, peaks.high)
     found: tuple[Array, np.ndarray] = close(
-        peaks.curve, peaks.row // P, peaks.row % P, *ends, loop, (FLAT, NARROW, float(CLOSINGS))
+        peaks.curve, peaks.row // P, peaks.row % P, *ends, loop, rules
     )
     return found
 
 
-# ln of the share of its bound under which a peak is none of ours: of several channels above that
-# of S = I, whose singular values ripple around 1 wherever the loop has no gain.
-RELEVANT, RELEVANT_OF_SEVERAL = -1.0, -0.4
-WITHIN, WITHIN_OF_SEVERAL = 0.5, 0.4
-STEP = 1e-5  # of ln v
-BESIDE = 1e-6  # of the range of a parameter of the plants: far less than a half width's worth
-UNLIKE = 0.1  # relative: mixed differences that a smooth row has alike
+@dataclass(frozen=True)
+class HessianOptions:
+    """Numbers of the rows' second derivatives.
+
+    Attributes
+    ----------
+    step : float
+        Of ln v.
+    parameter_step : float
+        Of a parameter's range: far less than a half width's worth.
+    unlike : float
+        Relative: by how much the orders of a mixed difference may disagree.
+    """
+
+    step: float = 1e-5
+    parameter_step: float = 1e-6
+    unlike: float = 0.1
 
 
 @singledispatch
@@ -149,10 +180,26 @@ def assess(
     *,
     depth: float | None = None,
     each: bool = False,
+    options: PeakOptions = PeakOptions(),
 ) -> Assessment:
-    """Stability by the eigenvalues of every loop, then the constraints with c > `depth`.
+    """Assess a controller on every plant: stability by eigenvalues, then the constraints.
 
-    `each`: the constraints of unstable loops are given too, where some are stable.
+    Parameters
+    ----------
+    problem : LoopProblem
+        Dispatches: models, parts of several channels (`composite`), measured lines.
+    kappa, tau : array (n,), float
+        κ in the problem's units; ln(ω_b/ω₀).
+    depth : float, optional
+        Constraints c > depth are found; by default that of `options`.
+    each : bool
+        The constraints of unstable loops are given too, where some loop is stable.
+    options : PeakOptions
+
+    Returns
+    -------
+    Assessment
+        Without constraints where a loop is unstable.
     """
     plants = problem.plants
     poles = closed_loops(plants, problem.structure, kappa)[0]
@@ -160,9 +207,10 @@ def assess(
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
     several = len(plants.out) > 1
-    within = WITHIN_OF_SEVERAL if several else WITHIN
-    depth = (RELEVANT_OF_SEVERAL if several else RELEVANT) if depth is None else depth
-    v, regular, answers = frequency_grid(problem, problem.roots(kappa), poles)
+    within = options.near_of_several if several else options.near
+    if depth is None:
+        depth = options.depth_of_several if several else options.depth
+    v, regular, answers = frequency_grid(problem, problem.roots(kappa), poles, options)
     P, curves, loop = len(v), np.array(problem.curves, np.int64), problem.loop(kappa, tau)
     crossing = plants.variable(np.exp(tau + problem.leads))  # by number
     end = np.where(problem.short[:, None], crossing, np.inf)
@@ -171,9 +219,9 @@ def assess(
     begin = np.where(problem.late[:, None], crossing, 0.0)
     counts = (begin <= v[..., None, None]) & (v[..., None, None] <= end)
     value = np.where(counts, value, -np.inf)
-    peaks = local_peaks(loop, curves, v, value, depth, begin, end)
-    peaks = peaks.and_those(hidden := hidden_peaks(curves, v, value))
-    top, closed = closed_on_peaks(loop, peaks)
+    peaks = local_peaks(loop, curves, v, value, depth, begin, end, options)
+    peaks = peaks.and_those(hidden := hidden_peaks(curves, v, value, options))
+    top, closed = closed_on_peaks(loop, peaks, options)
     # An open end at ω_b is the crossing, from either side; one at the lowest frequency is a row.
     low_end = peaks.start < 0.1 * crossing[peaks.row // P]
     above = peaks.low <= np.where(np.isin(peaks.curve, curves[problem.late]),
@@ -189,12 +237,12 @@ def assess(
         curve.append(np.full(len(row[-1]), end_curve))
         at.append(np.repeat(place[numbers], P))
     i, j, c, k = np.nonzero(regular[..., None, None] & (value > -within))
-    found = constraints(problem, kappa, tau, Places(*map(np.concatenate, (curve, row, at))))
-    return Assessment(True, poles, found, Places(curves[c], i + k * P, v[i, j]))
+    found = constraints(problem, kappa, tau, RowPlaces(*map(np.concatenate, (curve, row, at))))
+    return Assessment(True, poles, found, RowPlaces(curves[c], i + k * P, v[i, j]))
 
 
 @singledispatch
-def constraints(problem: LoopProblem, kappa: Array, tau: float, at: Places) -> Constraints:
+def constraints(problem: LoopProblem, kappa: Array, tau: float, at: RowPlaces) -> Constraints:
     """Values and derivatives of these rows."""
     value, slope, to_kappa, *_ = evaluate_rows(problem, kappa, tau, at)
     to_tau = problem.to_tau(at, tau)
@@ -203,7 +251,7 @@ def constraints(problem: LoopProblem, kappa: Array, tau: float, at: Places) -> C
     return Constraints(at.curve, at.plant, at.v, value + problem.margin, to_kappa, to_tau)
 
 
-def evaluate_rows(problem: LoopProblem, kappa: Array, tau: float, at: Places) -> Any:
+def evaluate_rows(problem: LoopProblem, kappa: Array, tau: float, at: RowPlaces) -> Any:
     """What `kernels.loop_rows.rows` has of these rows; without the margin."""
     number, plant = np.divmod(at.plant, problem.plants.count)
     return rows(at.curve, number, plant, at.v, problem.loop(kappa, tau))
@@ -211,7 +259,20 @@ def evaluate_rows(problem: LoopProblem, kappa: Array, tau: float, at: Places) ->
 
 @singledispatch
 def to_theta(problem: LoopProblem, kappa: Array, constraints: Constraints) -> Array:
-    """∂c/∂θ (M, n_θ) at fixed κ and τ."""
+    """Differentiate constraints to the plants' parameters at fixed κ, τ and frequency.
+
+    Parameters
+    ----------
+    problem, kappa : LoopProblem, array (n,)
+        Plants that carry derivatives; κ in the problem's units.
+    constraints : Constraints
+        M of them.
+
+    Returns
+    -------
+    array (M, n_θ)
+        ∂c/∂θ.
+    """
     slopes, v, which = problem.plants.slopes, constraints.v, problem.plants_of(constraints)
     *_, x, y, right = evaluate_rows(problem, kappa, 0.0, constraints)
     out = form_slopes(slopes, which, v, x, y, False)
@@ -228,23 +289,40 @@ def hessians(
     tau: float,
     rows: Constraints,
     beside: Sequence[LoopProblem] = (),
+    options: HessianOptions = HessianOptions(),
 ) -> Array:
-    """(M, k + n + 1, k + n + 1): ∂²c_j to (z, κ, τ), in this order.
+    """Find the second derivatives of constraints c_j whose frequencies move with the peaks.
 
-    z are k parameters of the plants: `beside` has the loops that are moved by `BESIDE` along each.
+        ∂²c/∂y∂yᵀ + c_xyᵀc_xy/(-c_xx),   x = ln v, y = (z, κ, τ)      at a maximum of c over x
+
+    Parameters
+    ----------
+    problem, kappa, tau : LoopProblem, array (n,), float
+        As for `assess`.
+    rows : Constraints
+        M of them.
+    beside : sequence of LoopProblem
+        The k problems whose plants are moved by `options.parameter_step` along each z.
+    options : HessianOptions
+
+    Returns
+    -------
+    array (M, k + n + 1, k + n + 1)
+        To (z, κ, τ); 0 of rows whose singular values cross there.
     """
     k, n, m, P = len(beside), len(kappa), len(rows.v), problem.plants.count
+    step, moved_by = options.step, options.parameter_step
     out = np.zeros((m, k + n + 1, k + n + 1))
     if not m:
         return out
     loop = problem.loop(kappa, tau)
     out[:, k:-1, k:-1] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
-    v = (rows.v * np.exp([[0.0], [STEP], [-STEP]])).ravel()
-    around = Places(np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
+    v = (rows.v * np.exp([[0.0], [step], [-step]])).ravel()
+    around = RowPlaces(np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
     found = evaluate_rows(problem, kappa, tau, around)
     slopes, to_kappa = found[1].reshape(3, m), found[2].reshape(3, m, n)
     slope, own = slopes[0], to_kappa[0]
-    c_xx, c_xk = ((part[1] - part[2]) / (2.0 * STEP) for part in (slopes, to_kappa))
+    c_xx, c_xk = ((part[1] - part[2]) / (2.0 * step) for part in (slopes, to_kappa))
     end = rows.curve == LoopCurve.CROSSING
     fixed = end | (rows.curve == LoopCurve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
@@ -253,16 +331,16 @@ def hessians(
         to_z = to_theta(problem, kappa, rows)
         for i, other in enumerate(beside):
             moved = evaluate_rows(other, kappa, tau, rows)
-            c_xz[:, i] = (moved[1] - slope) / BESIDE
-            out[:, i, k:-1] = out[:, k:-1, i] = (moved[2] - own) / BESIDE
-            out[:, i, :k] = (to_theta(other, kappa, rows) - to_z) / BESIDE
+            c_xz[:, i] = (moved[1] - slope) / moved_by
+            out[:, i, k:-1] = out[:, k:-1, i] = (moved[2] - own) / moved_by
+            out[:, i, :k] = (to_theta(other, kappa, rows) - to_z) / moved_by
         out[:, :k, :k] = 0.5 * (out[:, :k, :k] + out[:, :k, :k].transpose(0, 2, 1))
         # Where singular values cross no difference means anything: its two orders disagree.
         up, down = (to_theta(problem, kappa, replace(rows, v=rows.v * np.exp(x)))
-                    for x in (STEP, -STEP))  # fmt: skip
-        c_zx = (up - down) / (2.0 * STEP)
+                    for x in (step, -step))  # fmt: skip
+        c_zx = (up - down) / (2.0 * step)
         unlike = np.abs(c_xz - c_zx).max(axis=1)
-        smooth = unlike <= UNLIKE * (1.0 + np.abs(c_zx).max(axis=1))
+        smooth = unlike <= options.unlike * (1.0 + np.abs(c_zx).max(axis=1))
     c_xy = np.concatenate([c_xz, c_xk], axis=1)
     shift = c_xy / np.where(top, -c_xx, np.inf)[:, None]
     out[:, :-1, :-1] += shift[:, :, None] * c_xy[:, None, :]

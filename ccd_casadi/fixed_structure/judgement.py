@@ -17,7 +17,13 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.certificate import TOLERANCE, SetCertificate, as_run, certify, holds
+from ccd_casadi.fixed_structure.certificate import (
+    CertificateOptions,
+    SetCertificate,
+    as_run,
+    certify,
+    holds,
+)
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.measured import MeasuredResponse
@@ -26,17 +32,34 @@ from ccd_casadi.support.text import HZ, counted
 
 ENGINE = "NumPy, on the matrices as the plant function returned them, free bodies free"
 AS_GIVEN = "NumPy, on the plants as they were given, with the coefficients of the code"
-SLOWER = 2e-3  # relative: what a claimed bandwidth may be above the judge's
-LOWEST, LINES = 1e-6, 600  # of half the rate, and frequencies, at which they are compared
-BELOW, PER_DECADE = 4.0, 40  # decades below the first line, where G is (jω)^-n, and points in each
-UNCLEAR = 0.9 * np.pi  # an angle that turns further between two lines may as well turn back
+
+
+@dataclass(frozen=True)
+class JudgementOptions:
+    """Numbers of the final judgement."""
+
+    slower: float = 2e-3  # relative: by how much a claimed bandwidth may be above the judge's
+    lowest: float = 1e-6  # of half the rate: from there on K and its code are compared
+    frequencies: int = 600  # at which they are compared
+    decades: float = 4.0  # below the first line, where G is (jω)^-n
+    per_decade: int = 40  # points of these
+    unclear: float = 0.9 * np.pi  # rad from line to line: a larger turn may be one backwards
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What was found on so many `plants`: the largest figures over their bounds, by name.
+    """The final judgement of a controller.
 
-    `passed` is None where it could not be judged.
+    Attributes
+    ----------
+    plants : int
+        How many were judged.
+    figures : mapping
+        The largest figures over their bounds, by name.
+    passed : bool or None
+        None where it could not be judged.
+    words, engine : str
+        The finding, and what found it.
     """
 
     plants: int
@@ -47,17 +70,38 @@ class Judgement:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """Of result.json."""
+        """Its entry in result.json."""
         return {**vars(self)}
 
 
 def judgement_of(certificate: SetCertificate, plants: int) -> Judgement:
-    """Of a certificate on plants as they were written."""
+    """Make the judgement of a certificate.
+
+    Parameters
+    ----------
+    certificate, plants : SetCertificate, int
+        On the plants as they were written, and their number.
+
+    Returns
+    -------
+    Judgement
+    """
     return Judgement(plants, certificate.worst, certificate.passed, certificate.words)
 
 
 def attempted(judge: Callable[..., Judgement], *of: Any) -> Judgement:
-    """What a judge finds; unknown where it finds no answer."""
+    """Call a judge and make its failure an unknown judgement.
+
+    Parameters
+    ----------
+    judge, of : callable, arguments
+        Such as `judge_loops`.
+
+    Returns
+    -------
+    Judgement
+        `passed` is None where the judge raised an error of its numbers or input.
+    """
     try:
         return judge(*of)
     except (UserError, ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -67,26 +111,44 @@ def attempted(judge: Callable[..., Judgement], *of: Any) -> Judgement:
 def judge_loops(
     plants: Sequence[StateSpace], controller: StateSpace, coded: StateSpace, bounds: Bounds,
     sampling: Sampling, bandwidth: float, integrator: bool, on_all: bool = True,
+    options: JudgementOptions = JudgementOptions(),
 ) -> Judgement:  # fmt: skip
-    """A difference equation (e in, u out) on plants, continuous or in discrete time at its rate.
+    """Judge a difference equation on plants: it is the controller, holds every plant, keeps bounds.
 
-    What is `coded` has to be the controller, and hold every plant; figures are the controller's:
-    poles that nearly coincide cost a level test its digits in the form that is coded. `bandwidth`:
-    the one claimed, rad/s, on each plant or, not `on_all`, on the first alone.
+    Figures are the controller's: poles that nearly coincide cost a level test its digits in the
+    form that is coded.
+
+    Parameters
+    ----------
+    plants : sequence of StateSpace
+        Force to displacement, SI; continuous, or in discrete time at the rate of `sampling`.
+    controller, coded : StateSpace
+        K, e in, u out, SI; the difference equation of the code.
+    bounds, sampling, integrator : Bounds, Sampling, bool
+        As for `certify`.
+    bandwidth, on_all : float, bool
+        ω_b that is claimed, rad/s: on each plant, or on the first alone.
+    options : JudgementOptions
+
+    Returns
+    -------
+    Judgement
+        With the claimed bandwidth over the judge's among its figures.
     """
-    omega = np.geomspace(LOWEST, 0.999, LINES) * np.pi / sampling.period
+    tolerance = CertificateOptions.tolerance
+    omega = np.geomspace(options.lowest, 0.999, options.frequencies) * np.pi / sampling.period
     K, own_K = coded.response(omega), as_run(controller, sampling).response(omega)
     off = float((np.linalg.norm(K - own_K, 2, (1, 2)) / np.linalg.norm(own_K, 2, (1, 2))).max())
-    if not off <= TOLERANCE:
+    if not off <= tolerance:
         words = f"the coefficients of the code are off the controller by {100.0 * off:.2g} %"
-        return Judgement(len(plants), {"code": off / TOLERANCE}, False, words, engine=AS_GIVEN)
+        return Judgement(len(plants), {"code": off / tolerance}, False, words, engine=AS_GIVEN)
     found = certify(plants, controller, bounds, sampling, integrator=integrator)
     if not (found.worst and all(holds(plant, coded, sampling) for plant in plants)):
         words = "unstable with the coefficients of the code" if found.worst else found.words
         return Judgement(len(plants), {}, False, words, engine=AS_GIVEN)
     own = found.bandwidth if on_all else found.plants[0].bandwidth
     figures = found.worst | {"bandwidth": bandwidth / own if own > 0.0 else np.inf}
-    slow = not own >= bandwidth * (1.0 - SLOWER)
+    slow = not own >= bandwidth * (1.0 - options.slower)
     words = f"the bandwidth is {own / HZ:.6g} Hz, not {bandwidth / HZ:.6g} Hz"
     words = words if slow and found.passed else found.words
     return Judgement(len(plants), figures, found.passed and not slow, words, engine=AS_GIVEN)
@@ -94,7 +156,7 @@ def judge_loops(
 
 def judge_lines(
     measured: MeasuredResponse, controller: StateSpace, bounds: Bounds, delay: float,
-    bandwidth: float, integrator: bool,
+    bandwidth: float, integrator: bool, options: JudgementOptions = JudgementOptions(),
 ) -> Judgement:  # fmt: skip
     """A controller, continuous or a difference equation, on a response as its file has it.
 
@@ -104,7 +166,8 @@ def judge_lines(
     if controller.period:
         hz = hz[hz < 0.5 / controller.period]
     G, p = measured.matrix[: len(hz)], len(measured.matrix[0])
-    below = np.geomspace(10.0**-BELOW, 1.0, int(BELOW * PER_DECADE), endpoint=False)
+    count = int(options.decades * options.per_decade)
+    below = np.geomspace(10.0**-options.decades, 1.0, count, endpoint=False)
     asymptote = measured.static * ((-1j / below) ** n)[:, None, None]
     omega = HZ * np.concatenate([below * hz[0], hz])
     lag = np.exp(-1j * omega * delay)[:, None, None]
@@ -114,7 +177,8 @@ def judge_lines(
     half = -0.5 * np.pi * q  # the angle of F at 0, but for half turns
     first = half + np.pi * np.round((np.angle(F[0]) - half) / np.pi)
     turns = np.append(np.angle(F[1:] / F[:-1]), -np.angle(F[-1]))
-    if np.abs(turns).max() > UNCLEAR or abs(np.angle(F[0]) - first) > UNCLEAR - 0.5 * np.pi:
+    unclear, begins = options.unclear, np.angle(F[0])
+    if np.abs(turns).max() > unclear or abs(begins - first) > unclear - 0.5 * np.pi:
         words = "the angle of det(I + GK) turns too fast from line to line to be followed"
         return Judgement(1, {}, None, words, engine=AS_GIVEN)
     grown = np.angle(F[0]) - first + turns.sum()
@@ -123,12 +187,13 @@ def judge_lines(
         words = f"unstable: {unstable} poles in the right half plane"
         return Judgement(1, {}, False, words, engine=AS_GIVEN)
     S = np.linalg.norm(np.linalg.inv(np.eye(p) + L[len(below) :]), 2, axis=(1, 2))
-    x = np.maximum(HZ * hz, 0.0 if integrator else bounds.omega_low) / bandwidth * (1.0 + SLOWER)
+    x = np.maximum(HZ * hz, 0.0 if integrator else bounds.omega_low) / bandwidth
+    x = x * (1.0 + options.slower)
     room = np.where(x <= 1.0, 1.0 / x, np.inf) if bounds.shape is None else bounds.room(x)
     shares = S / np.minimum(np.sqrt(0.5) * x * room, bounds.S_max)
     figures = {"S_max": float(S.max()) / bounds.S_max, "bandwidth": float(shares.max())}
     broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in figures.items()
-              if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
+              if not ratio <= 1.0 + CertificateOptions.tolerance]  # fmt: skip
     words = f"stable and within every bound on {counted(len(hz), 'line')}"
     if broken:
         words = f"exceeds its bound on {', '.join(broken)}"

@@ -10,7 +10,7 @@ bandwidth, so that ω_b is what the bounds leave free at this κ. At its end
 
     d ln v*/dθ = ∂ ln v/∂θ + Σ μ_j ∂c_j/∂θ        (envelope theorem)
 
-but for that payment, `REWARD` dτ/dθ.
+but for that payment, `reward` dτ/dθ.
 """
 
 from collections.abc import Sequence
@@ -51,14 +51,24 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, number, spoken
 
-REWARD = 1e-6  # of ln ω_b in ln v
-INSIDE = 0.7  # of the ω_b that its bounds leave a given κ: a search that begins at bounds crawls
-KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
+
+@dataclass(frozen=True)
+class LeastValueOptions:
+    """Numbers of the search for the least value."""
+
+    reward: float = 1e-6  # of ln ω_b in ln v
+    inside: float = 0.7  # of the ω_b that its bounds leave a given κ: from a bound a search crawls
+    kept: float = 1.0 + 2e-6  # figure over bound that the search leaves
 
 
 class Goal(Protocol):
-    """A figure of a controller on a set of plants that is made small, in SI, and its derivatives;
-    its logarithm is what is searched on."""
+    """A figure v > 0 of a controller on a set of plants that is made small, with derivatives.
+
+    Attributes
+    ----------
+    at, to_theta, shown : method
+        ln v and its gradient to κ (n,) in SI; ∂ ln v/∂θ (n_θ,) at fixed κ; v with its unit.
+    """
 
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln v at κ in SI, and its gradient; infinite where a loop is unstable."""
@@ -72,8 +82,18 @@ class Goal(Protocol):
 
 @dataclass(frozen=True)
 class RmsError:
-    """The RMS error e of a controller on SISO plants, e² the mean of its variances; derivatives by
-    adjoint Lyapunov equations."""
+    """The RMS error e of a controller on SISO plants, e² the mean of its variances.
+
+    Derivatives are those of adjoint Lyapunov equations.
+
+    Attributes
+    ----------
+    plants, structure : tuple of ScaledPlant, Structure
+    budget : ErrorBudget
+        The disturbances.
+    hold : Sampling or None
+        None: a continuous loop.
+    """
 
     plants: tuple[ScaledPlant, ...]
     structure: Structure
@@ -102,7 +122,6 @@ class RmsError:
         return self._of_mean(np.asarray(kappa, complex)[None], moved)[1]
 
     def shown(self, value: float) -> str:
-        """In nm."""
         return spoken(f"{1e9 * value:.4g} nm RMS")
 
     def _of_mean(
@@ -122,10 +141,17 @@ class RmsError:
 
 @dataclass(frozen=True)
 class LeastValue:
-    """A design with its value v over the set in SI, and that of the controller it began with.
+    """A design with the least value v of a goal.
 
-    `design.multipliers`: change of ln v per ln of a bound; `design.kkt_residual` is over ‖∇ ln v‖.
-    `envelope` has dv*/dθ where the plants carry derivatives; None where the end is not stationary.
+    Attributes
+    ----------
+    design : SectionsDesign
+        Its multipliers are changes of ln v per ln of a bound; its residual is over ‖∇ ln v‖.
+    value, first_value : float
+        v over the set in SI, and that of the controller the search began with.
+    steps : int
+    envelope : Envelope or None
+        dv*/dθ where the plants carry derivatives; None where the end is not stationary.
     """
 
     design: SectionsDesign
@@ -146,12 +172,34 @@ def least_value(
     initial: Sequence[Array] = (),
     only_initial: bool = False,
     tell: Tell = silent,
+    options: LeastValueOptions = LeastValueOptions(),
 ) -> LeastValue:
-    """From `initial` (κ in SI), a certified design and its other local optima to the least value
-    of the goal; with `only_initial` from the latter where the former lead to no certified design.
+    """Search the least value of a goal within the bounds, from a certified design.
 
-    `least_bandwidth` in rad/s. What the judge does not confirm is not handed out: the design that
-    it began with is, then. A local optimum, as any search from given starts finds.
+    Parameters
+    ----------
+    plants, bounds, sampling : sequence of ScaledPlant, Bounds, Sampling, optional
+    design : SectionsDesign
+        Certified, of one input and one output; its other local optima are starts too.
+    goal : Goal
+    least_bandwidth : float
+        rad/s.
+    initial, only_initial : sequence of array (n,), bool
+        κ in SI of further starts, which come first; `only_initial`: the design is a start only
+        where these lead to no certified design.
+    tell : callable
+        Is given a line for each end.
+    options : LeastValueOptions
+
+    Returns
+    -------
+    LeastValue
+        The best local optimum that the judge confirms, else the design that it began with.
+
+    Raises
+    ------
+    ValueError
+        The structure has several channels.
     """
     structure = design.structure
     if not isinstance(structure, Structure):
@@ -164,7 +212,7 @@ def least_value(
     def scaled(kappa: Array) -> tuple[float, Array]:
         return goal.at(structure.in_units(kappa, w0, force))
 
-    model = LoopModel(problem, scaled, REWARD, floor)
+    model = LoopModel(problem, scaled, options.reward, floor)
     first_hessian = np.diag(np.append(np.ones(len(design.kappa)), 0.0))
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
@@ -180,7 +228,8 @@ def least_value(
         begin = in_problem_units(problem, np.array(kappa))
         tau = float(np.log(bandwidth / w0))
         if np.isinf(tau):
-            tau = max(at_its_bandwidth(problem, begin).tau + float(np.log(INSIDE)), floor)
+            own_tau = at_its_bandwidth(problem, begin).tau
+            tau = max(own_tau + float(np.log(options.inside)), floor)
         start = model.at(np.append(begin, tau))
         if start is None or model.is_known(start.x):
             continue
@@ -190,8 +239,8 @@ def least_value(
         model.known += [start.x, end.x]
         if not new:
             continue
-        made, conditions = _judged(search, end, design, floor)
-        value = float(np.exp(end.value + REWARD * end.x[-1]))
+        made, conditions = _judged(search, end, design, floor, options.kept)
+        value = float(np.exp(end.value + options.reward * end.x[-1]))
         at = f"{goal.shown(value)} at {number(made.bandwidth / HZ, 4)} Hz"
         tell(f"{at}, {count} steps: {made.words}")
         if made.certified and value < best.value:
@@ -204,14 +253,15 @@ def least_value(
 
 
 def _judged(
-    search: DesignSearch, end: Iterate[Assessment], design: SectionsDesign, floor: float
-) -> tuple[SectionsDesign, Optimality]:
+    search: DesignSearch, end: Iterate[Assessment], design: SectionsDesign, floor: float,
+    kept: float,
+) -> tuple[SectionsDesign, Optimality]:  # fmt: skip
     """The end as a design, certified by the judge, and its conditions of optimality."""
     inside, tau = end.x[:-1], float(end.x[-1])
     kappa, controller, judged = search.judged(inside)
     found = optimality(search.problem, Point(inside, tau, end.data), -end.gradient, floor)
     least = float(np.exp(floor)) * search.problem.plants.omega_0
-    good = judged.passed and judged.bandwidth >= least / KEPT
+    good = judged.passed and judged.bandwidth >= least / kept
     made = replace(
         design,
         outcome=SectionsOutcome.CERTIFIED if good else SectionsOutcome.NOT_CERTIFIED,

@@ -18,12 +18,11 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.loop_problem import (
-    FIRST,
     Assessment,
     Constraints,
     LoopCurve,
     LoopProblem,
-    Places,
+    RowPlaces,
 )
 from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure
@@ -33,14 +32,6 @@ from ccd_casadi.kernels.loop_point import LoopArrays, levels, rows
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
-
-OCTAVES = np.log(2.0) * np.linspace(-1.0, 1.0, 33)  # about ω_b
-STEP = 1e-5  # of τ
-REACH = 0.3  # ω₀ over the last line
-SHORT = 12.0  # ω₀ over the first line at least: searches start from ω_b = 0.1 ω₀
-RELEVANT = -1.0  # ln of a gain over its bound below which a line is none of the rows
-POLE = -1.0 + 1.0j  # of a line's mode, over its frequency
-SLOWEST = 0.01  # |p| T of it at least: below, digits of z - e^{pT} are lost
 
 
 @dataclass(frozen=True)
@@ -94,15 +85,16 @@ class LineProblem(LoopProblem):
         )
         return loop
 
-    def ceiling(self, tau: float) -> tuple[float, float]:
+    def ceiling(self, tau: float, *, step: float = 1e-5) -> tuple[float, float]:
         """ln of effort times the mean of 1/σ_min(G) over the two octaves about ω_b, of the response
-        where that is largest, and its slope to τ; infinite without an effort."""
+        where that is largest, and its slope to τ by differences; infinite without an effort."""
         if self.effort is None:
             return np.inf, 0.0
-        places = tau + np.array([[0.0], [-STEP], [STEP]]) + OCTAVES
+        octaves = np.log(2.0) * np.linspace(-1.0, 1.0, 33)
+        places = tau + np.array([[0.0], [-step], [step]]) + octaves
         means = [np.interp(places, x, y).mean(axis=1) for x, y in self._inverses]
         value, before, after = max(means, key=lambda mean: float(mean[0]))
-        return float(np.log(self.effort) + value), float(after - before) / (2.0 * STEP)
+        return float(np.log(self.effort) + value), float(after - before) / (2.0 * step)
 
     @cached_property
     def _inverses(self) -> list[tuple[Array, Array]]:
@@ -121,7 +113,7 @@ class LineProblem(LoopProblem):
         measured, L = next(self._open(kappa))
         measured = measured.followed
         beyond = HZ * measured.hz[np.argmax(np.abs(L[:, 0, 0]) < 1.0)] / self.plants.omega_0
-        return float(np.clip(np.log(0.5 * beyond), np.log(2.0 * self.base[0]), FIRST))
+        return float(np.clip(np.log(0.5 * beyond), np.log(2.0 * self.base[0]), self.first_tau))
 
     def stable(self, kappa: Array) -> bool:
         """Whether the winding on every response is that of a stable loop."""
@@ -167,7 +159,8 @@ def line_problem(
     every = np.concatenate([*hz, np.full(len(hz), low)])
     G = np.concatenate([one.matrix for one in responses] + [one.at(low)[None] for one in responses])
     size = np.linalg.norm(G, axis=(1, 2))
-    omega_0 = HZ * max(REACH * min(one[-1] for one in hz), SHORT * max(one[0] for one in hz))
+    # Searches start from ω_b = 0.1 ω₀: inside the lines.
+    omega_0 = HZ * max(0.3 * min(one[-1] for one in hz), 12.0 * max(one[0] for one in hz))
     force = 1.0 / float(np.exp(np.log(size).mean()))
     omega, T = HZ * every / omega_0, None if period is None else period * omega_0
     U, V = structure.directions
@@ -189,7 +182,8 @@ def line_problem(
 def _modes(omega: Array, G: np.ndarray, period: float | None) -> tuple[np.ndarray, np.ndarray]:
     """Pole and residue of each line with G (N, p, m) there: Re r and Im r solve G = r f + r̄ f̃."""
     count, p, m = G.shape
-    pole = POLE * np.maximum(omega, 0.0 if period is None else SLOWEST / period)
+    # below |p|T = 0.01 digits of z - e^{pT} are lost
+    pole = (-1.0 + 1.0j) * np.maximum(omega, 0.0 if period is None else 0.01 / period)
     f, other = 1.0 / (1j * omega - pole), 1.0 / (1j * omega - pole.conj())
     both, apart = f + other, 1j * (f - other)
     basis = np.array([[both.real, apart.real], [both.imag, apart.imag]]).transpose(2, 0, 1)
@@ -205,8 +199,10 @@ def _(
     *,
     depth: float | None = None,
     each: bool = False,
+    relevant: float = -1.0,
 ) -> Assessment:
-    """Every line within a factor e of its bound, the two next to ω_b, and |S| at ω_low."""
+    """Every line whose ln of a gain over its bound is above `relevant`, the two next to ω_b, and
+    |S| at ω_low."""
     plants, starts, P = problem.plants, problem.starts, problem.plants.count
     v, lines = problem.v, problem.starts[-1]
     crossing = plants.variable(np.exp(tau + problem.leads))
@@ -217,20 +213,20 @@ def _(
     loop = problem.loop(kappa, tau)
     codes = np.array(problem.curves, np.int64)
     every = np.arange(lines)
-    value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT, NONE)[:, 0]
+    value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, relevant, NONE)[:, 0]
     beyond = v[:lines, None, None] > crossing
     idle = np.where(beyond, problem.short[:, None], problem.late[:, None])
     value = np.where(idle, -np.inf, value)
-    i, c, k = np.nonzero(value > RELEVANT)
+    i, c, k = np.nonzero(value > relevant)
     at_low = np.flatnonzero(np.isfinite(problem.limits[LoopCurve.S_LOW]))
     low = (at_low[:, None] * P + np.arange(lines, P)).ravel()
     curve = np.concatenate([codes[c], np.full(len(low), LoopCurve.S_LOW)])
     row = np.concatenate([i + k * P, low])
-    found = constraints(problem, kappa, tau, Places(curve, row, v[row % P]))
+    found = constraints(problem, kappa, tau, RowPlaces(curve, row, v[row % P]))
     found.to_tau[curve == LoopCurve.KS] = -problem.ceiling(tau)[1]
     none = np.zeros(0, np.int64)
     peaks = found.and_those(_ends(problem, loop, crossing))
-    return Assessment(True, np.zeros(0), peaks, Places(none, none, np.zeros(0)))
+    return Assessment(True, np.zeros(0), peaks, RowPlaces(none, none, np.zeros(0)))
 
 
 def _ends(problem: LineProblem, loop: object, crossing: Array) -> Constraints:

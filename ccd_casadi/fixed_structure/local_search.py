@@ -10,23 +10,53 @@ import numpy as np
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
 from ccd_casadi.optim.kkt import non_negative, symmetric_rank_one
-from ccd_casadi.optim.trust_region import Data, Iterate, Model, Radius, Rows, Step, minimise
+from ccd_casadi.optim.trust_region import (
+    Data,
+    Iterate,
+    Radius,
+    Rows,
+    Step,
+    TrustRegionModel,
+    minimise,
+)
 from ccd_casadi.support.arrays import Array
-
-FIRST_RADIUS, LARGEST_RADIUS = 0.2, 1.5
-PENALTY = 20.0  # above the sum of multipliers: a per cent of a bound is worth so many of ω_b
-RESTORING = 400.0  # that of an end that is to be brought within its bounds
-PENALTIES = (20.0, 200.0, 2000.0)  # of a goal; the next one where a bound is left passed
-LEAST_RADIUS, LEAST_GAIN = 1e-7, 1e-9
-MERGED = 1e-3  # in κ and τ: searches as close as that are one
-MOST = 200  # steps with one penalty
 
 Goal = Callable[[Array], tuple[float, Array]]
 
 
 @dataclass(frozen=True)
+class LocalSearchOptions:
+    """Numbers of a local search; κ and τ are logarithms, radii are in them."""
+
+    radius: float = 0.2  # the first
+    largest_radius: float = 1.5
+    penalty: float = 20.0  # ln ω_b per ln of a bound: above the sum of multipliers
+    restoring_penalty: float = 400.0  # that of an end that is to be brought within its bounds
+    merged: float = 1e-3  # in κ and τ: searches as close as that are one
+
+
+@dataclass(frozen=True)
+class DescentOptions:
+    """Numbers of the search for the least value of a goal."""
+
+    radius: float = 0.2  # the first
+    least_radius: float = 1e-7
+    largest_radius: float = 1.0
+    penalties: tuple[float, ...] = (20.0, 200.0, 2000.0)  # the next where a bound is exceeded
+    steps: int = 200  # with one penalty
+    least_gain: float = 1e-9
+
+
+@dataclass(frozen=True)
 class Point:
-    """A controller at a bandwidth: κ, τ = ln(ω_b/ω₀), its assessment."""
+    """A controller at a bandwidth, and how it keeps its bounds there.
+
+    Attributes
+    ----------
+    kappa, tau : array (n,), float
+        κ in the problem's units; ln(ω_b/ω₀).
+    assessment : Assessment
+    """
 
     kappa: Array
     tau: float
@@ -34,23 +64,23 @@ class Point:
 
     def merit(self) -> float:
         """τ - ρ violation, to be made large."""
-        return self.tau - PENALTY * self.assessment.violation
+        return self.tau - LocalSearchOptions.penalty * self.assessment.violation
 
 
 @dataclass(frozen=True)
 class Ascent:
-    """Where a local search is, the radius it has, and how many loops it looked at.
+    """Where a local search is, the radius it has, and how many loops it assessed.
 
     `done`: further steps do not help.
     """
 
     point: Point
-    radius: float = FIRST_RADIUS
+    radius: float = LocalSearchOptions.radius
     evaluations: int = 1
     done: bool = False
 
 
-class LoopModel(Model[Assessment]):
+class LoopModel(TrustRegionModel[Assessment]):
     """The bounds of a set of loops as rows over x = (κ, τ); `goal` gives v(κ) and its gradient.
 
     `known`: x where searches have been; another one ends when it comes there.
@@ -111,7 +141,7 @@ class LoopModel(Model[Assessment]):
         step: Step,
         radius: float,
     ) -> Array:
-        """That of v."""
+        """H by a symmetric rank-one update, where there is a goal v."""
         if self.goal is None:
             return H
         return symmetric_rank_one(H, there.x - here.x, there.gradient - here.gradient)
@@ -122,11 +152,22 @@ class LoopModel(Model[Assessment]):
 
     def is_known(self, x: Array) -> bool:
         """Whether another search has been there."""
-        return any(np.abs(x - other).max() <= MERGED for other in self.known)
+        return any(np.abs(x - other).max() <= LocalSearchOptions.merged for other in self.known)
 
 
 def all_rows(problem: LoopProblem, kappa: Array, tau: float, found: Assessment) -> Constraints:
-    """The peaks, and after them the values near."""
+    """List every row that a step from a point takes into account.
+
+    Parameters
+    ----------
+    problem, kappa, tau, found : LoopProblem, array (n,), float, Assessment
+        The point and its assessment, all loops stable.
+
+    Returns
+    -------
+    Constraints
+        The peaks, and after them the values on the base grid near them.
+    """
     assert found.peaks is not None
     assert found.near is not None
     return found.peaks.and_those(constraints(problem, kappa, tau, found.near))
@@ -137,21 +178,38 @@ def ascend(
     start: Point,
     *,
     iterations: int,
-    radius: float = FIRST_RADIUS,
+    radius: float = LocalSearchOptions.radius,
     least_radius: float = 1e-6,
     least_gain: float = 1e-8,
     restoring: bool = False,
+    options: LocalSearchOptions = LocalSearchOptions(),
 ) -> Ascent:
-    """Climb to a larger ω_b, or with `restoring` within the bounds first, from a start whose loops
-    are stable; ends where steps do not help."""
+    """Climb to a larger ω_b from a start whose loops are stable, until steps do not help.
+
+    Parameters
+    ----------
+    problem, start : LoopProblem, Point
+    iterations : int
+        Steps at most.
+    radius, least_radius, least_gain : float
+        Of the trust region, in κ and τ; gain of the merit of a step below which it ends.
+    restoring : bool
+        Bring the point within its bounds first.
+    options : LocalSearchOptions
+
+    Returns
+    -------
+    Ascent
+    """
     model = LoopModel(problem)
     model.restoring = restoring
     begin = model.assessed(start.kappa, start.tau, start.assessment)
     assert begin is not None
     n = len(begin.x)
     end = minimise(
-        model, begin, np.zeros((n, n)), Radius(radius, least_radius, LARGEST_RADIUS),
-        steps=iterations, penalty=RESTORING if restoring else PENALTY, least_gain=least_gain,
+        model, begin, np.zeros((n, n)), Radius(radius, least_radius, options.largest_radius),
+        steps=iterations, penalty=options.restoring_penalty if restoring else options.penalty,
+        least_gain=least_gain,
     )  # fmt: skip
     x = end.best.x
     point = Point(x[:-1], float(x[-1]), end.best.data)
@@ -159,17 +217,18 @@ def ascend(
 
 
 def descend(
-    model: Model[Data], start: Iterate[Data], H: Array, within: float
-) -> tuple[Iterate[Data], int]:
-    """From a stable start to where steps help no longer, and how many loops were looked at.
+    model: TrustRegionModel[Data], start: Iterate[Data], H: Array, within: float,
+    options: DescentOptions = DescentOptions(),
+) -> tuple[Iterate[Data], int]:  # fmt: skip
+    """From a stable start to where steps help no longer, and how many loops were assessed.
 
     `within`: a violation that needs no larger penalty. H (n + 1, n + 1): the first of v.
     """
     end, evaluations = start, 0
-    for penalty in PENALTIES:
+    for penalty in options.penalties:
         found = minimise(
-            model, end, H, Radius(FIRST_RADIUS, LEAST_RADIUS, 1.0), steps=MOST, penalty=penalty,
-            least_gain=LEAST_GAIN,
+            model, end, H, Radius(options.radius, options.least_radius, options.largest_radius),
+            steps=options.steps, penalty=penalty, least_gain=options.least_gain,
         )  # fmt: skip
         end, evaluations = found.best, evaluations + found.evaluations
         if end.violation <= within:
@@ -177,9 +236,23 @@ def descend(
     return end, evaluations
 
 
-ACTIVE = 1e-5  # ln of the share of its bound within which a constraint binds
-NEAR = 1e-3  # the same within which it may bind at a kink that the search has not quite reached
-RESIDUAL = 1e-3  # of ∇τ, which is 1: above it there is no envelope gradient
+@dataclass(frozen=True)
+class OptimalityOptions:
+    """Numbers of the conditions of optimality.
+
+    Attributes
+    ----------
+    active : float
+        ln of the share of its bound within which a constraint binds.
+    near : float
+        The same within which it may bind at a kink that is all but reached.
+    residual : float
+        Of ∇τ, which is 1: above it there is no envelope gradient.
+    """
+
+    active: float = 1e-5
+    near: float = 1e-3
+    residual: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -188,10 +261,20 @@ class Envelope:
 
         {direct + to_thetaᵀ μ :  rowsᵀ μ = goal,  μ >= 0}        in the unit of v
 
-    over what binds; `rows` (M, n + 1) are slopes to (κ, τ), `multipliers` (M,) one such μ.
-    `to_theta` (m, n_θ) is of the m constraints, which come first and are named by kind: the ends of
-    κ's box have none. `slack` (M,): by how much a constraint is off its bound, in logarithms; with
-    μ slack a row counts that all but binds.
+    over what binds.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The kinds of the m constraints, which come first; the ends of κ's box have none.
+    direct, to_theta : array (n_θ,), (m, n_θ)
+    rows, goal : array (M, n + 1), (n + 1,)
+        Slopes to (κ, τ).
+    multipliers : array (M,)
+        One such μ.
+    slack : array (M,)
+        ln of the distance of a constraint from its bound; with μ slack a row counts that all but
+        binds.
     """
 
     names: tuple[str, ...]
@@ -250,8 +333,9 @@ class Optimality:
 
 
 def optimality(
-    problem: LoopProblem, point: Point, goal: Array | None = None, floor: float = -np.inf
-) -> Optimality:
+    problem: LoopProblem, point: Point, goal: Array | None = None, floor: float = -np.inf,
+    options: OptimalityOptions = OptimalityOptions(),
+) -> Optimality:  # fmt: skip
     """Non-negative least squares on the active constraints of a point whose loops are stable.
 
     `goal` (n + 1,) is the gradient to (κ, τ) of what is made large, by default τ; `floor` the least
@@ -259,17 +343,17 @@ def optimality(
     """
     peaks = point.assessment.peaks
     assert peaks is not None
-    binds = np.abs(peaks.value) <= ACTIVE
-    active, near = peaks.only(binds), peaks.only(~binds & (np.abs(peaks.value) <= NEAR))
+    binds = np.abs(peaks.value) <= options.active
+    active, near = peaks.only(binds), peaks.only(~binds & (np.abs(peaks.value) <= options.near))
     n = len(point.kappa)
     unit = np.eye(n + 1)
     rows, ends = [np.column_stack([active.to_kappa, active.to_tau])], []
     for i, name in enumerate(problem.structure.names):
         for row, sign, word in ((0, -1.0, "lower"), (1, 1.0, "upper")):
-            if abs(point.kappa[i] - problem.box[row, i]) <= ACTIVE:
+            if abs(point.kappa[i] - problem.box[row, i]) <= options.active:
                 rows.append(sign * unit[i : i + 1])
                 ends.append((name, word))
-    if abs(point.tau - floor) <= ACTIVE:
+    if abs(point.tau - floor) <= options.active:
         rows.append(-unit[n:])
     shares, closed = np.ones(sum(map(len, rows))), problem.closed(active, point.tau)
     # ∂ ln(shape x - (shape - 1)/x)/∂ ln shape
@@ -283,13 +367,14 @@ def optimality(
 
 
 def envelope_of(
-    problem: LoopProblem, kappa: Array, optimality: Optimality, direct: Array | None = None
-) -> Envelope | None:
+    problem: LoopProblem, kappa: Array, optimality: Optimality, direct: Array | None = None,
+    options: OptimalityOptions = OptimalityOptions(),
+) -> Envelope | None:  # fmt: skip
     """That of ln ω_b*(θ), or of a value made small whose slope at a fixed κ is `direct` (n_θ,).
 
     None where the conditions of optimality do not hold.
     """
-    if optimality.residual > RESIDUAL or optimality.violation > ACTIVE:
+    if optimality.residual > options.residual or optimality.violation > options.active:
         return None
     near, count = optimality.near, len(optimality.kinds)
     slopes = np.concatenate([to_theta(problem, kappa, part) for part in (optimality.active, near)])

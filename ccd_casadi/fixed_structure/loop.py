@@ -39,11 +39,6 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-PROBES = 1j * np.geomspace(1e-2, 1e2, 7)  # s over ω₀
-FAITHFUL = 1e-7  # relative error of the modal response, above which a plant has no such form
-AT_REST = 1e-9  # of the fastest pole: as slow as rounding makes a pole at 0
-CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
-
 
 @dataclass(frozen=True)
 class LoopPlant:
@@ -119,7 +114,7 @@ class PlantSet:
 
     @property
     def count(self) -> int:
-        """How many plants."""
+        """The number of plants."""
         return len(self.poles)
 
     @cached_property
@@ -194,7 +189,8 @@ class PlantSet:
             B[i, q] = s[:, None] * B[i, v]
         dA, dB, dC = (np.ascontiguousarray(np.moveaxis(part, 1, -1)) for part in parts)
         gap, size = self.poles[:, :, None] - self.poles[:, None, :], np.abs(self.poles)
-        near = np.abs(gap) <= CLOSE * np.maximum(size[:, :, None], size[:, None, :])
+        # closer ones count as equal: their divided difference is a derivative
+        near = np.abs(gap) <= 1e-6 * np.maximum(size[:, :, None], size[:, None, :])
         gaps = np.where(near, 0.0, 1.0 / np.where(near, 1.0, gap))
         terms, d = np.stack([self.poles] * 6, axis=-1), 0.0
         if self.period is not None:
@@ -292,14 +288,18 @@ def all_stable(poles: np.ndarray) -> np.ndarray:
         return np.asarray((poles.real < 0.0).all(-1))
 
 
-def _loop_plant(plant: ScaledPlant, name: str, trusted: bool) -> LoopPlant:
+def _loop_plant(
+    plant: ScaledPlant, name: str, trusted: bool, *, at_rest: float = 1e-9, error: float = 1e-7
+) -> LoopPlant:
+    """A plant by its modes. Poles that are slower than `at_rest` of the fastest are 0 but for
+    rounding; the modal response has a relative `error` at most, unless that is `trusted`."""
     plant, chains = _with_bodies_seen(plant)
     rest = np.setdiff1d(np.arange(len(plant.A)), chains)
     poles, V = np.zeros(len(plant.A), complex), np.eye(len(plant.A), dtype=complex)
     poles[rest], V[np.ix_(rest, rest)] = np.linalg.eig(plant.A[np.ix_(rest, rest)])
     resting = len(rest) and int((~plant.A[:, rest].any(axis=0)).sum())  # free bodies that D brakes
     slowest = rest[np.argsort(np.abs(poles[rest]))[:resting]]
-    if (np.abs(poles[slowest]) <= AT_REST * np.abs(poles).max(initial=0.0)).all():
+    if (np.abs(poles[slowest]) <= at_rest * np.abs(poles).max(initial=0.0)).all():
         poles[slowest] = 0.0
     if not ((poles.real < 0.0) | (poles == 0.0)).all():
         raise PlantError(f"{name} is not stable; a fixed structure is searched on stable plants")
@@ -307,12 +307,13 @@ def _loop_plant(plant: ScaledPlant, name: str, trusted: bool) -> LoopPlant:
     b, c = W @ plant.B, plant.C @ V
     system = strictly_proper(plant.A, plant.B, plant.C)
     if not trusted:
-        direct = system.at(PROBES)
-        modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (PROBES[:, None] - poles), b)
+        s = 1j * np.geomspace(1e-2, 1e2, 7)  # over ω₀
+        direct = system.at(s)
+        modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (s[:, None] - poles), b)
         q, v = chains.T
         bodies = (plant.C[:, q] * plant.A[q, v]) @ plant.B[v]
-        modal += bodies / PROBES[:, None, None] ** 2
-        if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
+        modal += bodies / s[:, None, None] ** 2
+        if np.abs(modal - direct).max() > error * np.abs(direct).max():
             words = "has poles that coincide and are coupled; move a damping ratio away from 1"
             raise PlantError(f"{name} {words}")
     return LoopPlant(

@@ -1,4 +1,4 @@
-"""What is asked of the loops of a set, as constraints on logarithms of gains over their bounds.
+"""The requirements on the loops of a set, as constraints on logarithms of gains over their bounds.
 
     S_max   ln|S| - ln S_max                    every local peak
     level   ln|S| + ½ ln 2 - ln x               every local peak on ω <= ω_b, and ω_b itself
@@ -9,12 +9,12 @@
 A constraint is c(κ, τ) <= 0 with τ = ln ω_b and x = ω/ω_b; without a shape, or where it ends at
 ω_b, the level has no x (`kernels.limits`). Of several channels |M| stands for every singular
 value: row number i + kP is the k-th of plant i of P. After those of the whole, p of them, come the
-rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u and w of `ChannelBounds`.
+rows that single channels keep within their bounds: uᵀS and wᵀKS, u and w of `ChannelBounds`.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -28,17 +28,26 @@ from ccd_casadi.kernels.sections import HALF_POWER, Limit, LoopCurve
 from ccd_casadi.lti.state_space import root_flanks
 from ccd_casadi.support.arrays import Array
 
-FIRST = float(np.log(0.1))  # τ, ω_b over ω₀
-PER_DECADE = 24
-REST = 1e-3  # of the lowest other frequency: gains are those at 0 Hz but for 1e-9
-
 
 @dataclass(frozen=True)
 class LoopProblem:
-    """The plants, the structure and the bounds, frequencies over ω₀; `box` (2, n) bounds κ.
+    """The largest bandwidth of a controller on a set of plants within bounds.
 
-    `margin` is how far (in logarithms) inside every bound its searches aim.
+    Frequencies are over ω₀ of the plants.
+
+    Attributes
+    ----------
+    plants, structure, bounds : PlantSet, Structure or ChannelStructure, Bounds
+    box : array (2, n)
+        Bounds of κ.
+    margin : float
+        ln: how far inside every bound its searches aim.
+    first_tau, per_decade : float, int
+        τ = ln(ω_b/ω₀) from which searches start; points of the base grid.
     """
+
+    first_tau: ClassVar[float] = float(np.log(0.1))
+    per_decade: ClassVar[int] = 24
 
     plants: PlantSet
     structure: Structure | ChannelStructure
@@ -48,7 +57,7 @@ class LoopProblem:
 
     def begin(self, kappa: Array) -> float:
         """τ from which a search climbs that starts at κ."""
-        return FIRST
+        return self.first_tau
 
     @cached_property
     def low(self) -> float:
@@ -68,8 +77,8 @@ class LoopProblem:
             top = max(top, 10.0 * max(w.c_K * w.omega_K, w.omega_T / w.A_u) / self.plants.omega_0)
         if self.plants.period is not None:
             top = 100.0 / self.plants.period
-        v = np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
-        return np.append(REST * bottom, v)
+        v = np.geomspace(bottom, top, int(self.per_decade * np.log10(top / bottom)))
+        return np.append(1e-3 * bottom, v)  # there gains are those at 0 Hz but for 1e-9
 
     @cached_property
     def fixed(self) -> Array:
@@ -213,18 +222,18 @@ class LoopProblem:
         """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
         return [LoopCurve(int(code)).name for code in constraints.curve]
 
-    def inverse_square(self, at: "Places", tau: float) -> Array:
+    def inverse_square(self, at: "RowPlaces", tau: float) -> Array:
         """(ω_i/ω)² at rows (M,) of a shape whose room opens from ω_b on; 0 of others."""
         lead = self.leads[at.plant // self.plants.count]
         x = self.plants.frequency(at.v) * np.exp(-tau - lead)
         own = self.bounds.opens & (at.curve == LoopCurve.SHAPE)
         return np.where(own, 1.0 / np.maximum(x, 1.0) ** 2, 0.0)
 
-    def closed(self, at: "Places", tau: float) -> Array:
+    def closed(self, at: "RowPlaces", tau: float) -> Array:
         """The share of shape ω/ω_i that is not open yet at rows (M,)."""
         return (1.0 - 1.0 / (self.bounds.shape or 1.0)) * self.inverse_square(at, tau)
 
-    def to_tau(self, at: "Places", tau: float) -> Array:
+    def to_tau(self, at: "RowPlaces", tau: float) -> Array:
         """∂c/∂τ of rows at a fixed frequency (M,)."""
         opens, shape = self.bounds.opens, at.curve == LoopCurve.SHAPE
         found = np.where(shape | (opens & (at.curve == LoopCurve.LEVEL)), 1.0, 0.0)
@@ -256,13 +265,13 @@ class Columns:
         return type(self)(*(part[chosen] for part in vars(self).values()))
 
     def and_those(self, *others: Self) -> Self:
-        """These and others."""
+        """These rows, then those of others."""
         parts = zip(*(vars(one).values() for one in (self, *others)), strict=True)
         return type(self)(*map(np.concatenate, parts))
 
 
 @dataclass(frozen=True)
-class Places(Columns):
+class RowPlaces(Columns):
     """LoopCurve, plant and v (over ω₀) of M constraints."""
 
     curve: np.ndarray
@@ -271,7 +280,7 @@ class Places(Columns):
 
 
 @dataclass(frozen=True)
-class Constraints(Places):
+class Constraints(RowPlaces):
     """Constraints c <= 0 there: value, derivatives to κ (M, n) and τ."""
 
     value: Array
@@ -281,16 +290,23 @@ class Constraints(Places):
 
 @dataclass(frozen=True)
 class Assessment:
-    """One controller on all plants: stable or not, and where it is, its constraints.
+    """One controller on all plants.
 
-    `peaks` are exact; `near` lie on the base grid and tell how curves go between the peaks: only
-    steps from here need their derivatives.
+    Attributes
+    ----------
+    stable, poles : bool, array (P, n)
+        Of every loop, in w.
+    peaks : Constraints or None
+        Of local peaks, exact; None where a loop is unstable.
+    near : RowPlaces or None
+        Points of the base grid near a bound, which describe the curves between the peaks: only
+        steps from here need their derivatives.
     """
 
     stable: bool
     poles: np.ndarray
     peaks: Constraints | None
-    near: Places | None
+    near: RowPlaces | None
 
     @property
     def violation(self) -> float:

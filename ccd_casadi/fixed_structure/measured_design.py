@@ -18,9 +18,8 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, key_words
-from ccd_casadi.fixed_structure.channel_design import TIGHTENED
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, Decoupling
-from ccd_casadi.fixed_structure.design import MARGIN, in_problem_units
+from ccd_casadi.fixed_structure.design import DesignOptions, in_problem_units
 from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
@@ -36,9 +35,6 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent, titled
 from ccd_casadi.support.text import HZ
 
-FEWER = 600  # lines that starts of single channels are designed on
-EXCEEDED = 1e-5  # relative: of a bound, by rounding
-CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
 NEGATIVE = "K has a negative gain, by the sign of the plant's"
 NO_START = "no start is stable by its winding: this structure may not stabilise the plant"
 OF_DATA = (
@@ -51,9 +47,17 @@ OF_DATA = (
 class MeasuredDesign:
     """A controller found on measured lines; SI, frequencies in rad/s.
 
-    `figures` are the judge's; `usable` where it is stable, surely so, and within every bound on
-    every line. `words` say what is missing. `sign` of K: -1 where the plant of one channel has a
-    negative gain; κ is that of |K|.
+    Attributes
+    ----------
+    structure, kappa, controller : Structure or ChannelStructure, array (n,), StateSpace or None
+        K(s), and κ of |K|.
+    bandwidth, figures : float, MeasuredFigures or None
+        The judge's.
+    usable, words : bool, str
+        Whether it is stable, surely so, and within every bound on every line; what is missing.
+    steps : int
+    sign : float
+        Of K: -1 where the plant of one channel has a negative gain.
     """
 
     structure: Structure | ChannelStructure
@@ -85,15 +89,34 @@ def design_on_data(
     progress: Tell = silent,
     workers: Pool | None = None,
 ) -> MeasuredDesign:
-    """max ω_b over the parameters of a structure, with every bound on every line of every response.
+    """Maximise ω_b over the parameters of a structure, with every bound on every measured line.
 
-    `period` (s): K is sampled and the responses hold hold and delay, as the controller sees them.
-    A structure of one channel on responses of several is that of each channel of
-    `static_decoupling`. With an `effort` also |KS| <= effort/|G|, the mean over the two octaves
-    about ω_b, where G has its least singular value. Of the bandwidth the share `given_up` is given
-    in the end for integral gain. A search begins from `initial` (κ in SI) alone if that is stable.
-    Raises UserError for responses of unlike shape or sign, derivatives of a displacement, or lines
-    beyond half the sampling rate.
+    Parameters
+    ----------
+    measured, structure, bounds : MeasuredResponse or sequence of them, Structure, Bounds
+        A structure of one channel on responses of several is that of each channel of
+        `static_decoupling`.
+    period : float, optional
+        s: K is sampled and the responses hold hold and delay, as the controller sees them.
+    starts, seed : int
+        Of the multi-start search.
+    effort : float, optional
+        |KS| <= effort/|G|, the mean over the two octaves about ω_b of G's least singular value.
+    given_up : float
+        Share of the bandwidth that is given in the end for integral gain.
+    initial : array (n,), optional
+        κ in SI; the only start if it is stable.
+    progress, workers : callable, Pool, optional
+
+    Returns
+    -------
+    MeasuredDesign
+
+    Raises
+    ------
+    UserError
+        Responses of unlike shape or sign, derivatives of a displacement, or lines beyond half the
+        sampling rate.
     """
     responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
     shapes = {one.matrix.shape[1:] for one in responses}
@@ -113,7 +136,7 @@ def design_on_data(
     if shapes == {(1, 1)}:
         sign = _sign(responses)
         responses = [replace(one, G=sign * one.G) for one in responses]
-    problem = line_problem(responses, structure, bounds, period, MARGIN, effort)
+    problem = line_problem(responses, structure, bounds, period, DesignOptions.margin, effort)
     again = None if initial is None else np.clip(in_problem_units(problem, initial), *problem.box)
     if again is not None and problem.stable(again):
         pool, spent = [again], 0
@@ -186,14 +209,14 @@ def static_decoupling(measured: MeasuredResponse) -> Decoupling:
 
 
 def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int) -> MeasuredDesign:
-    """The controller at κ and what the judge says of it."""
+    """The controller at κ with the judge's figures, which may exceed a bound by 1e-5 (rounding)."""
     structure, bounds, plants = problem.structure, problem.bounds, problem.plants
     si = structure.in_units(kappa, plants.omega_0, plants.force)
     K = structure.state_space(si)
     figures = judge(problem.responses, K, bounds, period=period, integrator=structure.integrator)
     shares = bounds.shares(figures).items()
     broken = [f"{key_words(name)} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in shares
-              if figures.stable and not ratio <= 1.0 + EXCEEDED]  # fmt: skip
+              if figures.stable and not ratio <= 1.0 + 1e-5]  # fmt: skip
     words = figures.words
     if broken:
         words = f"exceeds its bound on {', '.join(broken)}; {words}"
@@ -204,7 +227,8 @@ def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int
 def _pool(problem: LineProblem, starts: int, rng: np.random.Generator) -> list[Array]:
     """Half by rules, the fastest, half at random, of those whose winding is a stable loop's."""
     single = cast(Problem, problem)  # of one channel
-    inside = CROSSOVERS[2.0 * problem.base[0] < CROSSOVERS]
+    crossovers = np.geomspace(1e-4, 1.0, 24)  # over ω₀
+    inside = crossovers[2.0 * problem.base[0] < crossovers]
     rules = by_rules(single, inside)[::-1]
     _, first = np.unique(rules, axis=0, return_index=True)  # without notches many are alike
     found = _some(problem, rules[np.sort(first)], max(starts // 2, 1))
@@ -226,16 +250,18 @@ def _channels_stacked(
     seed: int,
     tell: Tell,
     workers: Pool | None,
+    lines: int = 600,
 ) -> tuple[list[Array], int]:
-    """The channels' own designs as one κ, with ever tighter S_max until it is stable."""
+    """The channels' designs on `lines` lines as one κ, with ever tighter S_max until it is
+    stable."""
     U, V = structure.directions
     spent = 0
-    for share in TIGHTENED:
+    for share in DesignOptions.peak_shares:
         parts = []
         for i in structure.free:
             limits = problem.bounds.of_channel(i)
             limits = replace(limits, S_max=1.0 + share * (limits.S_max - 1.0))
-            entries = [one.entry(U[:, i], V[:, i], FEWER) for one in problem.responses]
+            entries = [one.entry(U[:, i], V[:, i], lines) for one in problem.responses]
             name = structure.decoupling.names[i]
             design = design_on_data(
                 entries, structure.structures[i], limits, period=period, starts=starts, seed=seed,

@@ -33,20 +33,37 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 
-GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
-SAFETY = 2.0  # on the error of interpolation
-LARGE, SMALL = 2.0, 0.5  # gains of L at the first line at least, at the last at most
-RISEN = (
-    0.6  # half turns of G's angle beside those of its unstable poles, from which they are doubted
-)
-HIDDEN = 0.05  # of GK beside a resonance narrower than the lines, between which it may reach 1
-NOISE = 3.0  # standard deviations up to which a second difference may be noise
-STRIDES = (2, 4, 8)  # lines, over which it is then taken
-CUBIC_WINDOW = range(15)  # lines, over which the noise is estimated
-FITTED = 6  # lines that a parabola over a pole is fitted to
-NEAR_POLE = 1.0  # over the distance of two lines: a pole so near, and as narrow, is between them
-INSIDE = np.linspace(-0.4, 0.4, 5)  # places of a resonance between two lines
-BETWEEN = np.linspace(0.0, 1.0, 9)  # places on a chord
+
+@dataclass(frozen=True)
+class WindingOptions:
+    """Limits beyond which the data leave the winding in doubt."""
+
+    gap: float = 0.25 * np.pi  # rad: of G's angle at the first line to its asymptote
+    large: float = 2.0  # |L| at the first line at least
+    small: float = 0.5  # |L| at the last line at most
+    risen: float = 0.6  # half turns of G's angle beside those of its unstable poles
+    hidden: float = 0.05  # |GK| beside a resonance between lines, where it may reach 1
+
+
+@dataclass(frozen=True)
+class InterpolationOptions:
+    """Numbers of the error between two lines."""
+
+    safety: float = 2.0  # factor on the error of linear interpolation
+    deviations: float = 3.0  # standard deviations up to which a second difference may be noise
+    strides: tuple[int, ...] = (2, 4, 8)  # lines, over which it is then taken
+    window: int = 15  # lines, over which the noise is estimated
+    places: int = 9  # on a chord
+
+
+@dataclass(frozen=True)
+class HiddenResonanceOptions:
+    """Numbers of the search for resonances that fit between two lines."""
+
+    safety: float = 2.0  # factor on the room that the lines leave for one
+    fitted: int = 6  # lines that a parabola over a pole is fitted to
+    near: float = 1.0  # over the distance of two lines: such a pole lies between them
+    places: int = 5  # of a resonance between two lines
 
 
 @dataclass(frozen=True)
@@ -68,7 +85,19 @@ class MeasuredFigures(LoopPeaks):
 
 
 def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
-    """K (k, m, p) at frequencies in Hz; with a period by Tustin's rule, without prewarping."""
+    """Evaluate a controller on lines.
+
+    Parameters
+    ----------
+    K, hz : StateSpace, array (k,)
+        Continuous; frequencies in Hz.
+    period : float, optional
+        s: K is discretised by Tustin's rule, without prewarping.
+
+    Returns
+    -------
+    array (k, m, p)
+    """
     runs = K if period is None else tustin(K, period)
     return runs.response(HZ * np.asarray(hz, float))
 
@@ -155,22 +184,24 @@ def _worst(each: Sequence[MeasuredFigures]) -> MeasuredFigures:
     return MeasuredFigures(True, sure, unstable, words, **worst)
 
 
-def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
+def interpolation_errors(
+    hz: Array, L: np.ndarray, options: InterpolationOptions = InterpolationOptions()
+) -> Array:
     """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f.
 
     Where those of neighbouring lines do not stand out of the noise, of lines further apart.
     """
     x = np.log(hz)
-    noise = NOISE * np.sqrt(6.0) * _noise(x, L)
+    noise = options.deviations * np.sqrt(6.0) * _noise(x, L, options.window)
     around = _curvature(x, L, 1)
     step = _half_width(x, 1)
-    for stride in STRIDES:
+    for stride in options.strides:
         if len(x) > 2 * stride and noise.max() > 0.0:
             wide = _curvature(x, L, stride) + noise / _half_width(x, stride) ** 2
             around = np.where(around * step**2 < noise, np.minimum(around, wide), around)
     wider = np.maximum(np.append(around[1:], 0.0), np.insert(around[:-1], 0, 0.0))
     each = np.maximum(around, wider)
-    return np.asarray(SAFETY * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
+    return np.asarray(options.safety * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
 
 
 def _curvature(x: Array, L: np.ndarray, stride: int) -> Array:
@@ -186,10 +217,10 @@ def _half_width(x: Array, stride: int) -> Array:
     return np.pad(0.5 * (x[2 * stride :] - x[: -2 * stride]), stride, mode="edge")
 
 
-def _noise(x: Array, L: np.ndarray) -> Array:
+def _noise(x: Array, L: np.ndarray, window: int) -> Array:
     """Standard deviation of the noise of L at each line (k,): its distance from the cubic through
     the two lines on each side, the median of those around."""
-    if len(x) < len(CUBIC_WINDOW):
+    if len(x) < window:
         return np.zeros(len(x))
     at, near = x[2:-2], [x[:-4], x[1:-3], x[3:-1], x[4:]]
     off = L[2:-2] + 0.0
@@ -200,12 +231,15 @@ def _noise(x: Array, L: np.ndarray) -> Array:
         off = off - weight[:, None, None] * own
         spread += weight**2
     size = np.pad(sigma_max(off) / np.sqrt(spread), 2, mode="edge")
-    half = len(CUBIC_WINDOW) // 2
+    half = window // 2
     return np.median(np.lib.stride_tricks.sliding_window_view(
-        np.pad(size, half, mode="reflect"), len(CUBIC_WINDOW)), axis=1)  # fmt: skip
+        np.pad(size, half, mode="reflect"), window), axis=1)  # fmt: skip
 
 
-def hidden_damping(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
+def hidden_damping(
+    measured: MeasuredResponse, L: np.ndarray, k: np.ndarray,
+    options: HiddenResonanceOptions = HiddenResonanceOptions(),
+) -> Array:  # fmt: skip
     """The largest damping ratio with which a resonance between neighbouring lines (k - 1,) may make
     I + L singular and yet not show on them.
 
@@ -222,7 +256,7 @@ def hidden_damping(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> 
                     + np.concatenate([slope[1:], slope[-2:-1]]))  # fmt: skip
     jump = np.pad(sigma_max(slope - around) * h, 2, mode="edge")
     room = np.lib.stride_tricks.sliding_window_view(jump, 5).max(axis=1) / 4.0
-    room = np.minimum(room, _room_beside_a_pole(x, G.reshape(len(x), -1)))
+    room = np.minimum(room, _room_beside_a_pole(x, G.reshape(len(x), -1), options))
     eye, middle = np.eye(L.shape[1]), 0.5 * (L[1:] + L[:-1])
     ends, centre = (np.linalg.norm(eye + part, -2, axis=(1, 2)) for part in (L, middle))
     height = flat / sigma_max(k)
@@ -231,16 +265,17 @@ def hidden_damping(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> 
     return np.minimum(h * room / needed, 0.5 * h)
 
 
-def _room_beside_a_pole(x: Array, G: np.ndarray) -> Array:
+def _room_beside_a_pole(x: Array, G: np.ndarray, options: HiddenResonanceOptions) -> Array:
     """The largest q between neighbouring lines (k - 1,) of x, if G (k, entries) is else a parabola
     over one pole on the lines around: how well that fits them over how badly it fits 1/(t - t₀).
     Infinite where that pole is itself a resonance narrower than the lines."""
-    if len(x) < FITTED:
+    fitted, near = options.fitted, options.near
+    if len(x) < fitted:
         return np.full(len(x) - 1, np.inf)
     every = np.arange(len(x) - 1)
-    lines = np.clip(every - FITTED // 2 + 1, 0, len(x) - FITTED)[:, None] + np.arange(FITTED)
+    lines = np.clip(every - fitted // 2 + 1, 0, len(x) - fitted)[:, None] + np.arange(fitted)
     t = (x[lines] - 0.5 * (x[1:] + x[:-1])[:, None]) / np.diff(x)[:, None]
-    room = np.zeros(len(every))
+    room, inside = np.zeros(len(every)), np.linspace(-0.4, 0.4, options.places)
     for own in G.T:
         g = own[lines]
         basis = np.stack([t**0, t, t**2, -t * g], axis=-1)
@@ -251,11 +286,11 @@ def _room_beside_a_pole(x: Array, G: np.ndarray) -> Array:
 
         pole = (np.linalg.pinv(basis) @ g[..., None])[:, 3]
         left = np.linalg.norm(beside(g), axis=1)
-        tails = [np.linalg.norm(beside((1.0 + pole * t) / (t - at)), axis=1) for at in INSIDE]
-        room += (SAFETY * left / np.min(tails, axis=0)) ** 2
+        tails = [np.linalg.norm(beside((1.0 + pole * t) / (t - at)), axis=1) for at in inside]
+        room += (options.safety * left / np.min(tails, axis=0)) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             at = -1.0 / pole[:, 0]
-        room[(np.abs(at.real) < NEAR_POLE) & (np.abs(at.imag) < NEAR_POLE)] = np.inf
+        room[(np.abs(at.real) < near) & (np.abs(at.imag) < near)] = np.inf
     return np.sqrt(room)
 
 
@@ -281,10 +316,20 @@ def _hidden(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray, doubts: li
 
 
 def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
-    """What σ_max(S) may reach between neighbouring lines (k - 1,): infinite where nothing is sure.
+    """Bound σ_max(S) between neighbouring lines.
 
     By L, or where it is large and its inverse the smoother by S = L⁻¹ (I + L⁻¹)⁻¹.
     L = GK at each line is known within u = ‖Δ |K|‖, so L⁻¹ within ‖L⁻¹‖²u/(1 - ‖L⁻¹‖u).
+
+    Parameters
+    ----------
+    measured, L, k : MeasuredResponse, array (k, p, p), array (k, m, p)
+        GK and K on its lines.
+
+    Returns
+    -------
+    array (k - 1,)
+        Infinite where I + L may be singular.
     """
     hz, over, unsure = measured.hz, np.linalg.inv(L), np.zeros(len(L))
     if measured.spread is not None:
@@ -301,7 +346,9 @@ def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
     return np.minimum(by_L, by_inverse)
 
 
-def _clearances(hz: Array, L: np.ndarray, unsure: Array) -> Array:
+def _clearances(
+    hz: Array, L: np.ndarray, unsure: Array, options: InterpolationOptions = InterpolationOptions()
+) -> Array:
     """Least σ_min(I + L) between neighbouring lines (k - 1,): on the chord, less r and `unsure`.
 
     Of several channels that at a place near by, less half the step to the next.
@@ -313,15 +360,18 @@ def _clearances(hz: Array, L: np.ndarray, unsure: Array) -> Array:
         share = np.clip(-(start * along.conj()).real / np.where(size == 0.0, 1.0, size), 0.0, 1.0)
         least = np.abs(start + share * along)
     else:
-        places = np.eye(L.shape[1]) + L[:-1] + BETWEEN[:, None, None, None] * step
+        shares = np.linspace(0.0, 1.0, options.places)
+        places = np.eye(L.shape[1]) + L[:-1] + shares[:, None, None, None] * step
         least = np.linalg.svd(places, compute_uv=False)[..., -1].min(axis=0)
-        least = least - 0.5 * BETWEEN[1] * sigma_max(step)
-    return np.asarray(least - interpolation_errors(hz, L) - np.maximum(unsure[1:], unsure[:-1]))
+        least = least - 0.5 * shares[1] * sigma_max(step)
+    error = interpolation_errors(hz, L, options)
+    return np.asarray(least - error - np.maximum(unsure[1:], unsure[:-1]))
 
 
 def winding(
-    measured: MeasuredResponse, L: np.ndarray, integrators: int = 0
-) -> tuple[int, list[str]]:
+    measured: MeasuredResponse, L: np.ndarray, integrators: int = 0,
+    options: WindingOptions = WindingOptions(),
+) -> tuple[int, list[str]]:  # fmt: skip
     """Z of L = GK (k, p, p), with `integrators` of every channel of K, on the lines of
     `measured.followed`; and what the data leave open."""
     channels = L.shape[1]
@@ -337,23 +387,23 @@ def winding(
     doubts = []
     if len(set(measured.undamped_hz)) < len(measured.undamped_hz):
         doubts.append("G has two undamped modes at one frequency")
-    large = np.flatnonzero(np.linalg.norm(own, 2, axis=(1, 2)) > SMALL)
+    large = np.flatnonzero(np.linalg.norm(own, 2, axis=(1, 2)) > options.small)
     seen = 0.0 if measured.modelled or not len(large) else measured.excess(hz[large[-1]])
-    if seen > measured.unstable_poles + RISEN:
+    if seen > measured.unstable_poles + options.risen:
         doubts.append(
             f"the angle of G rises by {180.0 * seen:.0f} deg more than that of a stable G of its "
             "size: state its unstable poles (--unstable-poles, unstable_poles)"
         )
-    if measured.gap > GAP:
+    if measured.gap > options.gap:
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
-    if q > 0 and np.linalg.norm(own[0], -2) < LARGE:
+    if q > 0 and np.linalg.norm(own[0], -2) < options.large:
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, |GK| is not large: measure below it")
-    if np.linalg.norm(own[-1], 2) > SMALL:
+    if np.linalg.norm(own[-1], 2) > options.small:
         doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small: measure above it")
     own = np.einsum("kii->ki", own)
     wide = np.diff(hz) > 2.0 * measured.least_damping * hz[1:]
     falls = (np.angle(own[1:] / own[:-1]) < -0.5 * np.pi) & wide[:, None]
-    hidden = np.flatnonzero((falls & (np.abs(own[1:]) > HIDDEN)).any(axis=1))
+    hidden = np.flatnonzero((falls & (np.abs(own[1:]) > options.hidden)).any(axis=1))
     if len(hidden):
         where = f"between {hz[hidden[0]]:.4g} and {hz[hidden[0] + 1]:.4g} Hz"
         doubts.append(f"{where} GK turns by more than 90 deg: a resonance narrower than the lines")
@@ -377,7 +427,20 @@ def _turns(measured: MeasuredResponse, F: np.ndarray) -> Array:
 
 
 def bandwidth_within(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
-    """The largest ω_b with |S| <= 1/√2 on the lines below it and |S| within the shape."""
+    """Find the largest ω_b with |S| <= 1/√2 on the lines below it and |S| within the shape.
+
+    Parameters
+    ----------
+    omega, ln_S : array (k,)
+        rad/s; ln σ_max(S) there.
+    bounds, integrator : Bounds, bool
+        The shape counts from 0 on with an integrator, else from ω_low.
+
+    Returns
+    -------
+    float
+        rad/s; 0 where |S| > 1/√2 on the first line.
+    """
     level = -HALF_POWER
     above = np.flatnonzero(ln_S > level)
     crossing = float(omega[-1])

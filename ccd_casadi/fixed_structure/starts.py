@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, channel_plant
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.structure import Kind
+from ccd_casadi.fixed_structure.structure import ParameterKind
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -29,9 +29,6 @@ SKEWED = (
     (("zeros", 0.93, 0.07), ("poles", 0.8, 0.1)),
     (("zeros", 0.95, 0.07), ("poles", 1.1, 0.2)),
 )
-CROSSOVERS = (0.01, 1.0)  # over ω₀
-DRAWS = 40  # for each start that is asked for
-STIFFNESS_LINE = -1.0  # d ln|G|/d ln ω above which the stiffness holds what is moved
 
 
 def by_rules(problem: Problem, crossovers: Array) -> Array:
@@ -154,7 +151,7 @@ def _kappa(problem: Problem, values: dict[str, float]) -> Array:
 def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     """κ with the gain that gives |L| = 1 at the crossover of the first plant, boxed."""
     kappa = np.clip(kappa, *problem.box)
-    kinds = np.array([kind is Kind.GAIN for kind in problem.structure.kinds])
+    kinds = np.array([kind is ParameterKind.GAIN for kind in problem.structure.kinds])
     v = problem.plants.variable(np.asarray(crossovers, float))
     kappa[:, kinds] = 0.0
     K = problem.structure.response(kappa.T, 1j * v)
@@ -169,18 +166,26 @@ def actuator_starts(
     sampling: Sampling | None,
     count: int,
     rng: np.random.Generator,
+    *,
+    crossovers_of: tuple[float, float] = (0.01, 1.0),
+    draws_for_each: int = 40,
+    stiffness_line: float = -1.0,
 ) -> list[Array]:
-    """Up to `count` controllers κ of the whole that are stable on all plants, in their units."""
-    draws = DRAWS * count
+    """Up to `count` controllers κ of the whole that are stable on all plants, in their units.
+
+    Crossovers are drawn over ω₀, `draws_for_each` of those required; where d ln|G|/d ln ω is above
+    `stiffness_line` the stiffness holds what is moved.
+    """
+    draws, (low, high) = draws_for_each * count, crossovers_of
     parts = []
     for i, own in enumerate(structure.structures):
         family = plant_set([channel_plant(plants[0], structure.decoupling, i)], sampling)
         single = Problem(family, own, problem.bounds, problem.box[:, structure.slices[i]])
-        crossovers = np.exp(rng.uniform(np.log(CROSSOVERS[0]), np.log(CROSSOVERS[1]), draws))
+        crossovers = np.exp(rng.uniform(np.log(low), np.log(high), draws))
         kappa = at_random(single, crossovers, rng)
         v = family.variable(crossovers)
         G, slope = family.responses(np.zeros(draws, int), v)
-        lag = (slope / G)[:, 0, 0].real > STIFFNESS_LINE
+        lag = (slope / G)[:, 0, 0].real > stiffness_line
         for j in range(1, own.lead + 1):
             pair = [own.names.index(f"lead {j} {root}") for root in ("zero", "pole")]
             kappa[np.ix_(lag, pair)] = kappa[np.ix_(lag, pair[::-1])]

@@ -11,6 +11,7 @@ by construction. κ has the units of what it is multiplied with: everything here
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,13 +19,9 @@ from ccd_casadi.kernels.sections import GAIN, INTEGRATOR, PAIR, REAL
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
-LEAST_DAMPING = 1e-3  # of roots whose structure gives none: below it a notch is a needle
-MOST_DAMPING = 3.0  # two real roots a factor of 34 apart
-SOFTEST_ROLL_OFF = 0.3  # damping ratio: below it a roll-off is a resonance
 
-
-class Kind(StrEnum):
-    """What a parameter is, by which its unit is known."""
+class ParameterKind(StrEnum):
+    """The kind of a controller's parameter, which determines its unit."""
 
     GAIN = "gain"
     FREQUENCY = "frequency"
@@ -50,12 +47,15 @@ class Structure:
     biquads: int = 2
     roll_off: int = 2
     least_damping: float = 0.0
+    # Ratios: below the first a notch is a needle; at the second two real roots are 34 times apart.
+    dampings: ClassVar[tuple[float, float]] = (1e-3, 3.0)
+    least_roll_off_damping: ClassVar[float] = 0.3  # below it a roll-off is a resonance
 
     def __post_init__(self) -> None:
         for name in ("lead", "biquads", "roll_off"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; give 0 or more sections")
-        if not 0.0 <= self.least_damping < MOST_DAMPING:
+        if not 0.0 <= self.least_damping < self.dampings[1]:
             raise ValueError(f"least_damping is {self.least_damping}; give a ratio from 0 to 1")
 
     @property
@@ -79,10 +79,14 @@ class Structure:
         return tuple(found)
 
     @property
-    def kinds(self) -> tuple[Kind, ...]:
+    def kinds(self) -> tuple[ParameterKind, ...]:
         """The kind of each parameter."""
         return tuple(
-            Kind.GAIN if name == "gain" else Kind.DAMPING if "damping" in name else Kind.FREQUENCY
+            ParameterKind.GAIN
+            if name == "gain"
+            else ParameterKind.DAMPING
+            if "damping" in name
+            else ParameterKind.FREQUENCY
             for name in self.names
         )
 
@@ -101,22 +105,22 @@ class Structure:
 
     def bounds(self, frequencies: tuple[float, float], gains: tuple[float, float]) -> Array:
         """Lower and upper bounds (2, n) of κ for frequencies and gains within these."""
-        least = max(self.least_damping, LEAST_DAMPING)
+        least, most = max(self.least_damping, self.dampings[0]), self.dampings[1]
         found = []
         for name, kind in zip(self.names, self.kinds, strict=True):
-            if kind is Kind.GAIN:
+            if kind is ParameterKind.GAIN:
                 found.append(gains)
-            elif kind is Kind.FREQUENCY:
+            elif kind is ParameterKind.FREQUENCY:
                 found.append(frequencies)
             elif name.startswith("roll-off"):
-                found.append((max(least, SOFTEST_ROLL_OFF), MOST_DAMPING))
+                found.append((max(least, self.least_roll_off_damping), most))
             else:
-                found.append((least, MOST_DAMPING))
+                found.append((least, most))
         return np.log(np.array(found).T)
 
     def in_units(self, kappa: Array, frequency: float, gain: float) -> Array:
         """κ with frequencies times `frequency` and the gain times `gain`."""
-        shift = {Kind.GAIN: np.log(gain), Kind.FREQUENCY: np.log(frequency), Kind.DAMPING: 0.0}
+        shift = dict(zip(ParameterKind, (np.log(gain), np.log(frequency), 0.0), strict=True))
         return kappa + np.array([shift[kind] for kind in self.kinds])
 
     @property

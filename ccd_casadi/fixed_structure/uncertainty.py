@@ -35,18 +35,30 @@ from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
 
 SLOPES = ("dM", "dK", "dD", "dB", "dC")  # of a modal plant
-UNCOUPLED = 1e-12  # relative: a modal damping matrix with less beside its diagonal is diagonal
 
 
 @dataclass(frozen=True)
 class UncertainPlant:
-    """What may differ from the model; zeros and (1, 1): nothing.
+    """The plants off their model: a box of parameters for each of some options.
 
-    `options`: the same plant with other loads or positions, by their matrices; the model first.
-    `damping` are the least and the largest factor. M_K in N/m scales all of them alike. `ranges`
-    are parameters of the model itself, least, the model's, largest; `along` gives an option at
-    their values, with derivatives to θ and, last, to these; `graph` its matrices as expressions of
-    these, where there are any. `rigid_modes`: how many, where that is stated.
+    Attributes
+    ----------
+    options : tuple of Mechanics
+        The same plant with other loads or positions, by their matrices; the model first.
+    M_K : float
+        N/m: scales all of them alike.
+    resonance_shift, mode_shift, gain : float
+        Relative, to either side: of all modes, of each, and of the plant; 0: none.
+    damping : tuple of two floats
+        The least and the largest factor on modal damping.
+    ranges : tuple of (name, least, nominal, largest)
+        Parameters of the model itself.
+    along : callable, optional
+        An option at values of these, with derivatives to θ and, last, to these.
+    graph : callable
+        An option's matrices as expressions of these, where there are any.
+    rigid_modes : int, optional
+        How many, where that is stated.
     """
 
     options: tuple[Mechanics, ...]
@@ -189,7 +201,7 @@ class UncertainPlant:
         """The model of every option, then the corners of its box.
 
         With more than three parameters single modes' shifts go together, with the least damping:
-        of the other corners there are too many to look at, and a search finds those that matter.
+        there are too many other corners to assess, and a search finds those that matter.
         """
         box, centre = self.box, self.nominal
         found = [(option, centre) for option in range(len(self.options))]
@@ -210,7 +222,7 @@ class ModalSum:
     """One option of an uncertain plant as Σ c_i b_iᵀ/(s² + g_i s + k_i), time in 1/`unit`, SI else.
 
     k = (ω (1 + shift)(1 + own shift))², g = factor (given + 2 ζ ω (1 + shift)(1 + own shift));
-    `rigid` ones are free, k = g = 0, and stand first; the others are in the order of
+    `rigid` ones are free, k = g = 0, and come first; the others are in the order of
     their numbers. `drive` (n, m), `reading` (n, p) are b_i and c_i. `moving` has ω and b_i c_i
     over boxes of the parameters that modes move with, the last ones; see `moving_modes`.
     """
@@ -264,20 +276,23 @@ class ModalSum:
         return poles, np.where(damped, known, -1.0)
 
 
-def modal_sum(uncertain: UncertainPlant, option: int, unit: float) -> ModalSum | None:
-    """None where a given damping matrix couples the modes or brakes a free body. Modes that move
-    need a graph, a damping ratio, one force, one sensor, and to be apart at the model."""
+def modal_sum(
+    uncertain: UncertainPlant, option: int, unit: float, *, uncoupled: float = 1e-12
+) -> ModalSum | None:
+    """None where a given damping matrix couples the modes (by more than `uncoupled`, relative) or
+    brakes a free body. Modes that move need a graph, a damping ratio, one force, one sensor, and to
+    be apart at the model."""
     system = uncertain.options[option]
     modal = uncertain.modal(option)
     zeta = float(system.damping_ratio or 0.0)
     given = modal.D - np.diag(2.0 * zeta * modal.natural)
     size = np.abs(np.diag(modal.D)).max()
-    if np.abs(given - np.diag(np.diag(given))).max() > UNCOUPLED * size:
+    if np.abs(given - np.diag(np.diag(given))).max() > uncoupled * size:
         return None
     if given[modal.rigid].any():
         return None
     diagonal = np.diag(given)
-    diagonal = np.where(np.abs(diagonal) > UNCOUPLED * size, diagonal, 0.0)
+    diagonal = np.where(np.abs(diagonal) > uncoupled * size, diagonal, 0.0)
     order = np.append(np.flatnonzero(modal.rigid), modal.numbered)
     found = ModalSum(
         modal.natural[order] / unit, modal.rigid[order], diagonal[order] / unit, zeta,

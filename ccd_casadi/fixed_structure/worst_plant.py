@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,13 +19,58 @@ from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
-WITHIN = 1e-4  # ln: by how much a plant of the box may pass a bound and count as within
-UNSTABLE = 10.0  # ln: what an unstable loop counts as
+
+@dataclass(frozen=True)
+class WorstPlantOptions:
+    """Numbers of the search for the worst plants; levels are ln of a figure over its bound.
+
+    Attributes
+    ----------
+    within : float
+        By how much a plant of the box may exceed a bound and count as within.
+    few : int
+        Parameters up to which every one is moved separately: a compass search.
+    lattice, searches, rounds : int
+        Its plants over the box, starts from the worst of them, halvings of its step.
+    lattice_of_many, damped_every : int
+        With more parameters: plants; of so many one keeps its damping, the others have the least.
+    steps : tuple of float
+        Shares of the way to the corner that a peak points to: ridges are narrow.
+    near : float
+        ln of the frequency: closer rows of one curve are one peak.
+    peaks, plants_of_peak, climbs : int
+        That climb, the highest; from how many plants each; rounds.
+    depth, least_gain : float
+        How far below its bound a peak may start; a peak that gains less is at its end.
+    """
+
+    within: float = 1e-4
+    few: int = 4
+    lattice: int = 200
+    searches: int = 6
+    rounds: int = 7
+    lattice_of_many: int = 30
+    damped_every: int = 4
+    steps: tuple[float, ...] = (1.0, 0.3, 0.1, 0.03)
+    near: float = 0.1
+    peaks: int = 40
+    plants_of_peak: int = 2
+    climbs: int = 4
+    depth: float = 0.1
+    least_gain: float = 1e-5
 
 
 @dataclass(frozen=True)
 class Excess:
-    """The largest c of one plant: (option, point), and its value in logarithms of its bound."""
+    """The largest constraint of one plant.
+
+    Attributes
+    ----------
+    option, point : int, array (n_p,)
+        The plant.
+    value : float
+        ln of the largest figure over its bound.
+    """
 
     option: int
     point: Array
@@ -53,8 +99,20 @@ class Loops:
 
 @dataclass(frozen=True)
 class LoopOnBox:
-    """A controller κ in SI with its ω_b (rad/s) on a box of plants, and the bounds that its loops
-    have to keep."""
+    """A controller on a box of plants, with the bounds that its loops have to keep.
+
+    Attributes
+    ----------
+    uncertain, structure, kappa : UncertainPlant, Structure or ChannelStructure, array (n,)
+        κ in SI.
+    bandwidth : float
+        ω_b, rad/s.
+    bounds, sampling : Bounds, Sampling or None
+    unstable : float
+        ln: the excess that an unstable loop counts as, at least.
+    """
+
+    unstable: ClassVar[float] = 10.0
 
     uncertain: UncertainPlant
     structure: Structure | ChannelStructure
@@ -79,18 +137,20 @@ class LoopOnBox:
             log_omega = np.log(units.frequency(rows.v) * units.omega_0)
             np.maximum.at(largest, plant, value)
         grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
-        largest = np.where(grown < 0.0, largest, UNSTABLE + np.maximum(grown, 0.0))
+        largest = np.where(grown < 0.0, largest, self.unstable + np.maximum(grown, 0.0))
         return Loops(problem, kappa, largest, rows, plant, curve, log_omega, value)
 
 
-ALIKE = 0.3
-ALIGNED = (0.02, 0.5, 0.98)  # where they meet, in shares of the frequencies that both may have
-SAME = 1e-9  # relative: frequencies of one double mode, which meet without a shift
-
-
-def meetings(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
+def meetings(
+    uncertain: UncertainPlant, *, shares: tuple[float, ...] = (0.02, 0.5, 0.98),
+    least_cosine: float = 0.3, same: float = 1e-9,
+) -> list[tuple[int, Array]]:  # fmt: skip
     """Points (option, p) where two modes meet, all others as the model's, with the least
-    damping."""
+    damping.
+
+    They meet at `shares` of the frequencies that both may have. Modes of shapes less alike than
+    `least_cosine` are left out, and double ones (to `same`, relative), which meet without a shift.
+    """
     shift, names = uncertain.mode_shift, list(uncertain.names)
     if not shift:
         return []
@@ -105,9 +165,9 @@ def meetings(uncertain: UncertainPlant) -> list[tuple[int, Array]]:
         for i, j in combinations(range(len(omega)), 2):
             own = omega[[i, j]]
             low, high = (1.0 - shift) * own.max(), (1.0 + shift) * own.min()
-            if low >= high or alike[i, j] <= ALIKE or np.ptp(own) <= SAME * high:
+            if low >= high or alike[i, j] <= least_cosine or np.ptp(own) <= same * high:
                 continue
-            for share in ALIGNED:
+            for share in shares:
                 point = middle.copy()
                 point[[first + i, first + j]] = (low + share * (high - low)) / own - 1.0
                 found.append((option, point))
@@ -118,14 +178,6 @@ def _cosines(rows: Array) -> Array:
     """|cos| of the angle between every two rows."""
     unit = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     return np.abs(unit @ unit.T)
-
-
-STEPS = (1.0, 0.3, 0.1, 0.03)  # towards the corner that a peak points to: ridges are narrow
-NEAR = 0.1  # ln of the frequency: rows of one curve nearer than that are one peak
-PEAKS, EACH = 40, 2  # that climb, the highest, and from how many plants each
-BELOW = 0.1  # ln: how far below its bound a peak may start
-CLIMBS = 4  # rounds of them
-LEAST = 0.1 * WITHIN  # ln: a peak that gains less has arrived
 
 
 @dataclass(frozen=True)
@@ -140,37 +192,42 @@ class Peak:
     value: float
     largest: float
 
-    def row_of(self, loops: Loops, plant: int) -> int | None:
-        """The row of a plant that is this peak there: the highest near it."""
-        near = np.abs(loops.log_omega - self.log_omega) < NEAR
+    def row_of(self, loops: Loops, plant: int, within: float) -> int | None:
+        """The row of a plant that is this peak there: the highest `within` it in ln ω."""
+        near = np.abs(loops.log_omega - self.log_omega) < within
         rows = np.flatnonzero(near & (loops.plant == plant) & (loops.curve == self.curve))
         return int(rows[np.argmax(loops.value[rows])]) if len(rows) else None
 
 
-def climbed(loop: LoopOnBox, points: Sequence[tuple[int, Array]]) -> tuple[list[Excess], int]:
+def climbed(
+    loop: LoopOnBox, points: Sequence[tuple[int, Array]],
+    options: WorstPlantOptions = WorstPlantOptions(),
+) -> tuple[list[Excess], int]:  # fmt: skip
     """The worst plants found from these points (option, point) on, the worst first, and how many
-    were looked at; of those within every bound the worst alone."""
+    were assessed; of those within every bound the worst alone."""
     loops = loop.assessed(loop.uncertain.plants(points))
-    peaks, looked = _distinct(points, loops), len(points)
+    peaks, looked = _distinct(points, loops, options), len(points)
     ends: list[Peak] = []
-    for _ in range(CLIMBS):
-        steps = _towards_corners(loop, peaks)
+    for _ in range(options.climbs):
+        steps = _towards_corners(loop, peaks, options)
         if not steps:
             break
         looked += len(steps)
-        moved = _moved(loop, peaks, steps)
-        rising = [after.value > before.value + LEAST and after.value < UNSTABLE
+        moved = _moved(loop, peaks, steps, options.near)
+        rising = [after.value > before.value + options.least_gain
+                  and after.value < loop.unstable
                   for before, after in zip(peaks, moved, strict=True)]  # fmt: skip
         ends += [peak for peak, on in zip(moved, rising, strict=True) if not on]
         peaks = [peak for peak, on in zip(moved, rising, strict=True) if on]
     ends += peaks
     ends.sort(key=lambda end: -end.value)
     lost = [Excess(*points[i], float(loops.largest[i])) for i in _unstable(loops)]
-    found = [*lost, *_apart(loop, [end for end in ends if end.value > 0.0] or ends[:1])]
+    over = [end for end in ends if end.value > 0.0] or ends[:1]
+    found = [*lost, *_apart(loop, over, options)]
     return sorted(found, key=lambda end: -end.value), looked
 
 
-def _apart(loop: LoopOnBox, peaks: Sequence[Peak]) -> list[Excess]:
+def _apart(loop: LoopOnBox, peaks: Sequence[Peak], options: WorstPlantOptions) -> list[Excess]:
     """The plants of these peaks, the highest first, without those whose peak is as high on one
     before it."""
     if not peaks:
@@ -178,60 +235,66 @@ def _apart(loop: LoopOnBox, peaks: Sequence[Peak]) -> list[Excess]:
     loops = loop.assessed(loop.uncertain.plants([(peak.option, peak.point) for peak in peaks]))
     found: list[int] = []
     for i, peak in enumerate(peaks):
-        rows = [peak.row_of(loops, j) for j in found if peaks[j].option == peak.option]
-        if all(row is None or loops.value[row] < peak.value - WITHIN for row in rows):
+        alike = [j for j in found if peaks[j].option == peak.option]
+        rows = [peak.row_of(loops, j, options.near) for j in alike]
+        if all(row is None or loops.value[row] < peak.value - options.within for row in rows):
             found.append(i)
     return [Excess(peaks[i].option, peaks[i].point, float(loops.largest[i])) for i in found]
 
 
 def _unstable(loops: Loops) -> list[int]:
-    return np.flatnonzero(loops.largest >= UNSTABLE).tolist()
+    return np.flatnonzero(loops.largest >= LoopOnBox.unstable).tolist()
 
 
-def _distinct(points: Sequence[tuple[int, Array]], loops: Loops) -> list[Peak]:
+def _distinct(
+    points: Sequence[tuple[int, Array]], loops: Loops, options: WorstPlantOptions
+) -> list[Peak]:
     """The highest peaks, those of every option apart, each on the plants where it is highest."""
     found, many = list[Peak](), Counter[tuple[int, int, int]]()
     for row in np.argsort(-loops.value, kind="stable").tolist():
         value, plant = float(loops.value[row]), int(loops.plant[row])
-        if found and (value < -BELOW or len(found) == PEAKS):
+        if found and (value < -options.depth or len(found) == options.peaks):
             break
         option, point = points[plant]
         curve, log_omega = int(loops.curve[row]), float(loops.log_omega[row])
-        key = option, curve, round(log_omega / NEAR)
+        key = option, curve, round(log_omega / options.near)
         many[key] += 1
-        if many[key] <= EACH:
+        if many[key] <= options.plants_of_peak:
             largest = float(loops.largest[plant])
             found.append(Peak(option, point, curve, log_omega, value, largest))
     return found
 
 
-def _towards_corners(loop: LoopOnBox, peaks: Sequence[Peak]) -> list[tuple[int, Array]]:
+def _towards_corners(
+    loop: LoopOnBox, peaks: Sequence[Peak], options: WorstPlantOptions
+) -> list[tuple[int, Array]]:
     """Steps from every peak: its number and the point."""
     if not peaks:
         return []
     box = loop.uncertain.box
     loops = loop.assessed([loop.uncertain.sloped(peak.point, peak.option) for peak in peaks])
-    rows = {i: row for i, peak in enumerate(peaks) if (row := peak.row_of(loops, i)) is not None}
+    found = (peak.row_of(loops, i, options.near) for i, peak in enumerate(peaks))
+    rows = {i: row for i, row in enumerate(found) if row is not None}
     if not rows:
         return []
     steps: list[tuple[int, Array]] = []
     for i, slope in zip(rows, loops.slopes(np.array(list(rows.values()))), strict=True):
         point = peaks[i].point
         corner = np.where(slope > 0.0, box[1], np.where(slope < 0.0, box[0], point))
-        ahead = [point + step * (corner - point) for step in STEPS]
+        ahead = [point + step * (corner - point) for step in options.steps]
         steps += [(i, other) for other in ahead if (other != point).any()]
     return steps
 
 
 def _moved(
-    loop: LoopOnBox, peaks: Sequence[Peak], steps: Sequence[tuple[int, Array]]
+    loop: LoopOnBox, peaks: Sequence[Peak], steps: Sequence[tuple[int, Array]], near: float
 ) -> list[Peak]:
     """Every peak where it is highest: where it was, or after one of the steps from there."""
     loops = loop.assessed(loop.uncertain.plants([(peaks[i].option, point) for i, point in steps]))
     out = list(peaks)
     for number, (i, point) in enumerate(steps):
-        largest, row = float(loops.largest[number]), peaks[i].row_of(loops, number)
-        if largest >= UNSTABLE:
+        largest, row = float(loops.largest[number]), peaks[i].row_of(loops, number, near)
+        if largest >= loop.unstable:
             value, at = largest, out[i].log_omega
         elif row is not None:
             value, at = float(loops.value[row]), float(loops.log_omega[row])
@@ -242,24 +305,31 @@ def _moved(
     return out
 
 
-LATTICE = 200  # plants, evenly over the box
-UNDAMPED = 30  # of more than four parameters, which are not looked through evenly anyway
-EVENLY = 4  # of so many plants one keeps its damping, the others have the least: peaks are sharp
-ALONG = 61  # plants along each theta that varies, at every corner of the rest
-SEARCHES = 6
-ROUNDS = 7  # of a compass search, its step halved each time
-FEW = 4  # parameters up to which every one is moved on its own
+def lattice(
+    uncertain: UncertainPlant, count: int, seed: int, *, along: int = 61
+) -> list[tuple[int, Array]]:
+    """Spread plants over the box: corners, lines along ranges, and a Latin hypercube.
 
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+    count, seed : int
+        Points of the hypercube, the options in turn; evenly on one parameter.
+    along : int
+        Points along each parameter of the model that varies, at every corner of the others.
 
-def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int, Array]]:
-    """About `count` points over the box of every option, its corners among them."""
+    Returns
+    -------
+    list of (option, point)
+        The corners of every option first.
+    """
     box, n = uncertain.box, len(uncertain.names)
     found = uncertain.corners()
     for row in range(n - len(uncertain.ranges), n):  # along a stroke what is worst comes and goes
         found += [
             (option, np.where(np.arange(n) == row, value, corner))
             for option, corner in uncertain.corners()
-            for value in np.linspace(box[0, row], box[1, row], ALONG)
+            for value in np.linspace(box[0, row], box[1, row], along)
         ]
     if n == 0:
         return found
@@ -274,21 +344,43 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
     return found + [(i % share, point) for i, point in enumerate(points)]
 
 
-def worst_plants(loop: LoopOnBox, seed: int = 0, count: int = LATTICE) -> tuple[list[Excess], int]:
-    """The worst plants found, the worst first, and how many were looked at."""
+def worst_plants(
+    loop: LoopOnBox, seed: int = 0, count: int = WorstPlantOptions.lattice,
+    options: WorstPlantOptions = WorstPlantOptions(),
+) -> tuple[list[Excess], int]:  # fmt: skip
+    """Search the worst plants of a box.
+
+    Of few parameters by compass searches from a lattice; of many by climbs of the highest peaks,
+    along their slopes to the corners, from a lattice and from modes that meet.
+
+    Parameters
+    ----------
+    loop, seed : LoopOnBox, int
+    count : int
+        Plants of the lattice, of many parameters `options.lattice_of_many` at most.
+    options : WorstPlantOptions
+
+    Returns
+    -------
+    found : list of Excess
+        The worst first.
+    assessed : int
+        How many plants were assessed.
+    """
     uncertain, n = loop.uncertain, len(loop.uncertain.names)
-    if n > FEW:
-        points = _sharp(uncertain, lattice(uncertain, min(count, UNDAMPED), seed))
-        return climbed(loop, [*points, *meetings(uncertain)])
+    if n > options.few:
+        points = lattice(uncertain, min(count, options.lattice_of_many), seed)
+        points = _sharp(uncertain, points, options.damped_every)
+        return climbed(loop, [*points, *meetings(uncertain)], options)
     points = lattice(uncertain, count, seed)
     value = loop.excesses(points)
-    looked, first = len(points), np.argsort(-value)[:SEARCHES]
+    looked, first = len(points), np.argsort(-value)[: options.searches]
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
         return heads, looked
     box = uncertain.box
     step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
-    for _ in range(ROUNDS):
+    for _ in range(options.rounds):
         moves = [
             (row, np.clip(head.point + sign * step * unit, *box))
             for row, head in enumerate(heads)
@@ -306,11 +398,11 @@ def worst_plants(loop: LoopOnBox, seed: int = 0, count: int = LATTICE) -> tuple[
 
 
 def _sharp(
-    uncertain: UncertainPlant, points: Sequence[tuple[int, Array]]
+    uncertain: UncertainPlant, points: Sequence[tuple[int, Array]], every: int
 ) -> list[tuple[int, Array]]:
-    """These points, most of them with the least damping."""
+    """These points, one in `every` as it is, the others with the least damping: peaks are sharp."""
     own = np.array([name == "damping" for name in uncertain.names])
     return [
-        (option, np.where(own & (i % EVENLY > 0), uncertain.box[0], point))
+        (option, np.where(own & (i % every > 0), uncertain.box[0], point))
         for i, (option, point) in enumerate(points)
     ]

@@ -16,9 +16,17 @@ from ccd_casadi.synthesis.weights import Weights
 
 @dataclass(frozen=True)
 class FigureOfMerit:
-    """A value v of the inner problem: its key, its symbol, and how it is shown.
+    """A figure v of a controller that the outer problem counts, and how it is shown.
 
-    `unit` and `factor` (per SI unit) are for the eye, `entry` is its stem in result.json.
+    Attributes
+    ----------
+    key, words, symbol : str
+        Its value of `minimise`; its name; its symbol.
+    si_unit, unit, factor : str, str, float
+        v times `factor` is in `unit`, which is shown.
+    larger_is_better : bool
+    entry : str
+        Its stem in result.json.
     """
 
     key: str
@@ -58,7 +66,17 @@ Options = tuple[tuple[str, object], ...]
 
 @dataclass(frozen=True)
 class ControllerProblem:
-    """The base of all kinds: of largest bandwidth, continuous, on the plant of the case alone."""
+    """What a problem states of its controller; the base of all kinds.
+
+    By default a continuous controller of largest bandwidth, on the plant of the case alone.
+
+    Attributes
+    ----------
+    figure : FigureOfMerit
+        What J counts of the controller.
+    sampling : Sampling or None
+    plant_options : tuple of options
+    """
 
     @property
     def figure(self) -> FigureOfMerit:
@@ -92,10 +110,16 @@ class MixedSensitivityProblem(ControllerProblem):
 class RobustSet:
     """Plants on which the loop has to be stable and ‖S‖∞ within S_max.
 
-    Frequencies of the flexible modes times 1 + s, `shifts` values of s evenly over ±`shift`, and
-    with every one of them damping times each factor of `damping`. The controller is designed on the
-    plant shifted by `design_shift`; None leaves that open: both ends and the middle are tried, see
-    `design_choices`.
+    Attributes
+    ----------
+    shift, shifts : float, int
+        Frequencies of the flexible modes are multiplied by 1 + s, `shifts` values of s evenly over
+        ±`shift`.
+    damping : tuple of float
+        With every s damping is multiplied by each of these factors.
+    design_shift : float or None
+        s of the plant that the controller is designed on; None: both ends and the middle are tried
+        (`design_choices`).
     """
 
     shift: float

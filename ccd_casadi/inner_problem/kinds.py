@@ -15,7 +15,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of, structured_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import non_negative
@@ -30,15 +30,21 @@ ENDS = {  # of the ranges, as slopes to (ln ω_S, ln ω_T)
     "omega_S lower": (-1.0, 0.0), "omega_S upper": (1.0, 0.0),
     "omega_T lower": (0.0, -1.0), "omega_T upper": (0.0, 1.0),
 }  # fmt: skip
-RESIDUAL = 1e-3  # relative; above it the point is no stationary one and has no envelope gradient
 
 
 class InnerKind(ABC):
     """One kind of controller, for a problem; by default on the plant of the case alone, with S_max
     and S_low.
 
-    `slack`: relative, by how much its judge lets a bound be exceeded. `as_designed`: its
-    controllers run as they are, without being reduced. `title`: of such a controller in code.
+    Attributes
+    ----------
+    title : str
+        Of such a controller in code.
+    slack : float
+        Relative: by how much its judge lets a bound be exceeded.
+    as_designed : bool
+        Its controllers run as they are, without being reduced.
+    problem : CoDesignProblem
     """
 
     title: str = "Controller"
@@ -87,7 +93,13 @@ class InnerKind(ABC):
 
 
 class MixedSensitivity(InnerKind):
-    """H∞ controllers by the weights W_S, W_KS and W_T, over their frequencies."""
+    """H∞ controllers by the weights W_S, W_KS and W_T, over their frequencies ω_S and ω_T.
+
+    Attributes
+    ----------
+    problem : CoDesignProblem
+        Others as those of `InnerKind`.
+    """
 
     title = "H-infinity controller"
     slack = 1e-6
@@ -107,7 +119,7 @@ class MixedSensitivity(InnerKind):
         return "mixed sensitivity", ", ".join(words)
 
     def require_function(self) -> None:
-        """It always is."""
+        """It is a function of θ for every problem."""
 
     def members(self, theta: Sequence[float]) -> list[ScaledPlant]:
         return list(scaled_plant(self.problem, theta).members)
@@ -121,7 +133,7 @@ class MixedSensitivity(InnerKind):
         return (1.0,) if robust is None else robust.damping, (1.0,)
 
     def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
-        """γ/|W|."""
+        """S, KS and T stay below γ/|W|."""
 
         def over(hz: Array) -> Array:
             return np.asarray(gamma / np.abs(weights.responses(HZ * hz)))
@@ -133,10 +145,16 @@ class MixedSensitivity(InnerKind):
 
 
 class FixedStructure(InnerKind):
-    """Gain, notches, leads and roll-off on a set of plants, sampled or continuous."""
+    """Gain, notches, leads and roll-off on a set of plants, sampled or continuous.
+
+    Attributes
+    ----------
+    problem : CoDesignProblem
+        Others as those of `InnerKind`.
+    """
 
     title = "Controller of sections (integrator, lead, notches, roll-off)"
-    slack = LOOSE
+    slack = BoxCheckOptions.looseness
     as_designed = True
 
     def value(self, theta: Sequence[float]) -> tuple[float, Array]:
@@ -190,7 +208,17 @@ class FixedStructure(InnerKind):
 
 
 def kind_of(problem: CoDesignProblem) -> InnerKind:
-    """The kind of inner problem."""
+    """Find the kind of inner problem of a co-design problem.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    InnerKind
+        Of `KINDS`, by the class of `problem.controller`.
+    """
     return KINDS[type(problem.controller)](problem)
 
 
@@ -202,18 +230,37 @@ KINDS: dict[type[ControllerProblem], type[InnerKind]] = {
 
 
 def bandwidth_gradient(
-    optimum: Sensitivities, active: tuple[str, ...], bounded: tuple[str, ...]
+    optimum: Sensitivities,
+    active: tuple[str, ...],
+    bounded: tuple[str, ...],
+    *,
+    most_residual: float = 1e-3,
 ) -> Array:
-    """dω_b*/dθ (n_θ,) in rad/s per unit of θ, where the plant has slopes (else n_θ is 0); NaN where
-    the optimality conditions do not hold.
+    """Find the gradient of ω_b*(θ) by the envelope theorem.
 
-    `bounded` names the rows 1 to -2 of the optimum's values, as `InnerBounds.bounds` does.
+        dω_b*/dθ = ∂ω_b/∂θ - Σ μ_j ∂g_j/∂θ,   ∂ω_b/∂x = Σ μ_j ∂g_j/∂x,   x = (ln ω_S, ln ω_T)
+
+    Parameters
+    ----------
+    optimum : Sensitivities
+        At the optimum.
+    active, bounded : tuple of str
+        What binds there; the names of the rows 1 to -2 of the optimum's values, as
+        `InnerBounds.bounds` has them.
+    most_residual : float
+        Relative: above it the point is not stationary.
+
+    Returns
+    -------
+    array (n_θ,)
+        rad/s per unit of θ, where the plant has slopes (else n_θ is 0); NaN where the optimality
+        conditions do not hold.
     """
     x, theta, none = optimum.to_break_frequencies, optimum.to_theta, np.zeros_like(optimum.to_theta)
     rows = {name: (x[i], theta[i]) for i, name in enumerate(bounded, 1)}
     rows |= {name: (np.array(end), none[0]) for name, end in ENDS.items()}
     mu, residual = non_negative(np.reshape([rows[name][0] for name in active], (-1, 2)), x[0])
-    if residual > RESIDUAL:
+    if residual > most_residual:
         return np.full_like(none[0], np.nan)
     slopes = np.reshape([rows[name][1] for name in active], (len(mu), none.shape[1]))
     return np.asarray(theta[0] - mu @ slopes)
@@ -222,7 +269,18 @@ def bandwidth_gradient(
 def design_loops(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
 ) -> list[Loop]:
-    """The loops that a controller (SI) is designed for at θ: the model's first, as they run."""
+    """Make the loops that a controller is designed for.
+
+    Parameters
+    ----------
+    problem, theta, controller : CoDesignProblem, sequence of float, StateSpace
+        θ and K(s), e to force, in SI.
+
+    Returns
+    -------
+    list of Loop
+        As they run, the model's first.
+    """
     plants = kind_of(problem).plants(theta)
     return [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
 
@@ -237,7 +295,21 @@ def design_view(
     gamma: float = np.nan,
     label: str = "",
 ) -> LoopView:
-    """The view of a design; `weights` and γ of a mixed-sensitivity one."""
+    """Make the view of a design's loops for a page.
+
+    Parameters
+    ----------
+    problem, theta, controller : CoDesignProblem, sequence of float, StateSpace
+        θ and K(s) in SI.
+    bandwidth_hz, label : float, str
+        ω_b in Hz; the title.
+    weights, gamma : Weights, float
+        Of a mixed-sensitivity design.
+
+    Returns
+    -------
+    LoopView
+    """
     bounded = kind_of(problem).bounded(weights or problem.weights, gamma, bandwidth_hz)
     plants = kind_of(problem).members(theta)  # whose figures the result has
     loops = [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
@@ -246,10 +318,16 @@ def design_view(
 
 @dataclass(frozen=True)
 class LoopBudget:
-    """The budget on the model, and the largest RMS error (m) and force (N) on `plants` of them.
+    """The error budget of a controller.
 
-    None where the loop with the model is not stable; a plant with which it is not counts as
-    infinite.
+    Attributes
+    ----------
+    model : BudgetFigures or None
+        On the model; None where that loop is not stable.
+    plants : int
+    largest_error, largest_force : float
+        RMS, m and N, on any of the plants; infinite where a loop is not stable.
+    sampled : bool
     """
 
     model: BudgetFigures | None
@@ -262,7 +340,18 @@ class LoopBudget:
 def loop_budget(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
 ) -> LoopBudget | None:
-    """None for a problem without a budget; the controller in SI, as `controller.json` has it."""
+    """Evaluate the error budget of a controller.
+
+    Parameters
+    ----------
+    problem, theta, controller : CoDesignProblem, sequence of float, StateSpace
+        θ and K(s) in SI, as `controller.json` has it.
+
+    Returns
+    -------
+    LoopBudget or None
+        None for a problem without a budget.
+    """
     if problem.budget is None:
         return None
     loops = design_loops(problem, theta, controller)

@@ -22,16 +22,37 @@ from ccd_casadi.synthesis.closed_loop import recertified_in_si
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
-MET = 1e-9  # of its size: so far past 0 a constraint is met to rounding
-ACTIVE = 1e-6  # of its size: so near to 0 a design runs along it
+
+@dataclass(frozen=True)
+class ConstraintOptions:
+    """Numbers of the constraints λ(θ) <= 0, in shares of their sizes.
+
+    Attributes
+    ----------
+    met : float
+        Above 0 up to which a constraint is met to rounding.
+    active : float
+        Below 0 within which a constraint is active.
+    """
+
+    met: float = 1e-9
+    active: float = 1e-6
 
 
 @dataclass(frozen=True)
 class InnerValue:
-    """v(θ) and its gradient (n,) per unit of θ: ω_b* in rad/s, NaN where no design is certified.
+    """The value v(θ) of the inner problem.
 
-    Where the inner problem minimises something else `error` is that in SI (RMS error in m, time of
-    a move in s) and what the gradient is of; `bandwidth` is that of its controller.
+    Attributes
+    ----------
+    theta : tuple of float (n,)
+    bandwidth : float
+        ω_b* in rad/s, or that of the controller where something else is minimised; NaN where no
+        design is certified.
+    gradient : tuple of float (n,)
+        dv/dθ per unit of θ.
+    error : float
+        Where it is minimised: RMS error in m, time of a move in s; else NaN.
     """
 
     theta: tuple[float, ...]
@@ -41,7 +62,7 @@ class InnerValue:
 
     @property
     def value(self) -> float:
-        """What J counts."""
+        """v: the error where it is minimised, else the bandwidth."""
         return self.bandwidth if np.isnan(self.error) else self.error
 
     @property
@@ -51,25 +72,67 @@ class InnerValue:
 
 
 def constraint_sizes(problem: CoDesignProblem) -> Array:
-    """The size (m,) of each constraint, positive."""
+    """Find the size of each constraint: its change over the box or its values, whichever is known.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    array (m,)
+        Positive, in the units of λ.
+    """
     return _sizes(problem.source, problem.names, problem.lower, problem.upper, problem.start)
 
 
 def constraint_shares(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> Array:
-    """λ(θ) (m,) over the sizes."""
+    """Evaluate the constraints over their sizes.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, array (n,)
+        θ in SI.
+
+    Returns
+    -------
+    array (m,)
+        λ(θ) over `constraint_sizes`.
+    """
     return constraint_values(plant_of(problem), theta) / constraint_sizes(problem)
 
 
 def violated(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
-    """Names of the constraints that θ breaks by more than rounding; none where it is allowed."""
+    """Name the constraints that θ exceeds by more than rounding.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, array (n,)
+
+    Returns
+    -------
+    tuple of str
+        Empty where θ is allowed; an unknown (NaN) constraint is exceeded.
+    """
     names, shares = plant_of(problem).constraint_names, constraint_shares(problem, theta)
-    return tuple(name for name, share in zip(names, shares, strict=True) if not share <= MET)
+    met = ConstraintOptions.met
+    return tuple(name for name, share in zip(names, shares, strict=True) if not share <= met)
 
 
 def binding(problem: CoDesignProblem, theta: Array | tuple[float, ...]) -> tuple[str, ...]:
-    """Names of the constraints that are active at θ."""
+    """Name the constraints that are active at θ.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, array (n,)
+
+    Returns
+    -------
+    tuple of str
+    """
     names, shares = plant_of(problem).constraint_names, constraint_shares(problem, theta)
-    return tuple(name for name, share in zip(names, shares, strict=True) if share >= -ACTIVE)
+    active = ConstraintOptions.active
+    return tuple(name for name, share in zip(names, shares, strict=True) if share >= -active)
 
 
 @lru_cache(maxsize=8)
@@ -86,20 +149,50 @@ def _sizes(source: PlantSource, names: Names, lower: Ends, upper: Ends, start: E
 
 
 def objective(problem: CoDesignProblem, theta: Sequence[float] | Array, value: float) -> float:
-    """J at θ with a value v of the inner problem."""
+    """Evaluate J = w1 f(θ) + w2 v.
+
+    Parameters
+    ----------
+    problem, theta, value : CoDesignProblem, array (n,), float
+        θ and a value v of the inner problem, in SI.
+
+    Returns
+    -------
+    float
+    """
     return sum(objective_terms(problem, theta, value))
 
 
 def objective_terms(
     problem: CoDesignProblem, theta: Sequence[float] | Array, value: float
 ) -> tuple[float, float]:
-    """w1 f(θ) and w2 v, which may cancel."""
+    """Evaluate the terms of J, which may cancel.
+
+    Parameters
+    ----------
+    problem, theta, value : CoDesignProblem, array (n,), float
+
+    Returns
+    -------
+    tuple of two floats
+        w1 f(θ) and w2 v.
+    """
     cost = hardware_cost(plant_of(problem), theta)
     return problem.w1 * cost, problem.w2 * float(value)
 
 
 def objective_of(problem: CoDesignProblem, sample: InnerValue) -> float:
-    """J of a sample; infinite where no design is certified or λ(θ) <= 0 is not met."""
+    """Evaluate J of a sample.
+
+    Parameters
+    ----------
+    problem, sample : CoDesignProblem, InnerValue
+
+    Returns
+    -------
+    float
+        Infinite where no design is certified or λ(θ) <= 0 is not met.
+    """
     if not sample.feasible or violated(problem, sample.theta):
         return np.inf
     return objective(problem, sample.theta, sample.value)
@@ -115,7 +208,17 @@ class Hardware:
 
 
 def hardware_at(problem: CoDesignProblem, theta: Array) -> Hardware:
-    """What θ costs and may not, to first order."""
+    """Find the cost and the constraints of the hardware to first order.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, array (n,)
+
+    Returns
+    -------
+    Hardware
+        Slopes per share of the box.
+    """
     df, dlam = hardware_slopes(plant_of(problem), theta)
     width, sizes = box(problem).width, constraint_sizes(problem)
     shares = constraint_shares(problem, theta)
@@ -123,7 +226,17 @@ def hardware_at(problem: CoDesignProblem, theta: Array) -> Hardware:
 
 
 def objective_gradient(problem: CoDesignProblem, sample: InnerValue) -> Array:
-    """∇J (n,) per share of the box; of one side, where v has a kink."""
+    """Find the gradient of J at a sample.
+
+    Parameters
+    ----------
+    problem, sample : CoDesignProblem, InnerValue
+
+    Returns
+    -------
+    array (n,)
+        ∇J per share of the box; of one side, where v has a kink.
+    """
     own = hardware_at(problem, np.array(sample.theta)).cost_gradient
     return own + problem.w2 * np.array(sample.gradient) * box(problem).width
 
@@ -131,7 +244,18 @@ def objective_gradient(problem: CoDesignProblem, sample: InnerValue) -> Array:
 def final_design(
     problem: CoDesignProblem, theta: Sequence[float], point: tuple[float, float]
 ) -> Design:
-    """The synthesis at (ω_S, ω_T) in rad/s that is handed out, in SI and certified again there."""
+    """Make the design that a run writes: one synthesis, certified again in SI.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+    point : tuple of two floats
+        ω_S and ω_T in rad/s.
+
+    Returns
+    -------
+    Design
+    """
     plant, inner = scaled_plant(problem, theta), problem.inner
     made = synthesise(
         plant, problem.weights.at(*point), omega_low=inner.omega_low,

@@ -30,7 +30,6 @@ from ccd_casadi.support.user_code import (
 INSTALLED = {"site-packages", "dist-packages"}
 STANDARD = Path(ast.__file__).parent
 OURS = Path(__file__).parents[1]
-LONGEST = 255  # letters: a longer string names no file
 
 
 def files_of(path: Path, words: Iterable[str] = ()) -> tuple[Path, ...]:
@@ -47,7 +46,7 @@ def files_of(path: Path, words: Iterable[str] = ()) -> tuple[Path, ...]:
         try:
             tree = ast.parse(module.read_bytes())
         except (OSError, SyntaxError, ValueError, RecursionError):
-            continue  # it is told where the file is loaded
+            continue  # reported where the file is loaded
         strings = [
             node.value for node in ast.walk(tree)
             if isinstance(node, ast.Constant) and isinstance(node.value, str)
@@ -131,10 +130,10 @@ def _modules(name: str, base: list[str] | None, folder: Path) -> Iterator[Path]:
         places = list(spec.submodule_search_locations)
 
 
-def _beside(words: Iterable[str], folders: Iterable[Path]) -> Iterator[Path]:
-    """The files that strings name, those of a folder that they name included."""
+def _beside(words: Iterable[str], folders: Iterable[Path], *, longest: int = 255) -> Iterator[Path]:
+    """The files that strings (of `longest` letters at most) name, those in a named folder too."""
     for word in set(words):
-        if not word.strip("./ ") or len(word) > LONGEST or "\0" in word or "\n" in word:
+        if not word.strip("./ ") or len(word) > longest or "\0" in word or "\n" in word:
             continue
         for folder in folders:
             place = (folder / word).resolve()
@@ -152,22 +151,37 @@ Ends = tuple[float, ...]
 
 @dataclass(frozen=True)
 class PlantSource:
-    """Where the model comes from: a known name or `file.py:function`, and its options.
+    """The origin of a plant: a shipped model, or a function in a file, and its options.
 
-    `fixed`: parameters that are not in θ, each with value and unit. `places`: where its forces and
-    sensors stand, if not at nodes. `motion`: the move that it is for, and its motors.
+    Attributes
+    ----------
+    model, file, function : str or None
+        A name of the registry, or `file.py` and the function in it.
+    options : tuple of (str, object)
+        Keyword arguments.
+    seconds : float
+        Time limit of a function; it is not part of the plant's identity.
+    content : str or None
+        SHA-256 of its files as the case was read; None: as they are now.
+    fixed : tuple of (name, value, unit)
+        Parameters that are not in θ.
+    places : Places or None
+        Positions of its forces and sensors, if these are not at nodes.
+    motion : Motion or None
+        The move that it is for, and its motors.
+    given : GivenFunction or None
+        A function of a program, whose `content` the program states.
     """
 
     model: str | None
     file: str | None
     function: str | None
     options: tuple[tuple[str, object], ...]
-    seconds: float = 60.0  # that a function may take; no part of what the plant is
-    content: str | None = None  # SHA-256 of its files as the case was read; None: as they are now
+    seconds: float = 60.0
+    content: str | None = None
     fixed: tuple[tuple[str, float, str], ...] = ()
     places: Places | None = None
     motion: Motion | None = None
-    # of a program, with a `content` of its own: nobody sees what it depends on
     given: GivenFunction | None = field(default=None, compare=False)
 
     @property
@@ -312,7 +326,7 @@ def _own_function(source: PlantSource) -> ModelFunction:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     try:
-        sys.dont_write_bytecode = True  # which is told apart by the second: an edit may be sooner
+        sys.dont_write_bytecode = True  # it is dated by the second: an edit may be sooner
         with_time_limit(loader.exec_module, source.seconds, late)(module)
         function = with_time_limit(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:

@@ -1,4 +1,4 @@
-"""A co-design problem: everything that determines the true ω_b*(θ), and the way to ask for it.
+"""A co-design problem: everything that determines the true ω_b*(θ), and the way to find it.
 
 It is made of plain values, so that it can be sent to a worker process, hashed, and written
 beside the samples that it determines.
@@ -160,9 +160,22 @@ class CoDesignProblem(NotebookHtml):
 
 
 def plant_of(problem: CoDesignProblem) -> Plant:
-    """The plant, built once in a process.
+    """Build the plant of a problem, once in a process.
 
-    Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    Plant
+
+    Raises
+    ------
+    UserError
+        It cannot be built.
+    UserCodeRefused
+        A user's function must not run.
     """
     use_units(*problem.spoken)
     return plant_from(problem.source, problem.names, problem.lower, problem.upper)
@@ -184,7 +197,7 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
     Raises
     ------
     PlantError
-        The model is no plant at θ.
+        The model is not a plant at θ.
 
     Examples
     --------
@@ -199,14 +212,35 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
 def free_modal(
     problem: CoDesignProblem, system: Mechanics, off: Perturbation = NOMINAL
 ) -> ModalPlant:
-    """Matrices of the plant, on or off the model, as every loop has them: free bodies are free."""
+    """Take a plant to modal coordinates as every loop has it: free bodies are free.
+
+    Parameters
+    ----------
+    problem, system : CoDesignProblem, Mechanics
+        The matrices, SI.
+    off : Perturbation
+        Of resonances and damping.
+
+    Returns
+    -------
+    ModalPlant
+        Without rigid modes that no loop drives or sees.
+    """
     return without_hidden_rigid_modes(modal_plant(system, problem.suspension.free, off))
 
 
 def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
-    """The same of given matrices, whatever they are of: the plant's own, or close to them.
+    """Scale given matrices as `scaled_plant` does those of the plant.
 
-    Free bodies are free on every plant but the one that controllers are made on.
+    Parameters
+    ----------
+    problem, system : CoDesignProblem, Mechanics
+        The matrices, SI: the plant's own or close to them.
+
+    Returns
+    -------
+    ScaledPlant
+        Free bodies are free on every plant of its family but the one that controllers are made on.
     """
     suspension, robust = problem.suspension, problem.robust
 
@@ -226,9 +260,18 @@ def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
 
 
 def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:
-    """The problem for each plant that its controllers may be made on; itself where that is one.
+    """List the problem for each plant that its controllers may be made on.
 
-    min over θ and design plants is the least of the minima over θ, so nothing is lost.
+    The minimum over θ and design plants is the least of the minima over θ.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    tuple of CoDesignProblem
+        The problem itself where there is one design plant.
     """
     robust = problem.robust
     if robust is None or robust.design_shift is not None:
@@ -269,9 +312,18 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
 def best_choice(
     problem: CoDesignProblem, theta: Sequence[float], system: Mechanics | None = None
 ) -> tuple[CoDesignProblem, InnerResult]:
-    """The choice of `design_choices` with the largest ω_b* at θ (least violation), and its result.
+    """Solve the inner problem for every choice of `design_choices`, and take the best.
 
-    `syntheses` counts those of all choices. `system`: matrices in place of the plant's own at θ.
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+    system : Mechanics, optional
+        In the place of the plant's own matrices at θ.
+
+    Returns
+    -------
+    choice, result : CoDesignProblem, InnerResult
+        Of the largest ω_b*, else of the least violation; `syntheses` counts those of all choices.
     """
     solve = sweep_inner if problem.method == "sweep" else search_inner
     system = mechanics(plant_of(problem), theta) if system is None else system
@@ -329,5 +381,15 @@ def _require_mixed(problem: CoDesignProblem) -> None:
 
 
 def box(problem: CoDesignProblem) -> Box:
-    """The bounds of θ."""
+    """Make the box of θ.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    Box
+        In SI.
+    """
     return Box(np.array(problem.lower), np.array(problem.upper))

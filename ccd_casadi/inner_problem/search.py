@@ -6,6 +6,7 @@ are synthesised and added until the interpolant has no better place to offer. A 
 solve then ends on the true functions, as after a sweep.
 """
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -20,18 +21,28 @@ from ccd_casadi.synthesis.weights import Weights
 from surrogates import Kernel
 from surrogates.covariance import covariance
 
-INITIAL = (4, 4)  # designs along ln ω_S and ln ω_T
-FINE = 81  # points a side on which the interpolant is searched
-ADDED = 8  # designs that the interpolant may ask for
-BUDGET = 40  # certified syntheses in all, the local solve included
-LENGTHS = np.array([0.35, 0.6])  # correlation lengths as fractions of the box
+
+@dataclass(frozen=True)
+class InnerSearchOptions:
+    """Numbers of the search by derivatives."""
+
+    initial: tuple[int, int] = (4, 4)  # designs along ln ω_S and ln ω_T
+    mesh: int = 81  # points a side on which the interpolant is searched
+    added: int = 8  # designs at maxima of the interpolant, at most
+    syntheses: int = 40  # certified ones in all, the local solve included
+    lengths: tuple[float, float] = (0.35, 0.6)  # correlation lengths as fractions of the box
 
 
-def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> InnerResult:
+def search_inner(
+    plant: ScaledPlant,
+    weights: Weights,
+    problem: InnerBounds,
+    options: InnerSearchOptions = InnerSearchOptions(),
+) -> InnerResult:
     """ω_b*(θ) from derivatives, some forty syntheses, those apart that are not certified."""
     bounds = np.log([problem.omega_S, problem.omega_T])
     width = bounds[:, 1] - bounds[:, 0]
-    grids = [np.linspace(0.0, 1.0, n) for n in INITIAL]
+    grids = [np.linspace(0.0, 1.0, n) for n in options.initial]
     points = [np.array([a, b]) for a in grids[0] for b in grids[1]]
     at = partial(evaluate, plant, weights, problem)
 
@@ -39,8 +50,8 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> 
         return at(problem.frequencies(bounds[:, 0] + point * width))
 
     designs = [design(point) for point in points]
-    fine = np.linspace(0.0, 1.0, FINE)
-    for _ in range(ADDED):
+    fine = np.linspace(0.0, 1.0, options.mesh)
+    for _ in range(options.added):
         usable = [i for i, design in enumerate(designs) if design.figures.certified]
         if not usable:
             break
@@ -49,13 +60,14 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerBounds) -> 
         dY = np.array([designs[i].to_break_frequencies[:-1] * width for i in usable])
         dY[:, 0] /= Y[:, :1]
         Y[:, 0] = np.log(Y[:, 0])
-        new = _next_point(problem, fine, _interpolate(X, Y, dY, fine), np.array(points), designs)
+        predicted = _interpolate(X, Y, dY, fine, np.array(options.lengths))
+        new = _next_point(problem, fine, predicted, np.array(points), designs)
         if new is None:
             break
         points.append(new)
         designs.append(design(new))
     rows = [design.figures for design in designs]
-    left = BUDGET - sum(row.certified for row in rows)
+    left = options.syntheses - sum(row.certified for row in rows)
     return refine(at, problem, rows, _starts(problem, rows), left)
 
 
@@ -72,20 +84,20 @@ def _starts(problem: InnerBounds, rows: list[DesignFigures]) -> list[Point]:
     return [] if chosen is None else [(chosen.omega_S, chosen.omega_T)]
 
 
-def _interpolate(X: Array, Y: Array, dY: Array, fine: Array) -> Array:
+def _interpolate(X: Array, Y: Array, dY: Array, fine: Array, lengths: Array) -> Array:
     """Gaussian radial-basis interpolant of values and gradients (n, q) on the mesh, (q, f, f).
 
     A Gaussian of two variables is the product of one of each: on a mesh φ = e_1 e_2ᵀ, and
     cov(f, ∂_j f_b) = z_j φ, so that matrix products of (f, n) give every point. The lengths are
     given, and one factor serves all outputs.
     """
-    x, one = X / LENGTHS, np.ones(X.shape[1])
+    x, one = X / lengths, np.ones(X.shape[1])
     K = covariance(Kernel.RBF, x, x, one, gradients_of_a=True, gradients_of_b=True)
     K[np.diag_indices_from(K)] += 1e-8
     mean = Y.mean(axis=0)
-    data = np.vstack([Y - mean] + [dY[:, :, i] * LENGTHS[i] for i in range(X.shape[1])])
+    data = np.vstack([Y - mean] + [dY[:, :, i] * lengths[i] for i in range(X.shape[1])])
     by_value, by_S, by_T = cho_solve(cho_factor(K), data).T.reshape(-1, 3, 1, len(X)).swapaxes(0, 1)
-    z_S, z_T = (fine[:, None] / LENGTHS[i] - x[:, i] for i in range(2))
+    z_S, z_T = (fine[:, None] / lengths[i] - x[:, i] for i in range(2))
     e_S, e_T = np.exp(-0.5 * z_S**2), np.exp(-0.5 * z_T**2)
     found = (e_S * (by_value + z_S * by_S)) @ e_T.T + (e_S * by_T) @ (z_T * e_T).T
     return mean[:, None, None] + found
@@ -123,6 +135,6 @@ def _next_point(
         candidates.sort(key=lambda place: -predicted[0][place])
     for place in candidates:
         point = fine[list(place)]
-        if np.abs(X - point).max(axis=1).min() > 0.6 / (FINE - 1):
+        if np.abs(X - point).max(axis=1).min() > 0.6 / (len(fine) - 1):
             return point
     return None

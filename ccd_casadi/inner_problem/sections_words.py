@@ -7,16 +7,21 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.structure import Kind
+from ccd_casadi.fixed_structure.structure import ParameterKind
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ, spoken
-
-NEAR = 1.1  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
 
 
 @dataclass(frozen=True)
 class SectionWords:
-    """What a section is; frequencies in Hz, damping ratios; None where it has none."""
+    """A section of a controller in words.
+
+    Attributes
+    ----------
+    kind : str
+    zero_hz, zero_damping, pole_hz, pole_damping : float or None
+        Frequencies in Hz, damping ratios; None where it has none.
+    """
 
     kind: str
     zero_hz: float | None = None
@@ -39,7 +44,18 @@ class SectionWords:
 
 
 def section_words(structure: Structure, kappa: Array) -> list[SectionWords]:
-    """The sections of κ in SI, in the order of the structure."""
+    """Describe the sections of a controller of one channel.
+
+    Parameters
+    ----------
+    structure, kappa : Structure, array (n,)
+        κ in SI.
+
+    Returns
+    -------
+    list of SectionWords
+        In the order of the structure.
+    """
     values = dict(zip(structure.names, np.exp(np.asarray(kappa, float)).tolist(), strict=True))
     hz = {name: value / HZ for name, value in values.items()}
     found = []
@@ -62,30 +78,50 @@ def section_words(structure: Structure, kappa: Array) -> list[SectionWords]:
 
 
 def _biquad(zero: float, pole: float, zero_damping: float, pole_damping: float) -> str:
-    if max(zero / pole, pole / zero) <= NEAR:
+    if max(zero / pole, pole / zero) <= 1.1:  # of nearly one frequency
         return "notch" if zero_damping < pole_damping else "resonance filter"
     return "skewed notch, lead" if zero < pole else "skewed notch, lag"
 
 
 def gain_of(kappa: Array) -> float:
-    """The factor k in N/m: |K| between the integrator's zero and the first other section."""
+    """Find the gain of a controller of one channel.
+
+    Parameters
+    ----------
+    kappa : array (n,)
+        In SI.
+
+    Returns
+    -------
+    float
+        k in N/m: |K| between the integrator's zero and the first other section.
+    """
     return float(np.exp(kappa[0]))
 
 
 def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict[str, Any]:
-    """`controller` of result.json and `sections` of controller.json.
+    """Make the entry `controller` of result.json and `sections` of controller.json.
 
-    Of several channels each is under `channels` with its directions, and all sections in one list.
+    Parameters
+    ----------
+    structure, kappa : Structure or ChannelStructure, array (n,)
+        κ in SI.
+
+    Returns
+    -------
+    dict
+        Of several channels each is under `channels` with its directions, and all sections are in
+        one list.
     """
     if isinstance(structure, ChannelStructure):
         return _channels_dict(structure, kappa)
-    units = {Kind.GAIN: spoken("N/m"), Kind.FREQUENCY: "Hz", Kind.DAMPING: "1"}
+    units = dict(zip(ParameterKind, (spoken("N/m"), "Hz", "1"), strict=True))
     rows = zip(structure.names, structure.kinds, np.exp(kappa).tolist(), strict=True)
     return {
         "structure": asdict(structure),
         "order": structure.order,
         "parameters": [
-            {"name": name, "value": value / HZ if kind is Kind.FREQUENCY else value,
+            {"name": name, "value": value / HZ if kind is ParameterKind.FREQUENCY else value,
              "unit": units[kind]}
             for name, kind, value in rows
         ],

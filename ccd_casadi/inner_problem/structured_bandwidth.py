@@ -14,7 +14,7 @@ from ccd_casadi.fixed_structure import SectionsDesign, Structure
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections
 from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.least_value import Goal, LeastValue, RmsError, least_value
-from ccd_casadi.fixed_structure.local_search import RESIDUAL, Envelope
+from ccd_casadi.fixed_structure.local_search import Envelope, OptimalityOptions
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.objective import InnerValue
@@ -37,20 +37,46 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ
 
-CHECKED, FRESH = 100, 500  # plants of the lattice, and drawn afresh
-FRESH_SEED = 3000  # apart from those of other draws
-PER_MOVE = 10.0  # a continuous loop is stepped 50 times in this share of the setpoint
+
+@dataclass(frozen=True)
+class MoveTimeOptions:
+    """Numbers of the check of a move's time on the box of plants."""
+
+    lattice: int = 100  # plants
+    fresh: int = 500  # plants drawn for the yield
+    fresh_seed: int = 3000  # added to the problem's, so that no other draw is repeated
+    steps: float = 10.0  # per duration of the setpoint: a continuous loop has 50 points in each
 
 
 def motion_of(problem: CoDesignProblem, theta: Sequence[float]) -> MotionAt:
-    """The move at θ, of a problem that has one."""
+    """Find the move of a problem that has one.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+
+    Returns
+    -------
+    MotionAt
+        The setpoint and the forces at θ.
+    """
     own = plant_of(problem).evaluate
     assert isinstance(own, DrivenMechanics)
     return own.at(tuple(map(float, theta)), problem.sampling)
 
 
 def require_motion(problem: CoDesignProblem) -> None:
-    """Raise UserError where the plant does not make its move."""
+    """Check that the plant makes its move.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Raises
+    ------
+    UserError
+        The plant has unlike numbers of inputs and outputs, or the move cannot be made.
+    """
     plant = plant_of(problem)
     if plant.inputs != plant.outputs:
         words = f"has {plant.inputs} inputs and {plant.outputs} outputs; [move] needs as many"
@@ -61,13 +87,25 @@ def require_motion(problem: CoDesignProblem) -> None:
 def exact_times(
     problem: CoDesignProblem, motion: MotionAt, plants: Sequence[ScaledPlant], K: StateSpace
 ) -> Array:
-    """From the start of the move until the error stays within the window, s; its end at least."""
+    """Simulate the move on plants: the time until the error stays within the window.
+
+    Parameters
+    ----------
+    problem, motion : CoDesignProblem, MotionAt
+    plants, K : sequence of ScaledPlant, StateSpace
+        K(s) in SI.
+
+    Returns
+    -------
+    array (plants,)
+        s from the start of the move, its end at least.
+    """
     profile = motion.cycle.profile
     found = [
         simulate(
             Loop(plant.plant_si(), K, problem.sampling), profile, axis=0,
             forces=motion.forward, window=motion.motion.window,
-            bandwidth_hz=PER_MOVE / profile.duration,
+            bandwidth_hz=MoveTimeOptions.steps / profile.duration,
         ).settled
         for plant in plants
     ]  # fmt: skip
@@ -79,37 +117,63 @@ def latest_plant(
 ) -> tuple[float, int, Array]:
     """The exact time on the latest plant of a lattice of the box, its option and its point."""
     uncertain = uncertain_plant(problem, theta)
-    points = lattice(uncertain, CHECKED, seed)
+    points = lattice(uncertain, MoveTimeOptions.lattice, seed)
     times = exact_times(problem, motion_of(problem, theta), uncertain.plants(points), K)
     return float(times.max()), *points[int(times.argmax())]
 
 
 def stated_time(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, value: float
-) -> tuple[float, Yield | None]:
-    """The time that a design is told to need (s), whose smooth time on the set is `value`, and how
-    many fresh plants need no longer."""
-    seed = structured_of(problem).seed
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, value: float,
+    options: MoveTimeOptions = MoveTimeOptions(),
+) -> tuple[float, Yield | None]:  # fmt: skip
+    """Find the time of the move that a run states, and its yield.
+
+    Parameters
+    ----------
+    problem, theta, K : CoDesignProblem, sequence of float, StateSpace
+    value : float
+        The smooth time on the set, s.
+    options : MoveTimeOptions
+
+    Returns
+    -------
+    time : float
+        s: the latest of the smooth time, the set, and a lattice of the box.
+    fresh : Yield or None
+        How many plants drawn from the box need no longer; None without a box.
+    """
+    seed, count = structured_of(problem).seed, options.fresh
     uncertain, motion = uncertain_plant(problem, theta), motion_of(problem, theta)
     on_set = exact_times(problem, motion, plants_of(problem, theta), K)
-    told = max(value, float(on_set.max()), latest_plant(problem, theta, K, seed + FRESH_SEED)[0])
+    latest = latest_plant(problem, theta, K, seed + options.fresh_seed)[0]
+    stated = max(value, float(on_set.max()), latest)
     if not uncertain.names:
-        return told, None
-    fresh = uncertain.drawn(np.random.default_rng((seed, FRESH_SEED)), FRESH)
+        return stated, None
+    fresh = uncertain.drawn(np.random.default_rng((seed, options.fresh_seed)), count)
     times = exact_times(problem, motion, uncertain.plants(fresh), K)
-    return told, Yield(int((times <= told).sum()), FRESH)
+    return stated, Yield(int((times <= stated).sum()), count)
 
 
-FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
-LOST = 1e-6  # relative: of the bandwidth, by rounding
-FEW = 8  # starts of the search at a θ where no warm start ends certified
+@dataclass(frozen=True)
+class StructuredValueOptions:
+    """Numbers of the searches at one θ."""
+
+    searches: int = 5  # at most, of which the last continue an end that is not optimal yet
+    rounding: float = 1e-6  # relative: of the bandwidth
+    starts: int = 8  # of the search at a θ where no warm start ends certified
 
 
 @dataclass(frozen=True)
 class StructuredValue(InnerValue):
-    """With the design, and how many climbs and multi-start searches it took (`syntheses`).
+    """The value of a fixed structure at a θ, with its design.
 
-    At a kink of the value the gradient is that of one side, and `envelope` has the others.
+    Attributes
+    ----------
+    design : SectionsDesign
+    syntheses : int
+        Climbs and multi-start searches that it took.
+    envelope : Envelope or None
+        All gradients at a kink of the value, where `gradient` is that of one side.
     """
 
     design: SectionsDesign
@@ -119,14 +183,18 @@ class StructuredValue(InnerValue):
 
 @dataclass(frozen=True)
 class ProblemAt:
-    """A problem of fixed structure at a θ: the plants there, and what is searched on them."""
+    """A problem of fixed structure at a θ: the plants there, and the searches on them.
+
+    Attributes
+    ----------
+    problem, theta : CoDesignProblem, sequence of float (n,)
+    """
 
     problem: CoDesignProblem
     theta: Sequence[float]
 
     @cached_property
     def plants(self) -> list[ScaledPlant]:
-        """The plant set."""
         return plants_of(self.problem, self.theta)
 
     def searched(
@@ -196,9 +264,23 @@ class ProblemAt:
 
 
 def structured_value(
-    problem: CoDesignProblem, theta: Sequence[float], workers: Pool | None = None
-) -> StructuredValue:
-    """The best certified design from the problem's warm starts at θ, and the envelope gradient."""
+    problem: CoDesignProblem, theta: Sequence[float], workers: Pool | None = None,
+    options: StructuredValueOptions = StructuredValueOptions(),
+) -> StructuredValue:  # fmt: skip
+    """Find v(θ): the best certified design from the problem's warm starts, and its gradient.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+        θ in SI.
+    workers : Pool, optional
+        The searches are spread over them.
+    options : StructuredValueOptions
+
+    Returns
+    -------
+    StructuredValue
+    """
     here, starts = ProblemAt(problem, theta), structured_of(problem).starts
     initial = warm_starts_at(problem, structure_of(problem), here.plants, bounds_of(problem))
     made: SectionsDesign | None = None
@@ -207,26 +289,38 @@ def structured_value(
         made = here.searched(initial, workers=workers)
         spent += 1
     if made is None or (starts and not made.certified):
-        made = here.searched(initial, min(FEW, starts), workers=workers)
+        made = here.searched(initial, min(options.starts, starts), workers=workers)
         spent += 1
-    while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
+    limit = OptimalityOptions.residual
+    while made.certified and made.kkt_residual > limit and spent < options.searches:
         again = here.searched([made.kappa], workers=workers)
         spent += 1
-        if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
+        kept = (1.0 - options.rounding) * made.bandwidth
+        if not again.certified or again.bandwidth < kept:
             break
         made = again
     return here.value_of(made, spent, only_initial=True)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
-    """Raise UserError where J counts another figure, for a command that knows ω_b alone."""
+    """Check that J counts ω_b, for a command that knows ω_b alone.
+
+    Parameters
+    ----------
+    problem, command : CoDesignProblem, str
+
+    Raises
+    ------
+    UserError
+        J counts another figure.
+    """
     if problem.figure is not BANDWIDTH:
         words = f"{command} counts the bandwidth; solve, inner and retrain count the others"
         raise UserError(f'inner.minimise: is "{problem.figure.key}", and {words}')
 
 
 def too_slow(problem: CoDesignProblem, design: SectionsDesign) -> SectionsDesign:
-    """The design, no longer a certified one where what is minimised asks for more bandwidth."""
+    """The design, not certified where what is minimised requires more bandwidth."""
     least = structured_of(problem).bandwidth_least
     if not design.certified or design.bandwidth >= least:
         return design

@@ -27,17 +27,34 @@ from ccd_casadi.plants.plant import Evaluate, FromExpressions, Mechanics, mechan
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
-ALMOST = 0.99  # of the lowest flexible frequency of all: below it the suspension is
-
 
 def structured_of(problem: CoDesignProblem) -> StructuredProblem:
-    """The controller part of a structured problem."""
+    """Take the part of a structured problem that states its controller.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    StructuredProblem
+    """
     assert isinstance(problem.controller, StructuredProblem)
     return problem.controller
 
 
 def bounds_of(problem: CoDesignProblem) -> Bounds:
-    """The bounds on every plant, SI."""
+    """Collect the bounds that hold on every plant.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    Bounds
+        In SI, with those of single channels.
+    """
     structured, inner = structured_of(problem), problem.inner
     weighted = structured.weighted_level is not None
     return Bounds(
@@ -72,7 +89,17 @@ def _channel_bounds(problem: CoDesignProblem) -> tuple[ChannelBounds, ...]:
 
 
 def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:
-    """The controller's structure: one, or one for each channel of a plant with several."""
+    """Find the structure of the controller.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    Structure or ChannelStructure
+        One structure for each channel of a plant with several outputs.
+    """
     if plant_of(problem).outputs == 1:
         return structured_of(problem).structure
     channels = structured_of(with_channels(problem)).channels
@@ -104,7 +131,19 @@ def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
 def nearby(
     problem: CoDesignProblem, known: Sequence[Sequence[float]], here: Sequence[float]
 ) -> tuple[Evaluate, ...]:
-    """The model with every option set, from what is known at some θ; see `plants.plant.near`."""
+    """Approximate the model with every option set from its values at some θ.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    known, here : sequence of sequences of float, sequence of float
+        θ where the model is known; θ near which it is required.
+
+    Returns
+    -------
+    tuple of callables
+        As `plants.plant.nearby_model` gives them, one for each option set.
+    """
     return tuple(nearby_model(plant_of(option), known, here) for option in _options(problem))
 
 
@@ -116,9 +155,17 @@ def _options(problem: CoDesignProblem) -> list[CoDesignProblem]:
 def uncertain_plant(
     problem: CoDesignProblem, theta: Sequence[float], known: Sequence[Mechanics] = ()
 ) -> UncertainPlant:
-    """The model at θ with every option set, and the box of what may differ from it.
+    """Make the model at θ with every option set, and the box of plants around it.
 
-    `known`: their matrices, in the place of the plants' own.
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+    known : sequence of Mechanics
+        Matrices of every option set, in the place of the plants' own.
+
+    Returns
+    -------
+    UncertainPlant
     """
     u, held = structured_of(problem).uncertainty, problem.source.held
     options = _options(problem)
@@ -142,7 +189,17 @@ def uncertain_plant(
 
 
 def with_ranges(problem: CoDesignProblem) -> CoDesignProblem:
-    """The problem with what varies as the last of its parameters."""
+    """Append the parameters that vary to those of a problem.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+
+    Returns
+    -------
+    CoDesignProblem
+        Its last parameters are the ranges of `[robust]`.
+    """
     ranges = structured_of(problem).uncertainty.ranges
     if not ranges:
         return problem
@@ -163,20 +220,51 @@ def with_ranges(problem: CoDesignProblem) -> CoDesignProblem:
 def with_options(
     problem: CoDesignProblem, options: Sequence[tuple[str, object]]
 ) -> CoDesignProblem:
-    """The problem with some options of its plant replaced."""
+    """Replace some options of a problem's plant.
+
+    Parameters
+    ----------
+    problem, options : CoDesignProblem, sequence of (str, object)
+
+    Returns
+    -------
+    CoDesignProblem
+    """
     merged = tuple(sorted((dict(problem.source.options) | dict(options)).items()))
     source: PlantSource = replace(problem.source, options=merged)
     return replace(problem, source=source)
 
 
 def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPlant]:
-    """The plant set at θ: its plants, or the corners of the box where none are known yet."""
+    """Make the plant set at θ.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+
+    Returns
+    -------
+    list of ScaledPlant
+        The problem's scenarios, or the corners of the box where it has none yet.
+    """
     uncertain, scenarios = uncertain_plant(problem, theta), structured_of(problem).scenarios
     known = [(option, np.array(point)) for option, point in scenarios]
     return uncertain.plants(known or uncertain.corners())
 
 
 def with_structured(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:
+    """Change fields of a problem's `StructuredProblem`.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    changes
+        Fields by name.
+
+    Returns
+    -------
+    CoDesignProblem
+    """
     return replace(problem, controller=replace(structured_of(problem), **changes))  # type: ignore[arg-type]
 
 
@@ -186,12 +274,22 @@ def warm_starts_at(
     plants: Sequence[ScaledPlant],
     bounds: Bounds,
 ) -> list[Array]:
-    """Each warm start as it is or moved with the plant from the start θ, whichever is nearer; κ in
-    SI.
+    """Take the warm starts to the plants at a θ, as they are or moved, whichever is better there.
 
     Moved: frequencies with the first flexible mode, the gain as 1/|G| at the frequency that the
-    crossover moves with; a notch stays on its resonance. Of several channels each is moved on its
-    own, with the first mode that it sees.
+    crossover moves with; a notch stays on its resonance. Of several channels each is moved with the
+    first mode that it sees.
+
+    Parameters
+    ----------
+    problem, structure, bounds : CoDesignProblem, Structure or ChannelStructure, Bounds
+    plants : sequence of ScaledPlant
+        At the θ.
+
+    Returns
+    -------
+    list of array (n,)
+        κ in SI.
     """
     structured = structured_of(problem)
     if not structured.warm_starts:
@@ -236,7 +334,8 @@ def _first_mode(plant: ScaledPlant) -> float:
     """The lowest flexible frequency that the plant's states have, in rad/s; ω₀ if there is none."""
     flexible = plant.natural[plant.natural > 0.0]
     own = np.abs(np.linalg.eigvals(plant.A)) * plant.omega_0
-    light = own[own > ALMOST * flexible.min()] if len(flexible) else flexible
+    # below the lowest flexible frequency of all is the suspension
+    light = own[own > 0.99 * flexible.min()] if len(flexible) else flexible
     return float(light.min()) if len(light) else plant.omega_0
 
 

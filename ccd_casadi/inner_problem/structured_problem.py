@@ -31,11 +31,18 @@ Scenario = tuple[int, tuple[float, ...]]
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What may differ from the model; the defaults are: nothing.
+    """The uncertainty of the plant; by default there is none.
 
-    `damping`: least and largest factor. `options`: further option sets of the plant (loads,
-    positions), each what differs from the case's own. `ranges`: fixed parameters that vary, each
-    with its bounds.
+    Attributes
+    ----------
+    resonance_shift, mode_shift, gain : float
+        Relative, to either side: of all modes, of each, and of the plant.
+    damping : tuple of two floats
+        The least and the largest factor.
+    options : tuple of options
+        Further option sets of the plant (loads, positions), each what differs from the case's.
+    ranges : tuple of (name, lower, upper)
+        Fixed parameters that vary.
     """
 
     resonance_shift: float = 0.0
@@ -48,10 +55,18 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class ChannelProblem:
-    """One channel of a plant with several: its structure, and its directions of outputs and inputs
-    (None: not given; those that are found at the start hold then for every θ). `like` names the
-    channel whose parameters it has. What it keeps besides the whole loop, see `ChannelBounds`:
-    `S_max`, `M_K` (None: nothing), and `bandwidth_ratio` times ω_b."""
+    """One channel of a plant with several outputs.
+
+    Attributes
+    ----------
+    name, structure : str, Structure
+    outputs, inputs : tuple of float, optional
+        Its directions; None: those that are found at the start hold for every θ.
+    like : str, optional
+        The channel whose parameters it has.
+    S_max, M_K, bandwidth_ratio : float or None, float or None, float
+        Its bounds besides the whole loop's, as in `ChannelBounds`.
+    """
 
     name: str
     structure: Structure
@@ -71,18 +86,30 @@ class ChannelProblem:
 
 @dataclass(frozen=True)
 class StructuredProblem(ControllerProblem):
-    """Structure, bounds beyond S_max and S_low, hold and delay, the uncertainty, and the search.
+    """A controller of fixed structure: its bounds beyond S_max and S_low, its plants, its search.
 
-    `weighted_level` is of |W_KS KS| and |W_T T|, W_T at the lower end of ω_T; None: no bound, as
-    with `shape` and `compliance_max` (m/N). A search from `starts` starts and `seed` finds the
-    `warm_starts` (κ in SI) and the `scenarios` of the plant set (option, point of the box): from
-    these on ω_b*(θ) is the best of the climbs from the warm starts, on the plants, whatever was
-    asked before. Both are empty before it. `frequencies` (rad/s) bound those of K, alike at every
-    θ; None: by the plant at the start. `minimise` "rms_error" or "move_time": at a θ the search
-    goes on from there to the least of it under the problem's budget or in its move, at
-    `bandwidth_least` (rad/s) or more, from that controller and the `error_warm_starts` (κ in SI).
-    `channels` of a plant with several outputs; where the case names none they are found, with
-    `structure` for each.
+    Attributes
+    ----------
+    structure : Structure
+        Of each channel that the case does not name.
+    shape, shape_ends, weighted_level, compliance_max
+        As in `Bounds`; None: no such bound. W_T at the lower end of ω_T.
+    sampling : Sampling or None
+        Hold and delay.
+    uncertainty : Uncertainty
+    starts, seed : int
+        Of the multi-start search, which finds the warm starts and the scenarios.
+    frequencies : tuple of two floats, optional
+        Bounds of those of K, rad/s, alike at every θ; None: by the plant at the start.
+    warm_starts, scenarios : tuple of κ in SI, tuple of (option, point of the box)
+        With these v(θ) is the best of the climbs from the warm starts, on the plants of the
+        scenarios. Both are empty before the search.
+    minimise, bandwidth_least : str, float
+        "bandwidth", "rms_error" or "move_time"; the last two at ω_b >= bandwidth_least (rad/s).
+    channels : tuple of ChannelProblem
+        Of a plant with several outputs.
+    error_warm_starts : tuple of κ in SI
+        Of the least RMS error or move time.
     """
 
     structure: Structure = field(default_factory=Structure)
@@ -109,7 +136,6 @@ class StructuredProblem(ControllerProblem):
 
     @property
     def plant_options(self) -> tuple[Options, ...]:
-        """Loads and positions."""
         return self.uncertainty.options
 
     def require_plants(self, plants: Sequence[Plant]) -> None:
@@ -145,7 +171,7 @@ class StructuredProblem(ControllerProblem):
     def with_warm_start(self, kappa: tuple[float, ...], most: int) -> Self:
         """With one more warm start of what it minimises, first, `most` at most."""
         name = "warm_starts" if self.figure is BANDWIDTH else "error_warm_starts"
-        others = (anchor for anchor in getattr(self, name) if anchor != kappa)
+        others = (known for known in getattr(self, name) if known != kappa)
         return replace(self, **{name: (kappa, *others)[:most]})  # type: ignore[arg-type]
 
     def identity_with(self, weights: Weights, budget: ErrorBudget | None) -> dict[str, Any]:

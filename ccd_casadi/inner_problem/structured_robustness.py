@@ -13,20 +13,23 @@ import numpy as np
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
-from ccd_casadi.fixed_structure.certificate import TOLERANCE
+from ccd_casadi.fixed_structure.certificate import CertificateOptions
 from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
-    LATTICE,
-    WITHIN,
     Excess,
     LoopOnBox,
+    WorstPlantOptions,
     lattice,
     worst_plants,
 )
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.structured_bandwidth import LOST, ProblemAt, latest_plant
+from ccd_casadi.inner_problem.structured_bandwidth import (
+    ProblemAt,
+    StructuredValueOptions,
+    latest_plant,
+)
 from ccd_casadi.inner_problem.structured_plant_set import (
     bounds_of,
     plants_of,
@@ -41,27 +44,59 @@ from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.terminal import Tell, silent
 from ccd_casadi.support.text import HZ, of_a_bound
 
-AT_ONCE = 8  # plants added in a round
-APART = 1e-4  # of the box: plants that are closer are the same plant
-CHECKED = 200  # plants that the judge looks at in the end
-LOOSE = 2.0 * WITHIN  # relative: by how much they may pass a bound
-# Plants drawn for the yield, by their cost (2 ms, and 120 ms with four channels): where none fails
-# they prove 99.54 % and 95.5 % at confidence 1 - 1e-6.
-FRESH, FRESH_OF_SEVERAL = 3000, 300
-FRESH_SEED = 2000  # apart from those of the search and of the lattice
+
+@dataclass(frozen=True)
+class BoxCheckOptions:
+    """Numbers of the check of a design on the box of plants.
+
+    Plants are drawn for the yield by their cost (2 ms, and 120 ms with four channels): where none
+    fails they prove 99.54 % and 95.5 % at confidence 1 - 1e-6.
+
+    Attributes
+    ----------
+    added : int
+        Plants added to the set in a round, at most.
+    apart : float
+        Of the box: plants that are closer are the same plant.
+    lattice : int
+        Plants that the judge sees in the end.
+    looseness : float
+        Relative: by how much they exceed a bound.
+    fresh : int
+        Plants drawn for the yield.
+    fresh_of_several : int
+        With several channels.
+    fresh_seed : int
+        Added to the problem's, so that no other draw is repeated.
+    """
+
+    added: int = 8
+    apart: float = 1e-4
+    lattice: int = 200
+    looseness: float = 2.0 * WorstPlantOptions.within
+    fresh: int = 3000
+    fresh_of_several: int = 300
+    fresh_seed: int = 2000
 
 
 @dataclass(frozen=True)
 class DesignOnBox:
-    """A design of a problem at θ, held against the whole box of plants there."""
+    """A design of a problem at θ, checked on the whole box of plants there.
+
+    Attributes
+    ----------
+    problem, theta, design : CoDesignProblem, sequence of float (n,), SectionsDesign
+    options : BoxCheckOptions
+    """
 
     problem: CoDesignProblem
     theta: Sequence[float]
     design: SectionsDesign
+    options: BoxCheckOptions = BoxCheckOptions()
 
     @property
     def uncertain(self) -> UncertainPlant:
-        """The box."""
+        """The plants of the box at θ."""
         return uncertain_plant(self.problem, self.theta)
 
     def worst(self, turn: int = 0, tell: Tell = silent) -> tuple[Excess, tuple[Scenario, ...]]:
@@ -71,8 +106,9 @@ class DesignOnBox:
         """
         problem, theta, design = self.problem, self.theta, self.design
         worst, found = violations(
-            problem, self.uncertain, design.kappa, design.bandwidth, turn, tell
-        )
+            problem, self.uncertain, design.kappa, design.bandwidth, turn, tell,
+            options=self.options,
+        )  # fmt: skip
         if problem.figure is MOVE_TIME and design.controller is not None:
             value = float(np.exp(ProblemAt(problem, theta).goal.at(design.kappa)[0]))
             seed = structured_of(problem).seed + turn
@@ -103,36 +139,40 @@ class DesignOnBox:
         """The independent judge on a lattice of the box and the worst plant; how many plants it
         saw.
 
-        The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
+        The bounds count as met within `looseness`, since the search stops at half of it.
         """
         structured, uncertain = structured_of(self.problem), self.uncertain
-        points = [*lattice(uncertain, CHECKED, structured.seed + 1000), (worst.option, worst.point)]
+        points = lattice(uncertain, self.options.lattice, structured.seed + 1000)
+        points = [*points, (worst.option, worst.point)]
         if not uncertain.names:
             points = uncertain.corners()[: 1 + len(structured.uncertainty.options)]
         else:
             points += [(option, np.array(point)) for option, point in structured.scenarios]
         K = self.design.controller
         assert K is not None
-        return _judged(self.problem, uncertain.as_written(points), K, workers), len(points)
+        plants, loose = uncertain.as_written(points), self.options.looseness
+        return _judged(self.problem, plants, K, loose, workers), len(points)
 
     def fresh_yield(self, workers: Pool | None = None) -> Yield | None:
-        """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
+        """Judge plants that are drawn uniformly from the box: how many keep every bound and ω_b.
 
-        The options are drawn alike often. None where there is no box to draw from.
+        Options are equally likely. None where there is no box.
         """
-        structured, uncertain = structured_of(self.problem), self.uncertain
+        structured, uncertain, options = structured_of(self.problem), self.uncertain, self.options
+        loose = options.looseness
         if not uncertain.names or self.design.controller is None:
             return None
-        count = FRESH if plant_of(self.problem).outputs == 1 else FRESH_OF_SEVERAL
-        points = uncertain.drawn(np.random.default_rng((structured.seed, FRESH_SEED)), count)
+        count = options.fresh if plant_of(self.problem).outputs == 1 else options.fresh_of_several
+        rng = np.random.default_rng((structured.seed, options.fresh_seed))
+        points = uncertain.drawn(rng, count)
         plants = uncertain.as_written(points)
-        found = _judged(self.problem, plants, self.design.controller, workers).plants
-        bounds = bounds_of(self.problem).looser(LOOSE)
-        least = self.design.bandwidth * (1.0 - LOOSE)
+        found = _judged(self.problem, plants, self.design.controller, loose, workers).plants
+        bounds = bounds_of(self.problem).looser(loose)
+        least = self.design.bandwidth * (1.0 - loose)
         kept = [
             one.stable and one.confirmed and one.bandwidth >= least
             and all(
-                share <= 1.0 + TOLERANCE
+                share <= 1.0 + CertificateOptions.tolerance
                 for share in (bounds.shares(one) | bounds.channel_shares(one.channels)).values()
             )
             for one in found
@@ -183,12 +223,34 @@ def violations(
     bandwidth: float,
     turn: int,
     tell: Tell | None = None,
-    within: float = WITHIN,
+    within: float = WorstPlantOptions.within,
     others: Sequence[Scenario] = (),
-    count: int = LATTICE,
+    count: int = WorstPlantOptions.lattice,
+    options: BoxCheckOptions = BoxCheckOptions(),
 ) -> tuple[Excess, tuple[Scenario, ...]]:
-    """The worst plant found for κ (SI) at ω_b in rad/s from a lattice of `count`, and new ones over
-    a bound by `within`; the `others` are known and tried besides."""
+    """Search the worst plant of a box for a controller.
+
+    Parameters
+    ----------
+    problem, uncertain : CoDesignProblem, UncertainPlant
+    kappa, bandwidth : array (n,), float
+        κ in SI; ω_b in rad/s.
+    turn, count : int
+        Added to the problem's seed; plants of the lattice.
+    tell : callable, optional
+        Is given a line.
+    within : float
+        ln of a bound, above which a plant violates it.
+    others : sequence of (option, point)
+        Known plants, which are tried besides.
+    options : BoxCheckOptions
+
+    Returns
+    -------
+    worst : Excess
+    found : tuple of (option, point)
+        New plants that violate a bound, `options.added` at most.
+    """
     structured = structured_of(problem)
     loop = LoopOnBox(uncertain, structure_of(problem), kappa, bandwidth, bounds_of(problem),
                      structured.sampling)  # fmt: skip
@@ -208,7 +270,8 @@ def violations(
             for option, point in (*counted, *found)
             if option == head.option
         ]
-        if head.value > within and (not near or min(near) > APART) and len(found) < AT_ONCE:
+        apart = not near or min(near) > options.apart
+        if head.value > within and apart and len(found) < options.added:
             found.append((head.option, tuple(map(float, head.point))))
     return heads[0], tuple(found)
 
@@ -216,8 +279,17 @@ def violations(
 def recertified(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
 ) -> SectionsDesign:
-    """The design judged anew on the problem's plants: what a store of designs holds of it may be
-    older than they are. No longer certified where that fails."""
+    """Judge a design again on the problem's plants, which may be newer than a stored design.
+
+    Parameters
+    ----------
+    problem, theta, design : CoDesignProblem, sequence of float, SectionsDesign
+
+    Returns
+    -------
+    SectionsDesign
+        With the new certificate; not certified where that fails.
+    """
     if design.controller is None:
         return design
     judged = certify(
@@ -225,7 +297,8 @@ def recertified(
         integrator=structure_of(problem).integrator,
     )  # fmt: skip
     again = replace(design, certificate=judged)
-    if judged.passed and judged.bandwidth >= design.bandwidth * (1.0 - LOST):
+    least = design.bandwidth * (1.0 - StructuredValueOptions.rounding)
+    if judged.passed and judged.bandwidth >= least:
         return again
     words = f"judged anew, {judged.bandwidth / HZ:.6g} Hz: {judged.words}"
     outcome = SectionsOutcome.NOT_CERTIFIED if design.certified else design.outcome
@@ -235,18 +308,30 @@ def recertified(
 def certify_corners(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
 ) -> SetCertificate:
-    """The judge on the model of every option and the corners of the box."""
+    """Judge a controller on the model of every option and on the corners of the box.
+
+    Parameters
+    ----------
+    problem, theta, controller : CoDesignProblem, sequence of float, StateSpace
+        K(s) in SI.
+
+    Returns
+    -------
+    SetCertificate
+    """
     uncertain = uncertain_plant(problem, theta)
-    return _judged(problem, uncertain.as_written(uncertain.corners()), controller)
+    plants = uncertain.as_written(uncertain.corners())
+    return _judged(problem, plants, controller, BoxCheckOptions.looseness)
 
 
 def _judged(
     problem: CoDesignProblem,
     plants: Sequence[StateSpace],
     controller: StateSpace,
+    loose: float,
     workers: Pool | None = None,
 ) -> SetCertificate:
     return certify(
-        plants, controller, bounds_of(problem).looser(LOOSE), problem.sampling,
+        plants, controller, bounds_of(problem).looser(loose), problem.sampling,
         integrator=structure_of(problem).integrator, workers=workers,
     )  # fmt: skip

@@ -6,13 +6,13 @@ found.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.least_value import LeastValue
-from ccd_casadi.fixed_structure.local_search import RESIDUAL
+from ccd_casadi.fixed_structure.local_search import OptimalityOptions
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
@@ -28,12 +28,19 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
 
-MOST_WARM_STARTS = 3
-ENOUGH = 12  # starts before a search may say that it found no controller within the bounds
-MOST_STARTS = 36  # of a search that has found its best only once
-DISTINCT = 0.1  # relative: local optima further below the best are no warm starts
-ROUNDS, ROUNDS_OF_ERROR = 8, 4  # of a design on the set and a search for plants that are worse
-SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
+
+@dataclass(frozen=True)
+class StructuredSearchOptions:
+    """Numbers of the search of a controller of fixed structure on a box of plants."""
+
+    warm_starts: int = 3  # that are kept
+    least_starts: int = 12  # before no controller within the bounds counts as found
+    most_starts: int = 36  # of a search that has found its best only once
+    distinct: float = 0.1  # relative: local optima further below the best are not warm starts
+    rounds: int = 8  # of a design on the set and a search for worse plants
+    rounds_of_least: int = 4  # the same where another figure than the bandwidth counts
+    slowest: float = 1e-3  # of K's frequencies, over ω₀
+    fastest: float = 30.0  # of K's frequencies, over the fastest pole at the start
 
 
 def race(
@@ -42,26 +49,52 @@ def race(
     tell: Tell = silent,
     workers: Pool | None = None,
     only_warm_starts: bool = False,
+    options: StructuredSearchOptions = StructuredSearchOptions(),
 ) -> SectionsDesign:
-    """A multi-start search at θ: the problem's starts, and its warm starts beside them or alone.
+    """Search a controller at θ from many starts.
 
-    The problem's starts are the least number: it goes on, up to `MOST_STARTS`, until its best was
-    found twice. Few starts that all miss a bound prove little: then it searches from `ENOUGH`.
+    The problem's starts are the least number: more are added, up to `options.most_starts`, until
+    the best was found twice. Few starts that all miss a bound prove little: then it searches from
+    `options.least_starts`.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, sequence of float
+    tell, workers : callable, Pool, optional
+    only_warm_starts : bool
+        Without other starts than the problem's warm starts.
+    options : StructuredSearchOptions
+
+    Returns
+    -------
+    SectionsDesign
     """
     here, structured = ProblemAt(problem, theta), structured_of(problem)
     warm_starts = [np.array(kappa) for kappa in structured.warm_starts]
     starts = None if only_warm_starts else structured.starts
-    made = here.searched(warm_starts, starts, MOST_STARTS, tell, workers)
-    if made.certified or starts is None or starts >= ENOUGH:
+    made = here.searched(warm_starts, starts, options.most_starts, tell, workers)
+    least = options.least_starts
+    if made.certified or starts is None or starts >= least:
         return made
-    return here.searched(warm_starts, ENOUGH, MOST_STARTS, tell, workers)
+    return here.searched(warm_starts, least, options.most_starts, tell, workers)
 
 
-def with_range(problem: CoDesignProblem) -> CoDesignProblem:
-    """The problem with its channels and the range of K's frequencies, by the plant at its start,
-    alike at every θ.
+def with_range(
+    problem: CoDesignProblem, options: StructuredSearchOptions = StructuredSearchOptions()
+) -> CoDesignProblem:
+    """Fix the channels and the range of K's frequencies of a problem, by the plant at its start.
 
     A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    options : StructuredSearchOptions
+
+    Returns
+    -------
+    CoDesignProblem
+        With `channels` and `frequencies`.
     """
     problem = with_channels(problem)
     structured = structured_of(problem)
@@ -69,8 +102,8 @@ def with_range(problem: CoDesignProblem) -> CoDesignProblem:
         return problem
     plant = scaled_plant(problem, problem.start)
     poles = np.abs(np.linalg.eigvals(plant.A))
-    fastest = FASTEST * max(1.0, float(poles.max())) * plant.omega_0
-    slowest = SLOWEST * plant.omega_0
+    fastest = options.fastest * max(1.0, float(poles.max())) * plant.omega_0
+    slowest = options.slowest * plant.omega_0
     if structured.sampling is not None:
         fastest = min(fastest, 2.0 / structured.sampling.period)
         slowest = min(slowest, 0.01 * fastest)
@@ -82,13 +115,29 @@ def prepared(
     tell: Tell = silent,
     workers: Pool | None = None,
     only_warm_starts: bool = False,
+    options: StructuredSearchOptions = StructuredSearchOptions(),
 ) -> tuple[CoDesignProblem, SectionsDesign, Excess | None]:
-    """The problem with warm starts and plants: searched at its start θ, worst plants added.
+    """Search at the problem's start θ, and add the worst plants to its set until none is worse.
 
-    With `only_warm_starts` the warm starts that it has alone are where searches start. The design
-    is the search's last; where it is not certified the problem has no warm starts, and each θ is
-    searched on its own. All of it is of the largest bandwidth, whatever the problem minimises.
-    Third the worst plant for the design, where it was searched.
+    All of it is of the largest bandwidth, whatever the problem minimises.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+    tell, workers : callable, Pool, optional
+    only_warm_starts : bool
+        Searches start from the problem's warm starts alone.
+    options : StructuredSearchOptions
+
+    Returns
+    -------
+    problem : CoDesignProblem
+        With warm starts and scenarios; without warm starts where no design is certified: each θ is
+        then searched separately.
+    design : SectionsDesign
+        The last.
+    worst : Excess or None
+        The worst plant for the design, where it was searched.
     """
     asked = structured_of(problem).minimise
     problem = with_range(with_structured(problem, minimise="bandwidth"))
@@ -96,24 +145,24 @@ def prepared(
     scenarios = tuple((option, tuple(map(float, point))) for option, point in corners)
     problem = with_structured(problem, scenarios=scenarios)
 
-    made = race(problem, problem.start, tell, workers, only_warm_starts)
+    made = race(problem, problem.start, tell, workers, only_warm_starts, options)
     worst: Excess | None = None
-    last = True  # a search that ended off its optimum goes on to it once no plant is found worse
-    for turn in range(ROUNDS if made.certified else 0):
+    last = True  # a search that ended off its optimum continues once no plant is found worse
+    for turn in range(options.rounds if made.certified else 0):
         worst, wider = _wider(problem, problem.start, made, turn, tell)
-        if wider is None and (last or made.kkt_residual <= RESIDUAL):
+        if wider is None and (last or made.kkt_residual <= OptimalityOptions.residual):
             break
         last = wider is None
-        problem = with_structured(wider or problem, warm_starts=_warm_starts(made))
+        problem = with_structured(wider or problem, warm_starts=_warm_starts(made, options))
         if not last:
-            made = race(problem, problem.start, tell, workers, only_warm_starts=True)
+            made = race(problem, problem.start, tell, workers, True, options)
         if last or not made.certified:  # which has a few starts more where warm ones lead to none
             made = structured_value(problem, problem.start, workers).design
         worst = None
         if not made.certified:
             break
     if made.certified:
-        problem = with_structured(problem, warm_starts=_warm_starts(made))
+        problem = with_structured(problem, warm_starts=_warm_starts(made, options))
     return with_structured(problem, minimise=asked), made, worst
 
 
@@ -127,37 +176,61 @@ def _wider(
     return worst, with_structured(problem, scenarios=scenarios) if found else None
 
 
-def _warm_starts(design: SectionsDesign) -> tuple[tuple[float, ...], ...]:
+def _warm_starts(
+    design: SectionsDesign, options: StructuredSearchOptions
+) -> tuple[tuple[float, ...], ...]:
     """The certified design's κ first, then those of the other local optima near it."""
     own, omega_b = tuple(map(float, design.kappa)), design.bandwidth
     others = [
         optimum.kappa
         for optimum in design.local_optima
-        if (1.0 - DISTINCT) * omega_b <= optimum.bandwidth < (1.0 - 1e-3) * omega_b
+        if (1.0 - options.distinct) * omega_b <= optimum.bandwidth < (1.0 - 1e-3) * omega_b
     ]
-    return (own, *others)[:MOST_WARM_STARTS]
+    return (own, *others)[: options.warm_starts]
 
 
 def with_warm_start(problem: CoDesignProblem, kappa: Sequence[float] | Array) -> CoDesignProblem:
-    """The problem with one more warm start, first, of what it minimises."""
-    structured = structured_of(problem)
-    structured = structured.with_warm_start(tuple(map(float, kappa)), MOST_WARM_STARTS + 1)
+    """Add a warm start of what a problem minimises, as the first.
+
+    Parameters
+    ----------
+    problem, kappa : CoDesignProblem, array (n,)
+        κ in SI.
+
+    Returns
+    -------
+    CoDesignProblem
+    """
+    structured, most = structured_of(problem), StructuredSearchOptions.warm_starts + 1
+    structured = structured.with_warm_start(tuple(map(float, kappa)), most)
     return replace(problem, controller=structured)
 
 
 def least_from(
-    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, tell: Tell = silent
-) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:
-    """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
-    one of the least of another figure, not certified where it has to be slower than is allowed.
+    problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign, tell: Tell = silent,
+    options: StructuredSearchOptions = StructuredSearchOptions(),
+) -> tuple[CoDesignProblem, SectionsDesign, LeastValue | None]:  # fmt: skip
+    """Search the least of the problem's figure from a design of largest bandwidth.
 
-    The problem has the plants then that were found worse on the way, and that design as the first
-    of its warm starts.
+    Parameters
+    ----------
+    problem, theta, design : CoDesignProblem, sequence of float, SectionsDesign
+    tell : callable
+    options : StructuredSearchOptions
+
+    Returns
+    -------
+    problem : CoDesignProblem
+        With the plants that were found worse, and the new design as its first warm start.
+    design : SectionsDesign
+        Of the least figure; `design` itself where the bandwidth counts; not certified where it has
+        to be slower than is allowed.
+    found : LeastValue or None
     """
     if problem.figure is BANDWIDTH or not (design := too_slow(problem, design)).certified:
         return problem, design, None
     wider = problem
-    for turn in range(ROUNDS_OF_ERROR):
+    for turn in range(options.rounds_of_least):
         problem = wider
         found = ProblemAt(problem, theta).least(design, tell=tell)
         wider = _wider(problem, theta, found.design, turn, tell)[1] or problem

@@ -24,11 +24,6 @@ from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
 from ccd_casadi.synthesis.weights import Weights
 
-# The local solves aim this far inside a constraint, so that what they return satisfies it.
-MARGIN = 1e-9
-NEAR = 1e-3  # of ln ω: how near to an uncertified design a local solve looks for a better one
-STARTS = 6  # local solves after a sweep, at most
-ACTIVE = 1e-5  # relative distance within which a constraint counts as binding
 Point = tuple[float, float]  # ω_S, ω_T in rad/s
 At = Callable[[Point], Sensitivities]  # one certified synthesis with its derivatives
 LABELS = {
@@ -39,8 +34,44 @@ LABELS = {
 
 
 @dataclass(frozen=True)
+class SweepOptions:
+    """Numbers of the local solves after a sweep.
+
+    Attributes
+    ----------
+    margin : float
+        ln: how far inside a constraint they aim, so that a result satisfies it.
+    near : float
+        ln ω: closer to an uncertified design no better one is searched.
+    starts : int
+        Local solves at most.
+    active : float
+        Relative distance within which a constraint counts as binding.
+    """
+
+    margin: float = 1e-9
+    near: float = 1e-3
+    starts: int = 6
+    active: float = 1e-5
+
+
+@dataclass(frozen=True)
 class InnerBounds:
-    """Constraints and search box of the inner problem; frequencies in rad/s."""
+    """The constraints and the search box of the inner problem.
+
+    Attributes
+    ----------
+    S_max, S_low, omega_low : float
+        ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low; rad/s.
+    omega_S, omega_T : tuple of two floats
+        The box, rad/s.
+    gamma_backoff : float
+        γ of a synthesis over γ_opt.
+    sweep_points : tuple of two ints
+        Along ω_S and ω_T.
+    compliance_max : float or None
+        m/N: ‖GS‖∞ at most.
+    """
 
     S_max: float
     S_low: float
@@ -49,7 +80,7 @@ class InnerBounds:
     omega_T: tuple[float, float]
     gamma_backoff: float = 1.02
     sweep_points: tuple[int, int] = (20, 20)
-    compliance_max: float | None = None  # m/N
+    compliance_max: float | None = None
 
     @property
     def bounds(self) -> dict[str, tuple[str, float]]:
@@ -109,9 +140,21 @@ class InnerStatus(StrEnum):
 
 @dataclass(frozen=True)
 class InnerResult(NotebookHtml):
-    """The optimum (None if infeasible), what binds there, and every synthesis on the way.
+    """The solution of the inner problem at a θ.
 
-    `violation` is the least one, in ln of the bounds, of any certified design; zero if solved.
+    Attributes
+    ----------
+    status : InnerStatus
+    optimum : Sensitivities or None
+        None if infeasible.
+    active : tuple of str
+        What binds there.
+    rows, syntheses : tuple of DesignFigures, int
+        Every synthesis that was made, and their number.
+    shortfall : str
+        How near the certified designs came, if infeasible.
+    violation : float
+        The least one, in ln of the bounds, of any certified design; zero if solved.
     """
 
     status: InnerStatus
@@ -171,7 +214,18 @@ def refine(
 def evaluate(
     plant: ScaledPlant, weights: Weights, problem: InnerBounds, point: Point
 ) -> Sensitivities:
-    """One certified synthesis with derivatives at (ω_S, ω_T) in rad/s."""
+    """Make one certified synthesis with derivatives.
+
+    Parameters
+    ----------
+    plant, weights, problem : ScaledPlant, Weights, InnerBounds
+    point : tuple of two floats
+        ω_S and ω_T in rad/s.
+
+    Returns
+    -------
+    Sensitivities
+    """
     return sensitivities(plant, weights.at(*point), **problem.synthesis_options)
 
 
@@ -188,7 +242,7 @@ def sweep_starts(problem: InnerBounds, rows: Sequence[DesignFigures]) -> list[Po
     around = np.pad(merit.reshape(problem.sweep_points), 1, constant_values=-np.inf)
     highest = sliding_window_view(around, (3, 3)).max(axis=(2, 3)).ravel()
     found = np.flatnonzero(np.isfinite(merit) & (merit >= highest))
-    best = found[np.argsort(-merit[found], kind="stable")][:STARTS]
+    best = found[np.argsort(-merit[found], kind="stable")][: SweepOptions.starts]
     return [(rows[i].omega_S, rows[i].omega_T) for i in best]
 
 
@@ -205,11 +259,11 @@ def local_solve(
 ) -> list[Sensitivities]:
     """Maximise ln ω_b from `start` by SLSQP over (ln ω_S, ln ω_T); every design on the way.
 
-    Where a step ends in an uncertified design, the search goes on from the best one so far in a
+    Where a step ends in an uncertified design, the search continues from the best one so far in a
     box that reaches half way to there.
     """
     bounds = np.log([problem.omega_S, problem.omega_T])
-    levels = problem.levels - MARGIN
+    levels = problem.levels - SweepOptions.margin
     seen: dict[tuple[float, float], Sensitivities] = {}
 
     def at(x: Array) -> Sensitivities:
@@ -255,15 +309,28 @@ def local_solve(
             break
         best = np.array(min(certified, key=rank))
         half = 0.5 * float(np.abs(np.array(lost) - best).max(axis=1).min())
-        if half < NEAR or (ended and np.array_equal(best, x)):
+        if half < SweepOptions.near or (ended and np.array_equal(best, x)):
             break
         x, low, high = best, np.maximum(bounds[:, 0], best - half), best + half
         high = np.minimum(bounds[:, 1], high)
     return list(seen.values())
 
 
-def active_constraints(problem: InnerBounds, figures: DesignFigures) -> tuple[str, ...]:
-    """Names of the constraints and range ends that bind at a design."""
+def active_constraints(
+    problem: InnerBounds, figures: DesignFigures, *, active: float = SweepOptions.active
+) -> tuple[str, ...]:
+    """Name the constraints and range ends that bind at a design.
+
+    Parameters
+    ----------
+    problem, figures : InnerBounds, DesignFigures
+    active : float
+        Relative distance within which they bind.
+
+    Returns
+    -------
+    tuple of str
+    """
     values = {
         **{name: getattr(figures, of) / bound for name, (of, bound) in problem.bounds.items()},
         "omega_S lower": problem.omega_S[0] / figures.omega_S,
@@ -271,7 +338,7 @@ def active_constraints(problem: InnerBounds, figures: DesignFigures) -> tuple[st
         "omega_T lower": problem.omega_T[0] / figures.omega_T,
         "omega_T upper": figures.omega_T / problem.omega_T[1],
     }
-    return tuple(name for name, ratio in values.items() if ratio >= 1.0 - ACTIVE)
+    return tuple(name for name, ratio in values.items() if ratio >= 1.0 - active)
 
 
 def shortfall(problem: InnerBounds, rows: Sequence[DesignFigures]) -> str:
@@ -303,7 +370,17 @@ def shortfall(problem: InnerBounds, rows: Sequence[DesignFigures]) -> str:
 
 
 def missed_bounds(problem: InnerBounds, figures: DesignFigures) -> list[str]:
-    """Which bounds a design misses, and by how much; none where it keeps them all."""
+    """Report which bounds a design misses, and by how much.
+
+    Parameters
+    ----------
+    problem, figures : InnerBounds, DesignFigures
+
+    Returns
+    -------
+    list of str
+        Empty where it keeps them all.
+    """
     return [
         f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is required"
         for name, (of, bound) in problem.bounds.items()
@@ -312,8 +389,18 @@ def missed_bounds(problem: InnerBounds, figures: DesignFigures) -> list[str]:
 
 
 def missed_by(value: float, bound: float) -> str:
-    """A value beyond a bound with as many digits as tell them apart, and by how much.
+    """Write a value beyond a bound with as many digits as distinguish them, and the excess.
 
+    Parameters
+    ----------
+    value, bound : float
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> missed_by(2.0004, 2.0)
     '2.0004 (+0.02 %)'
     """

@@ -3,6 +3,7 @@ set."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -13,17 +14,15 @@ from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-AT_REST = 1e-6  # of the fastest: a pole that is as slow is that of a free body, at 0
-FAITHFUL = 1e-6  # relative error of a response by its poles and zeros, up to which they are used
-OUTSIDE = 1e-3  # of its size: real part from which on a zero counts as one of the right half plane
-WIDE = 20.0  # m_T where nothing bounds T: more than 1 + S_max
 ROOT_HALF = np.sqrt(0.5)
 
 
 @dataclass(frozen=True)
 class Response:
     """g(jv) by poles and zeros, `value` at `at`; between two frequencies each factor has an
-    exact range of its size."""
+    exact range of its size. `accuracy`: relative error up to which they are used."""
+
+    accuracy: ClassVar[float] = 1e-6
 
     zeros: np.ndarray
     poles: np.ndarray
@@ -39,11 +38,11 @@ class Response:
         return found
 
     def range(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """The least and the largest that |g| can be on the intervals, FAITHFUL included."""
+        """The least and the largest that |g| can be on the intervals, its error included."""
         least, most = (np.full(low.shape, np.log(abs(self.value))) for _ in range(2))
         with np.errstate(divide="ignore"):  # of a pole or zero on the axis: from 0 or to infinity
             self._widen(least, most, low, high)
-        return np.exp(least) * (1.0 - FAITHFUL), np.exp(most) * (1.0 + FAITHFUL)
+        return np.exp(least) * (1.0 - self.accuracy), np.exp(most) * (1.0 + self.accuracy)
 
     def _widen(self, least: Array, most: Array, low: Array, high: Array) -> None:
         """Adds the ranges of all factors' logarithms."""
@@ -89,16 +88,16 @@ def response_of(system: StateSpace) -> Response | None:
     response = system.response(omega)[:, 0, 0]
     found = Response(zeros, poles, float(v[12]), complex(response[12]))
     error = np.abs(found.values(v) / response - 1.0).max()
-    if not error <= 0.5 * FAITHFUL:
+    if not error <= 0.5 * Response.accuracy:
         words = "its poles and zeros do not give its response"
         raise PlantError(f"no bound on every controller: {words} (off by {error:.1e})")
     return found
 
 
-def _resting(poles: np.ndarray) -> np.ndarray:
-    """Which poles (s, or v of a sampled plant) are those of free bodies."""
+def _resting(poles: np.ndarray, at_rest: float = 1e-6) -> np.ndarray:
+    """Which poles (s, or v of a sampled plant) are of free bodies: `at_rest` of the fastest."""
     size = np.abs(poles)
-    return np.asarray(size <= AT_REST * size.max(initial=0.0))
+    return np.asarray(size <= at_rest * size.max(initial=0.0))
 
 
 def _reached(A: Array, B: Array) -> np.ndarray:
@@ -116,7 +115,10 @@ class Limits:
     `others`: one channel's, of other plants that the same controller serves.
     `ratio`: its bandwidth over ω_b. `integrator`: the shape counts from 0 on, else from ω_low.
     `beyond`: zeros of G in the right half plane, in v, which T has for every controller.
+    `unbounded`: m_T where nothing bounds T, more than 1 + S_max.
     """
+
+    unbounded: ClassVar[float] = 20.0
 
     name: str
     bounds: Bounds
@@ -161,7 +163,7 @@ class Limits:
         if bounds.compliance_max is not None and self.free is not None:
             least = self.free.range(first, last)[0]
             m_S = np.minimum(m_S, bounds.compliance_max / least)
-        m_T = np.full(low.shape, WIDE)
+        m_T = np.full(low.shape, self.unbounded)
         if bounds.weighted_level is not None and bounds.weights is not None:
             ends = np.abs([bounds.weights.responses(omega) for omega in (first, last)])
             _, W_KS, W_T = ends.min(axis=0)  # both are monotone in ω
@@ -179,10 +181,12 @@ def limits_of(
     direction: Array | None = None,
     ratio: float = 1.0,
     integrator: bool = True,
+    outside: float = 1e-3,
 ) -> Limits:
     """Of a SI plant, stable but for free bodies, in a direction of outputs (one output: None).
 
     `bounds` are its own. Free bodies make S vanish at rest; what is used here holds with them too.
+    A zero whose real part is `outside` of its size counts as one of the right half plane.
 
     Raises PlantError where the plant is not stable.
     """
@@ -203,16 +207,17 @@ def limits_of(
     row = tuple(part for part in parts if part is not None)
     one = plant.B.shape[1] == 1 and len(plant.C) == 1
     zeros = row[0].zeros if one else np.empty(0, complex)
-    beyond = zeros[zeros.real > OUTSIDE * np.abs(zeros)]
+    beyond = zeros[zeros.real > outside * np.abs(zeros)]
     free = response_of(plant) if one and bounds.compliance_max is not None else None
     return Limits(name, bounds, row, free, period, tuple(beyond.tolist()), ratio, integrator)
 
 
-LARGEST = 100.0  # radius of a disc that is used; in the place of others the first stands again
+def discs(
+    limits: Limits, low: Array, high: Array, omega_b: float, largest: float = 100.0
+) -> tuple[np.ndarray, Array]:
+    """Centres and radii (k, N) on the intervals [low, high] of v: T is in all of them.
 
-
-def discs(limits: Limits, low: Array, high: Array, omega_b: float) -> tuple[np.ndarray, Array]:
-    """Centres and radii (k, N) on the intervals [low, high] of v: T lies in all of them."""
+    A disc whose radius is `largest` or more is replaced by the first."""
     m_S, m_T = limits.radii(low, high, omega_b)
     centres, radii = [np.zeros(low.shape), np.ones(low.shape)], [m_T, m_S]
     for other in limits.others:
@@ -221,7 +226,7 @@ def discs(limits: Limits, low: Array, high: Array, omega_b: float) -> tuple[np.n
         slack = np.maximum(1.0 - spread * np.minimum(m_T, 1.0 + m_S), 1e-9)  # |T| <= 1 + |S|
         S, size = circle(1.0 / r, m_T * (1.0 + spread) / slack)  # T and S change places
         for centre, radius in (circle(r, m_S / slack), (1.0 - S, size)):
-            matters = radius < LARGEST
+            matters = radius < largest
             centres.append(np.where(matters, centre, 0.0))
             radii.append(np.where(matters, radius, radii[0]))
     return np.array(centres), np.array(radii)
@@ -248,7 +253,7 @@ def ratio(one: Response, other: Response, low: Array, high: Array) -> tuple[np.n
         for p in (*np.delete(mine, rows), *np.delete(yours, columns)):
             slope += 1.0 / near(p)
     r = other.values(middle) / one.values(middle)
-    return r, np.expm1(half * slope + 3.0 * FAITHFUL)
+    return r, np.expm1(half * slope + 3.0 * Response.accuracy)
 
 
 def circle(r: np.ndarray, m: Array) -> tuple[np.ndarray, Array]:

@@ -10,7 +10,7 @@ from ccd_casadi.support.arrays import Array
 
 
 @dataclass(frozen=True)
-class Basis:
+class MultiplierBasis:
     """`reals` a > 0 for s = -a, then `pairs` p (Re p > 0, Im p > 0) for s = -p and its conjugate.
 
     `corner` a and `order` e of the roll-off; `zeros` z with `turned` -1 for a multiplier, +1 for
@@ -94,17 +94,16 @@ class Basis:
         return float(np.abs(weight) @ np.array(most) * self.corner / start)
 
 
-COST = 1e-5  # of the length of h's coefficients, in g
 SOLVED = ("Solved", "AlmostSolved")
-MATTERS = 0.01  # of its radius: a disc that holds another one but for that does not matter
 
 
-def that_matter(centres: np.ndarray, radii: Array) -> np.ndarray:
-    """Which of the discs (k, N): the first two, and others that no disc lies in, or almost."""
+def that_matter(centres: np.ndarray, radii: Array, almost: float = 0.01) -> np.ndarray:
+    """Which of the discs (k, N): the first two, and others that no disc is in, or all but `almost`
+    of their radius."""
     found = np.ones(radii.shape, bool)
     for i in range(2, len(radii)):
         for j in range(len(radii)):
-            holds = np.abs(centres[i] - centres[j]) + radii[j] <= (1.0 + MATTERS) * radii[i]
+            holds = np.abs(centres[i] - centres[j]) + radii[j] <= (1.0 + almost) * radii[i]
             if j != i:
                 found[i] &= ~(holds & found[j])
     return found
@@ -126,13 +125,13 @@ def least_scaling(functions: np.ndarray, centres: np.ndarray, radii: Array) -> t
 
 
 def greatest_multiplier(
-    functions: np.ndarray, width: Array, centres: np.ndarray, radii: Array
+    functions: np.ndarray, width: Array, centres: np.ndarray, radii: Array, cost: float = 1e-5
 ) -> tuple[float, Array]:
     """The same g from the other side and the coefficients of h; `width` are the grid's cells.
 
     The first disc is around 0; its h_i is what h and the others leave. The length of the
-    coefficients costs a little: where T is small h may be anything, and large ones that cancel
-    leave no certificate.
+    coefficients costs a little, `cost` in g: where T is small h may be anything, and large ones
+    that cancel leave no certificate.
     """
     N, n = functions.shape
     disc, at = np.nonzero(that_matter(centres, radii)[1:])
@@ -154,7 +153,7 @@ def greatest_multiplier(
     end = 1 + 3 * (N + E)
     order = [[0], 1 + threes[0], 1 + 3 * N + threes[1], np.arange(end, end + n + 1)]
     rows, right = rows[np.concatenate(order)].tocsc(), np.append(1.0, np.zeros(end + n))
-    aim = np.concatenate([np.zeros(n), -c.real, c.imag, np.zeros(N + E), [COST]])
+    aim = np.concatenate([np.zeros(n), -c.real, c.imag, np.zeros(N + E), [cost]])
     x = _solved(aim, rows, right, 1, n + 1)
     return (np.inf, np.zeros(n)) if x is None else (float(-aim[:-1] @ x[:-1]), x[:n])
 

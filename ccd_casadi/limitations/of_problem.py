@@ -32,9 +32,19 @@ MODEL = "the model"
 
 @dataclass(frozen=True)
 class Gap:
-    """ω_b in rad/s: no controller that keeps the bounds on `plants` has `upper_bound` (infinite:
-    nothing bounds it), none on the model `model_bound`, some one on the model has `lower_bound`
-    (both 0: not computed); `channel` binds."""
+    """Bounds on the bandwidth of every controller that keeps the bounds on the loop.
+
+    Attributes
+    ----------
+    upper_bound : float
+        No controller on `plants` has this ω_b, rad/s; infinite: nothing bounds it.
+    lower_bound, model_bound : float
+        One on the model has the first, none the second, rad/s; 0: not computed.
+    channel : str
+        That binds.
+    plants : str
+        In words.
+    """
 
     upper_bound: float
     lower_bound: float = 0.0
@@ -71,10 +81,28 @@ class Gap:
 
 
 def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> Gap:
-    """The bound from outside at θ; `within`, of one channel, on the model from both sides besides.
+    """The bound on every controller at θ.
 
-    On the model it holds for every set that has the model in it. Raises UserError for a problem of
-    another kind.
+    On the model it holds for every set that has the model in it.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With controllers of fixed structure.
+    theta : (n_θ,) sequence
+        SI.
+    within : bool
+        Whether to bound it on the model from both sides too, of one channel.
+
+    Returns
+    -------
+    Gap
+        rad/s.
+
+    Raises
+    ------
+    UserError
+        The problem is of another kind.
     """
     loops = sorted(limits_of_problem(problem, theta), key=pointwise)
     if loops[0].name:
@@ -121,7 +149,18 @@ def opposite_corners(
 
 
 def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
-    """From outside, which takes seconds; None where there is none to know."""
+    """The upper bound alone, which takes seconds.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, (n_θ,) sequence
+        As of `gap_of`.
+
+    Returns
+    -------
+    Gap or None
+        None for a problem of another kind.
+    """
     try:
         return gap_of(problem, theta, within=False)
     except UserError:
@@ -129,8 +168,20 @@ def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
 
 
 def none_reaches(problem: CoDesignProblem, theta: Sequence[float], omega_b: float) -> bool:
-    """Whether it is shown, in a fraction of a second, that no controller has ω_b (rad/s) at θ, on
-    the model; False where nothing is known."""
+    """Whether it is shown, in a fraction of a second, that no controller has a bandwidth.
+
+    Parameters
+    ----------
+    problem, theta : CoDesignProblem, (n_θ,) sequence
+        As of `gap_of`; the model alone counts.
+    omega_b : float
+        rad/s.
+
+    Returns
+    -------
+    bool
+        False where nothing is known.
+    """
     if not omega_b > 0.0:
         return False
     try:

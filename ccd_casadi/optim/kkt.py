@@ -13,18 +13,26 @@ from scipy.linalg import null_space
 
 from ccd_casadi.support.arrays import Array
 
-KEPT = 1e-7  # by how much an answer may miss its rows
-INSIDE = 1e-6  # and its bounds, to which it can be moved
-CURVED = 1e-8  # of a step in its own units: its answer is then one point
-SLACK = 1e-3  # of the penalty: σ's curvature; with less DAQP begins so far out that it cycles
-UNBOUNDED = 1e30  # what DAQP takes for infinite
 QUIET = ("error_on_fail", "print_iter", "print_header", "print_info")
-TOLERANCES = {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}
-AT_FIRST, ADDED = 200, 50  # rows of a programme, and those that its answer exceeds, at a time
-LOST = 1e-8  # share of its factors below which a scalar product is rounding
 
 
-class Answer(NamedTuple):
+@dataclass(frozen=True)
+class QuadraticOptions:
+    """Numbers of quadratic programmes, in the units in which they are solved."""
+
+    row_error: float = 1e-7  # by how much a solution may exceed its rows
+    bound_error: float = 1e-6  # and its bounds, to which it can be moved
+    primal: float = 1e-10  # DAQP's tolerances
+    dual: float = 1e-12
+    zero: float = 1e-13
+    unbounded: float = 1e30  # what DAQP takes for infinite
+    curvature: float = 1e-8  # of a step: its solution is then one point
+    slack_curvature: float = 1e-3  # of σ over the penalty; with less DAQP starts far out and cycles
+    first_rows: int = 200  # of a programme
+    added_rows: int = 50  # at a time, of those that its solution exceeds
+
+
+class QuadraticSolution(NamedTuple):
     """x (n,) and the multipliers (m,) of the rows."""
 
     x: Array
@@ -32,38 +40,44 @@ class Answer(NamedTuple):
 
 
 def solve_quadratic(
-    H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array
-) -> Answer | None:
+    H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array,
+    options: QuadraticOptions = QuadraticOptions(),
+) -> QuadraticSolution | None:  # fmt: skip
     """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper; bounds may be infinite.
 
-    None where neither solver keeps the rows of A (m, n), which tells nothing of x. H may be
+    None where neither solver keeps the rows of A (m, n), which says nothing of x. H may be
     nearly singular.
     """
-    rows, n = A.shape
+    (rows, n), unbounded = A.shape, options.unbounded
 
     def kept(x: Array) -> bool:
         missed = np.maximum(low - x, x - high).max()
-        return bool((A @ x - upper).max(initial=-np.inf) <= KEPT and missed <= INSIDE)
+        error = (A @ x - upper).max(initial=-np.inf)
+        return bool(error <= options.row_error and missed <= options.bound_error)
 
-    above, below = np.empty(n + rows), np.full(n + rows, -UNBOUNDED)
+    above, below = np.empty(n + rows), np.full(n + rows, -unbounded)
     above[:n], above[n:] = high, upper
-    np.minimum(above, UNBOUNDED, out=above)
-    np.maximum(low, -UNBOUNDED, out=below[:n])
+    np.minimum(above, unbounded, out=above)
+    np.maximum(low, -unbounded, out=below[:n])
     matrix = np.ascontiguousarray(A, float)
-    x, _, flag, info = daqp.solve(np.array(H, float), c, matrix, above, below, **TOLERANCES)
+    x, _, flag, info = daqp.solve(
+        np.array(H, float), c, matrix, above, below, primal_tol=options.primal,
+        dual_tol=options.dual, zero_tol=options.zero,
+    )  # fmt: skip
     if flag == 1 and kept(x):
-        return Answer(x, np.maximum(info["lam"][n:], 0.0))
+        return QuadraticSolution(x, np.maximum(info["lam"][n:], 0.0))
     solver = _interior(n, rows)
     found = solver(h=H, g=c, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
     x = np.array(found["x"]).ravel()
     if not solver.stats()["success"] or not kept(x):
         return None
-    return Answer(x, np.maximum(np.array(found["lam_a"]).ravel(), 0.0))
+    return QuadraticSolution(x, np.maximum(np.array(found["lam_a"]).ravel(), 0.0))
 
 
 def solve_elastic(
     H: Array, c: Array, slopes: Array, value: Array, elastic: Array, low: Array, high: Array,
     penalty: float, radius: float, unit: float, *, free: bool = False,
+    options: QuadraticOptions = QuadraticOptions(),
 ) -> tuple[Array, Array] | None:  # fmt: skip
     """p (n,) and the multipliers (m,) of the rows of a trust-region step:
 
@@ -79,25 +93,25 @@ def solve_elastic(
     A, hessian, cost = np.empty((m, n + 1)), np.zeros((n + 1, n + 1)), np.empty(n + 1)
     A[:, :n], A[:, n] = slopes, -elastic
     hessian[:n, :n], cost[:n], cost[n] = radius / unit * H, c / unit, penalty / unit
-    hessian.ravel()[:: n + 2] += CURVED
+    hessian.ravel()[:: n + 2] += options.curvature
     ends = np.full((2, n + 1), np.inf)
     ends[0, :n], ends[1, :n], ends[0, n] = low / radius, high / radius, -np.inf
     if not free:
-        hessian[n, n], ends[0, n] = SLACK * penalty / unit, 0.0
-    upper, held = -value / radius, np.arange(min(m, AT_FIRST))
+        hessian[n, n], ends[0, n] = options.slack_curvature * penalty / unit, 0.0
+    upper, held = -value / radius, np.arange(min(m, options.first_rows))
     part: slice | np.ndarray = slice(len(held))  # the first ones are no copy
     while True:
-        found = solve_quadratic(hessian, cost, A[part], upper[part], *ends)
+        found = solve_quadratic(hessian, cost, A[part], upper[part], ends[0], ends[1], options)
         if found is None:
             return None
         if len(held) == m:
             break
         missed = A @ found.x - upper
         missed[part] = -np.inf
-        if missed.max() <= KEPT:
+        if missed.max() <= options.row_error:
             break
-        worst = np.argsort(-missed)[:ADDED]
-        held = part = np.concatenate([held, worst[missed[worst] > KEPT]])
+        worst = np.argsort(-missed)[: options.added_rows]
+        held = part = np.concatenate([held, worst[missed[worst] > options.row_error]])
     multipliers = np.zeros(m)
     multipliers[held] = unit * found.multipliers
     return radius * np.clip(found.x[:n], *ends[:, :n]), multipliers
@@ -112,9 +126,20 @@ def _interior(n: int, rows: int) -> ca.Function:
 
 
 def damped_bfgs(H: Array, s: Array, y: Array) -> Array:
-    """H (n, n) with the curvature that a change y of the gradient along the step s shows.
+    """Update a Hessian by the curvature of a step, positive definite (BFGS, Powell's damping).
 
-    Powell's damping keeps it positive definite.
+    Parameters
+    ----------
+    H, s, y : array (n, n), (n,), (n,)
+        The step s changes the gradient by y.
+
+    Returns
+    -------
+    array (n, n)
+
+    References
+    ----------
+    J. Nocedal and S. J. Wright, Numerical Optimization, procedure 18.2.
     """
     Hs = H @ s
     curvature = float(s @ Hs)
@@ -126,11 +151,23 @@ def damped_bfgs(H: Array, s: Array, y: Array) -> Array:
     return np.asarray(H - np.outer(Hs, Hs) / curvature + np.outer(y, y) / float(s @ y))
 
 
-def symmetric_rank_one(H: Array, s: Array, y: Array) -> Array:
-    """H (n, n) with H s = y, which may curve either way; as it is where the denominator is lost."""
+def symmetric_rank_one(H: Array, s: Array, y: Array, *, least: float = 1e-8) -> Array:
+    """Update a Hessian so that H s = y, which may curve either way (SR1).
+
+    Parameters
+    ----------
+    H, s, y : array (n, n), (n,), (n,)
+        The step s changes the gradient by y.
+    least : float
+        Denominator over its factors below which it is rounding, and H stays as it is.
+
+    Returns
+    -------
+    array (n, n)
+    """
     rest = y - H @ s
     size = float(rest @ s)
-    if abs(size) <= LOST * float(np.linalg.norm(rest) * np.linalg.norm(s)):
+    if abs(size) <= least * float(np.linalg.norm(rest) * np.linalg.norm(s)):
         return H
     return np.asarray(H + np.outer(rest, rest) / size)
 
@@ -141,21 +178,38 @@ def convex(H: Array, least: float) -> Array:
     return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
 
 
-# A constraint closer than this to its bound, in shares of its size or of the box, is active: a
-# polish stops where steps change J by no more than rounding.
-ACTIVE = 1e-6
-STEP = 1e-4  # of the box: differences of true gradients
+@dataclass(frozen=True)
+class KktOptions:
+    """Numbers of the conditions of optimality.
+
+    Attributes
+    ----------
+    active : float
+        Shares of its size or the box: a closer constraint is active; a polish stops where
+        steps change J by rounding.
+    step : float
+        Of the box: differences of true gradients.
+    """
+
+    active: float = 1e-6
+    step: float = 1e-4
 
 
 @dataclass(frozen=True)
 class Kink:
-    """What is known of a design where J of θ has more than one gradient.
+    """A design where J of θ has more than one gradient.
 
-    one_gradient: the residual with that of one side alone. slopes: of J to the two sides of each of
-    some orthogonal directions, all that the active bounds leave; differences of true values, per
-    share of the box, over ‖∇J‖∞; NaN where there is no design. multipliers: of the bounds on the
-    loop by kind, change of ln of the inner value per ln of a bound. first_order: the slopes are on
-    plants as they are known nearby, climbed to from the design's controller.
+    Attributes
+    ----------
+    one_gradient : float
+        The residual with the gradient of one side alone.
+    slopes : tuple of pairs
+        Of J to the two sides of each of some orthogonal directions, all that the active bounds
+        leave: differences of true values, per share of the box, over ‖∇J‖∞; NaN without a design.
+    multipliers : dict
+        Of the bounds on the loop by kind: change of ln of the inner value per ln of a bound.
+    first_order : bool
+        The slopes are on plants to first order nearby, climbed to from the design's controller.
     """
 
     one_gradient: float
@@ -174,11 +228,24 @@ class Kink:
 class KktCertificate:
     """Residuals of the true optimality conditions at a verified design.
 
-    stationarity: scaled, see the module. primal: largest violation of g or a bound, in shares.
-    complementarity: largest |μ g| over ‖∇J‖∞. multipliers: per name, change of J per unit of g, or
-    per unit box of a bound. second_order: least eigenvalue of the reduced Hessian of the Lagrangian
-    over ‖∇J‖∞, inf at a vertex, None where it was not computed. kink: where one gradient of J is
-    not all that there are.
+    Attributes
+    ----------
+    stationarity : float
+        ‖∇J + Σ μ ∇g‖∞ over ‖∇J‖∞.
+    primal : float
+        The largest violation of g or a bound, in shares.
+    complementarity : float
+        The largest |μ g| over ‖∇J‖∞.
+    multipliers : dict
+        By name: change of J per unit of g, or per unit box of a bound.
+    active : tuple of str
+    second_order : float or None
+        Least eigenvalue of the reduced Hessian of the Lagrangian over ‖∇J‖∞; inf at a vertex, None
+        where it was not computed.
+    objective_gradient : tuple of float (n,)
+        ∇J per unit box.
+    kink : Kink or None
+        Where J has more than one gradient.
     """
 
     stationarity: float
@@ -193,8 +260,16 @@ class KktCertificate:
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """∇J (n,), and values g (m,) and Jacobian (m, n) of constraints by name, at one z of the unit
-    box; g in shares of `sizes` (m,)."""
+    """First derivatives of J and of constraints g at one z of the unit box.
+
+    Attributes
+    ----------
+    gradient : array (n,)
+        ∇J.
+    g, jacobian : array (m,), (m, n)
+        In shares of `sizes`.
+    sizes, names : array (m,), tuple of str
+    """
 
     gradient: Array
     g: Array
@@ -205,10 +280,19 @@ class FirstOrder:
 
 @dataclass(frozen=True)
 class ActiveSet:
-    """∇J (n,) and what is within `ACTIVE` of its bound at one z of the unit box.
+    """The active constraints and bounds at one z of the unit box.
 
-    rows (m, n) and slack (m,), <= 0 inside, are in shares of `sizes` (m,), one each per label; the
-    first `constraints` are of g, the rest bounds. violation: the largest of all, 0 where none is.
+    Attributes
+    ----------
+    gradient : array (n,)
+        ∇J.
+    rows, slack, sizes : array (m, n), (m,), (m,)
+        Slopes and values, <= 0 inside, in shares of the sizes.
+    labels : tuple of str
+    constraints : int
+        So many of the first rows are of g, the others of bounds.
+    violation : float
+        The largest of all constraints, active or not; 0 where none is violated.
     """
 
     gradient: Array
@@ -254,21 +338,47 @@ class ActiveSet:
 
 
 def non_negative(rows: Array, goal: Array) -> tuple[Array, float]:
-    """μ >= 0 (m,) that brings rowsᵀ μ nearest to `goal` (n,), and what is missing over ‖goal‖∞."""
+    """Find the multipliers μ >= 0 with the least ‖rowsᵀ μ - goal‖₂.
+
+    Parameters
+    ----------
+    rows, goal : array (m, n), (n,)
+
+    Returns
+    -------
+    mu : array (m,)
+    residual : float
+        ‖rowsᵀ μ - goal‖∞ over ‖goal‖∞.
+    """
     mu = np.zeros(len(rows))
     if len(rows):
         mu = scipy.optimize.nnls(rows.T, goal, maxiter=100 * len(rows))[0]
     return mu, float(np.abs(goal - mu @ rows).max()) / max(float(np.abs(goal).max()), 1e-300)
 
 
-def active_set(z: Array, here: FirstOrder, variables: Sequence[str]) -> ActiveSet:
-    """What binds at z of the unit box: g <= 0, and the ends of `variables`."""
-    at = np.flatnonzero(here.g >= -ACTIVE)
+def active_set(
+    z: Array, here: FirstOrder, variables: Sequence[str], *, active: float = KktOptions.active
+) -> ActiveSet:
+    """Collect what binds at a point of the unit box.
+
+    Parameters
+    ----------
+    z, here : array (n,), FirstOrder
+    variables : sequence of str (n,)
+        Names of the components of z, by which their bounds are labelled.
+    active : float
+        Shares of its size or of the box within which a constraint g <= 0 or a bound binds.
+
+    Returns
+    -------
+    ActiveSet
+    """
+    at = np.flatnonzero(here.g >= -active)
     rows, slack, units = ([*each[at]] for each in (here.jacobian, here.g, here.sizes))
     labels, count = [here.names[i] for i in at], len(at)
     for i, name in enumerate(variables):
         for end, value, sign in (("lower", -z[i], -1.0), ("upper", z[i] - 1.0, 1.0)):
-            if value >= -ACTIVE:
+            if value >= -active:
                 rows.append(sign * np.eye(z.size)[i])
                 labels.append(f"{name} {end}")
                 slack.append(value)
@@ -281,7 +391,20 @@ def active_set(z: Array, here: FirstOrder, variables: Sequence[str]) -> ActiveSe
 
 
 def reduced_curvature(Z: Array, columns: Array | None, size: float) -> float | None:
-    """Least eigenvalue of ZᵀHZ over `size`, columns (n, k) = HZ; inf at a vertex, None unknown."""
+    """Find the least eigenvalue of the reduced Hessian ZᵀHZ.
+
+    Parameters
+    ----------
+    Z, columns : array (n, k), (n, k) or None
+        Free directions; HZ, None or NaN where it is not known.
+    size : float
+        What the eigenvalue is divided by.
+
+    Returns
+    -------
+    float or None
+        inf at a vertex (k = 0), None where HZ is not known.
+    """
     if Z.shape[1] == 0:
         return np.inf
     if columns is None or not np.isfinite(columns).all():
@@ -294,12 +417,23 @@ def hessian_products(
     slopes: Callable[[Array], Sequence[Array | None]],
     z: Array,
     directions: Array,
-    step: float = STEP,
+    step: float = KktOptions.step,
 ) -> Array | None:
-    """HZ (n, k) by differences of gradients, all at once: z (2 k, n) -> (n,) of each; one-sided at
-    an end of the unit box.
+    """Multiply a Hessian by directions: differences of gradients, one-sided at an end of the box.
 
-    None where a gradient is not known, or the box leaves less than half of a step.
+    Parameters
+    ----------
+    slopes : callable
+        Gradients at many points: z (2k, n) to 2k arrays (n,), None where one is not known.
+    z, directions : array (n,), (n, k)
+        In the unit box; Z.
+    step : float
+        Of the box.
+
+    Returns
+    -------
+    array (n, k) or None
+        HZ; None where a gradient is not known, or the box leaves less than half of a step.
     """
     ends = np.clip(z + step * np.concatenate([directions.T, -directions.T]), 0.0, 1.0)
     found = [slope for slope in slopes(ends) if slope is not None]

@@ -10,8 +10,8 @@ solves
 with ½ pᵀ ∇²c p by programmes around the step before, whose Hessian is that of the Lagrangian, made
 convex (Fletcher and Sainz de la Maza 1989), each within a region of its own and corrected to second
 order, so that what the model promises grows from one to the next. A trial counts where the merit
-falls. What is minimised and how its curvature is learnt is the `Model`'s; `Radius` is how far a
-step is trusted.
+falls. What is minimised and how its curvature is learnt is the `TrustRegionModel`'s; `Radius` is
+how far a step is trusted.
 """
 
 from abc import ABC, abstractmethod
@@ -24,32 +24,54 @@ import numpy as np
 from ccd_casadi.optim.kkt import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
-SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to the answer of a programme
-SETTLED = 1e-2  # of the radius: a programme that moves less has no more to give
-HOLDS = 1e-7  # of the penalty: the multiplier of a row that holds the step
-BENDS = 0.2  # of the sizes of its parts: how far curvature may move a row more than it is known to
-FLAT = 1e-4  # of the slopes: least curvature, which leaves a linear programme one
-CONVEXIFYING = 10.0  # times AᵀA of the rows that hold: changes nothing along them
-ENOUGH, POOR = 0.7, 0.2  # of the predicted gain: with it a model is trusted further, or less far
-SHRINK = 0.5  # of the radius, after a poor step
-GROW = 1.4  # steps: the radius after a good one
-STEADY = 3  # steps at one radius, each of a middling gain, after which a larger one is tried
-WIDER = 10.0
-ZOOM = 4.0  # steps of the radius to which it comes down where they are too small for it
-FADING = 0.1  # of a penalty that a larger sum of multipliers left, at each step
-TIMES = 2.0  # the sum of multipliers and slope: the penalty that a step along curved rows counts
-ELASTIC = 10.0  # times the merit's penalty, where that grows: of the programme
-
 Data = TypeVar("Data")
 
 
 @dataclass(frozen=True)
-class Rows:
-    """c (m,) and its slopes (m, n) at an iterate, in the unit of the violation.
+class RadiusOptions:
+    """Numbers of the radius of a trust region."""
 
-    hard: (m,) rows that a step keeps without σ. margin: (m,) by how much a step keeps further
-    inside, and less as the radius shrinks. hessians: of rows given by index, (k, n, n), for the
-    first `curved` of them.
+    good: float = 0.7  # of the predicted gain, above which a model is trusted further
+    poor: float = 0.2  # of the predicted gain, below which it is trusted less far
+    shrink: float = 0.5  # of the radius, after a poor step
+    grow: float = 1.4  # lengths of a good step: the radius after it
+    steady: int = 3  # steps at one radius, each of a middling gain, after which it is widened
+    widen: float = 10.0
+    zoom: float = 4.0  # lengths of a step to which a radius is reduced that is too large for it
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Numbers of a step: of its quadratic programmes and their merit."""
+
+    programmes: int = 12  # around each other, for one step
+    little: float = 1e-2  # of the gain: what one more programme has to add
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125)  # of the way to a programme's solution
+    settled: float = 1e-2  # of the radius: a programme that moves less is the last
+    holds: float = 1e-7  # of the penalty: multiplier of a row that holds the step
+    bends: float = 0.2  # of the sizes of a row's parts: what its unknown curvature may move it by
+    flat: float = 1e-4  # of the slopes: least curvature, which makes a linear programme definite
+    convexifying: float = 10.0  # times AᵀA of the rows that hold: changes nothing along them
+    fading: float = 0.1  # of a penalty that a larger sum of multipliers left, at each step
+    curved_penalty: float = 2.0  # over the sum of multipliers and slope, where rows are curved
+    elastic_penalty: float = 10.0  # of the programme over the merit's, where that grows
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The constraints of a step at an iterate.
+
+    Attributes
+    ----------
+    value, slopes : array (m,), (m, n)
+        c and ∇c, in the unit of the violation.
+    hard : array (m,) of bool, optional
+        Rows that a step keeps without σ.
+    margin : array (m,), optional
+        By how much a step keeps further inside; less as the radius shrinks.
+    hessians : callable, optional
+        (k, n, n) of rows given by index, for the first `curved` of them.
+    curved : int
     """
 
     value: Array
@@ -62,7 +84,17 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Iterate(Generic[Data]):
-    """x (n,), f and its gradient (n,), the largest c above 0, and what its rows are made from."""
+    """A point of the search.
+
+    Attributes
+    ----------
+    x, value, gradient : array (n,), float, array (n,)
+        x, f and ∇f.
+    violation : float
+        The largest c above 0.
+    data : object
+        What its rows are made from.
+    """
 
     x: Array
     value: float
@@ -73,9 +105,19 @@ class Iterate(Generic[Data]):
 
 @dataclass(frozen=True)
 class Step:
-    """p (n,), the gain of merit that the model predicts, and that it would have with straight rows.
+    """A step of the model.
 
-    hessian: of the last programme. multipliers: (m,) of `rows`. penalty: of the merit.
+    Attributes
+    ----------
+    change : array (n,)
+        p.
+    predicted, straight : float
+        Gain of merit that the model predicts, and that with linear rows.
+    hessian : array (n, n)
+        Of the last programme.
+    multipliers, rows : array (m,), Rows
+    penalty : float
+        Of the merit.
     """
 
     change: Array
@@ -94,12 +136,22 @@ class Step:
 
 @dataclass(frozen=True)
 class Radius:
-    """How far a step may go in each variable; `steady` counts the steps since it changed."""
+    """How far a step may go in each variable.
+
+    Attributes
+    ----------
+    value, least, largest : float
+        In the unit of the variables; a search ends below `least`.
+    steady : int
+        Steps since it changed.
+    options : RadiusOptions
+    """
 
     value: float
     least: float
     largest: float
     steady: int = 0
+    options: RadiusOptions = RadiusOptions()
 
     def times(self, factor: float) -> "Radius":
         """A smaller or larger one."""
@@ -107,32 +159,47 @@ class Radius:
 
     def after(self, gained: float, step: Step) -> "Radius":
         """What a step of this predicted gain leaves of it."""
-        if gained > ENOUGH * step.predicted:
-            value = min(max(self.value, GROW * step.size), self.largest)
+        options = self.options
+        if gained > options.good * step.predicted:
+            value = min(max(self.value, options.grow * step.size), self.largest)
             return replace(self, value=value, steady=0)
-        if gained < POOR * step.predicted:
-            return replace(self, value=SHRINK * min(self.value, step.size), steady=0)
-        if self.steady + 1 == STEADY:
+        if gained < options.poor * step.predicted:
+            return replace(self, value=options.shrink * min(self.value, step.size), steady=0)
+        if self.steady + 1 == options.steady:
             # What a small step gains less than predicted may be a violation so small that the
-            # linear rows overshoot it, whatever the radius: it is the gain that asks for more.
-            return self.times(WIDER)
+            # linear rows overshoot it, whatever the radius: it is the gain that requires more.
+            return self.times(options.widen)
         return replace(self, steady=self.steady + 1)
 
 
-class Model(ABC, Generic[Data]):
-    """What is minimised over the box `low` <= x <= `high` (n,)."""
+class TrustRegionModel(ABC, Generic[Data]):
+    """What is minimised over the box `low` <= x <= `high`, and how its curvature is learnt.
+
+    Attributes
+    ----------
+    low, high : array (n,)
+    carried : bool
+        σ >= 0 falls away: f is the largest row.
+    corrected : bool
+        A trial that gains too little is corrected to second order.
+    growing : bool
+        The penalty grows with the multipliers.
+    restoring : bool
+        The merit counts the whole penalty: the rows go before the goal.
+    bending : bool
+        A row that ends below its bound by little of what it moves counts with its curvature, as it
+        may bend over it. Searches over K alone end in better optima without.
+    step_options : StepOptions
+    """
 
     low: Array
     high: Array
-    carried = False  # whether σ >= 0 falls away: f is the largest row
-    corrected = False  # whether a trial that gains too little is corrected to second order
-    growing = False  # whether the penalty grows with the multipliers
-    restoring = False  # whether the merit counts the whole penalty: the rows go before the goal
-    # Whether a row that ends below its bound by little of what it moves counts with its curvature,
-    # as it may bend over it. Searches over K alone end in better optima without.
+    carried = False
+    corrected = False
+    growing = False
+    restoring = False
     bending = False
-    programmes = 12  # around each other, for one step
-    little = 1e-2  # of the gain: what one more programme has to add
+    step_options = StepOptions()
 
     @abstractmethod
     def at(self, x: Array) -> Iterate[Data] | None:
@@ -149,11 +216,11 @@ class Model(ABC, Generic[Data]):
         return H
 
     def ended(self, here: Iterate[Data], there: Iterate[Data]) -> bool:
-        """Whether a trial tells that to go on is of no use."""
+        """Whether a trial shows that further steps are of no use."""
         return False
 
 
-class End(NamedTuple, Generic[Data]):
+class Minimum(NamedTuple, Generic[Data]):
     """The best iterate, the radius left, the trials, and whether further steps do not help."""
 
     best: Iterate[Data]
@@ -163,7 +230,7 @@ class End(NamedTuple, Generic[Data]):
 
 
 def minimise(
-    model: Model[Data],
+    model: TrustRegionModel[Data],
     start: Iterate[Data],
     H: Array,
     radius: Radius,
@@ -171,36 +238,56 @@ def minimise(
     steps: int,
     penalty: float,
     least_gain: float,
-) -> End[Data]:
-    """From `start` to where the model promises less than `least_gain` of the merit.
+) -> Minimum[Data]:
+    """Minimise f(x) + ρ max(0, max c(x)) by steps in a trust region.
 
-    H (n, n) is the first Hessian, also after a programme without an answer. `steps` bounds the
-    iterations.
+    Parameters
+    ----------
+    model, start : TrustRegionModel, Iterate
+    H : array (n, n)
+        The first Hessian, also after a programme without a solution.
+    radius : Radius
+    steps : int
+        Iterations at most.
+    penalty : float
+        ρ.
+    least_gain : float
+        Of the merit, below which a step that the model predicts ends the search.
+
+    Returns
+    -------
+    Minimum
+        The best iterate, the radius that is left, the number of trials, and whether further steps
+        do not help.
+
+    References
+    ----------
+    R. Fletcher and E. Sainz de la Maza, Mathematical Programming 43 (1989) 235-256.
     """
     here, first, evaluations = start, H, 0
     for _ in range(steps):
         if radius.value < radius.least:
-            return End(here, radius, evaluations, True)
+            return Minimum(here, radius, evaluations, True)
         step = best_step(model, here, H, radius.value, penalty)
-        if step is None:  # that tells nothing of an optimum
+        if step is None:  # which says nothing of an optimum
             H, radius = first, radius.times(0.3)
             continue
         if step.predicted <= least_gain or step.straight <= least_gain:
-            zoomed = ZOOM * step.size
+            zoomed = radius.options.zoom * step.size
             if step.straight > least_gain or step.rows.margin is not None:
-                radius = radius.times(0.3)  # so bent that nothing is found as far as this
+                radius = radius.times(0.3)  # so curved that nothing is found as far as this
             elif model.growing and radius.least < zoomed < radius.value:
                 # The programme is solved to a share of the radius, and the merit counts what it
                 # leaves of a violation: next to an optimum that is more than is left to gain.
                 radius = radius.times(zoomed / radius.value)
             else:
-                return End(here, radius, evaluations, True)
+                return Minimum(here, radius, evaluations, True)
             continue
         penalty = step.penalty if model.growing else penalty
         there = model.at(here.x + step.change)
         evaluations += 1
         gained = _gain(here, there, step.penalty)
-        if gained < ENOUGH * step.predicted and there is not None and model.corrected:
+        if gained < radius.options.good * step.predicted and there is not None and model.corrected:
             change = _corrected(model, here, there, step, H, radius.value)
             other = None if change is None else model.at(here.x + change)
             evaluations += change is not None
@@ -209,17 +296,17 @@ def minimise(
         radius = radius.after(gained, step)
         if there is not None:
             if model.ended(here, there):
-                return End(there if gained > 0.0 else here, radius, evaluations, True)
+                return Minimum(there if gained > 0.0 else here, radius, evaluations, True)
             H = model.learnt(H, here, there, step, radius.value)
             here = there if gained > 0.0 else here
-    return End(here, radius, evaluations, False)
+    return Minimum(here, radius, evaluations, False)
 
 
 def best_step(
-    model: Model[Data], here: Iterate[Data], H: Array, radius: float, penalty: float
+    model: TrustRegionModel[Data], here: Iterate[Data], H: Array, radius: float, penalty: float
 ) -> Step | None:
     """The best step that the model knows; None where its programme has no answer."""
-    rows = model.rows(here, radius)
+    rows, options = model.rows(here, radius), model.step_options
     margin = np.zeros(len(rows.value)) if rows.margin is None else rows.margin
     chosen = np.arange(len(rows.value))
     if not model.carried:  # a row that the step cannot lift over its bound is none of it
@@ -229,7 +316,7 @@ def best_step(
     elastic = np.ones(len(chosen)) if rows.hard is None else 1.0 - rows.hard[chosen]
     soft = slice(None) if rows.hard is None else elastic > 0.0
     unit = _unit(here, penalty if model.carried else 0.0)
-    weight = ELASTIC * (unit + penalty) if model.growing else penalty
+    weight = options.elastic_penalty * (unit + penalty) if model.growing else penalty
     multipliers = np.zeros(len(rows.value))
 
     curved, bent = np.zeros((0, n, n)), np.zeros(0, int)  # Hessians, and the rows that have them
@@ -250,24 +337,25 @@ def best_step(
             M, cost, at, offset, elastic, *ends, weight, radius, unit, free=model.carried
         )
 
-    at, offset, M, p = slopes, value + margin[chosen], convex(H, FLAT * unit), np.zeros(n)
+    at, offset, M, p = slopes, value + margin[chosen], convex(H, options.flat * unit), np.zeros(n)
     (low, high), near, straight = _ends(model, here, radius), radius, 0.0
-    best: Step | None = None
-    for turn in range(model.programmes):
+    best, shares = None, options.shares
+    for turn in range(options.programmes):
         found = answer(offset)
         if found is None:
             break
         way, mu = found[0] - p, found[1]
         if model.growing:
-            penalty = max(FADING * penalty, 2.0 * float(mu.sum()))
+            penalty = max(options.fading * penalty, 2.0 * float(mu.sum()))
         elif rows.curved and not model.restoring:
-            penalty = min(weight, TIMES * float(mu.sum() + unit))
+            penalty = min(weight, options.curved_penalty * float(mu.sum() + unit))
         if turn == 0:
             straight = float(gains(way[None])[0])
-        holds = mu > HOLDS * weight
+        holds = mu > options.holds * weight
         counts = holds.copy()
         if model.bending:
-            counts |= offset + at @ found[0] > -BENDS * (np.abs(slopes) @ np.abs(found[0]))
+            moved = np.abs(slopes) @ np.abs(found[0])
+            counts |= offset + at @ found[0] > -options.bends * moved
         counts[bent] = False
         fresh = np.flatnonzero(counts & (chosen < rows.curved))
         if len(fresh) and rows.hessians is not None:
@@ -275,7 +363,7 @@ def best_step(
             bent = np.concatenate([bent, fresh])
         size = float(np.abs(way).max())
         # The rows bend less on part of the way: a whole one may lead further and further out.
-        tried = p + np.array(SHARES if rows.curved else SHARES[:1])[:, None] * way
+        tried = p + np.array(shares if rows.curved else shares[:1])[:, None] * way
         known, *reached = gains(np.vstack([p, tried])).tolist()
         if turn and reached[0] < max(reached):  # the whole of it, with what the rows bend on it
             bends = offset.copy()
@@ -289,7 +377,7 @@ def best_step(
             end = tried[reached.index(predicted)]
             near, p = 2.0 * float(np.abs(end - p).max()), end
         else:
-            near, predicted = 0.5 * SHARES[-1] * size, known
+            near, predicted = 0.5 * shares[-1] * size, known
         multipliers = np.zeros(len(rows.value))
         multipliers[chosen] = mu
         if rows.curved:
@@ -299,16 +387,17 @@ def best_step(
             offset[bent] -= 0.5 * bend @ p
             lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0)[bent], curved)
             active = at[holds]
-            M = convex(lagrangian + CONVEXIFYING * active.T @ active, FLAT * unit)
+            M = convex(lagrangian + options.convexifying * active.T @ active, options.flat * unit)
         best = Step(p, predicted, straight, M, multipliers, rows, penalty)
-        little = better < model.little * predicted if better > 0.0 else size < SETTLED * radius
+        settled = size < options.settled * radius
+        little = better < options.little * predicted if better > 0.0 else settled
         if not rows.curved or (turn and little and not len(fresh)):
             break
     return best
 
 
 def _corrected(
-    model: Model[Data],
+    model: TrustRegionModel[Data],
     here: Iterate[Data],
     there: Iterate[Data],
     step: Step,
@@ -348,6 +437,6 @@ def _unit(here: Iterate[Data], carried: float) -> float:
     return max(float(np.abs(here.gradient).max()), carried, 1e-300)
 
 
-def _ends(model: Model[Data], here: Iterate[Data], radius: float) -> tuple[Array, Array]:
+def _ends(model: TrustRegionModel[Data], here: Iterate[Data], radius: float) -> tuple[Array, Array]:
     low = np.minimum(np.maximum(model.low - here.x, -radius), 0.0)
     return low, np.maximum(np.minimum(model.high - here.x, radius), 0.0)

@@ -3,8 +3,12 @@
     M q̈ + D q̇ + K q = B u,   y = C q;   ẋ = [0 1; -M⁻¹K -M⁻¹D] x + [0; M⁻¹B] u,   x = (q, q̇)
 
 in the person's own coordinates and units, free bodies free, nothing reduced, scaled or put in modal
-form. Off the model, with a common shift s of the resonances, shifts s_i of single modes, a factor d
-of the damping and a gain g,
+form, but for one case: beside a link so stiff that λ_max > 1e7 λ_min the eigenvalues of A err by
+ε λ_max in squares of rates, which moves the soft poles and hides free bodies. There x = (η, η̇),
+q = Φ η with `natural_modes`, which know the soft modes, M = 1 and K = Λ.
+
+Off the model, with a common shift s of the resonances, shifts s_i of single modes, a factor d of
+the damping and a gain g,
 
     K' = (1 + s)²(K + Σ_i ((1 + s_i)² - 1) λ_i M φ_i (M φ_i)ᵀ),
     D' = d (D + Σ_i 2 ζ (1 + s)(1 + s_i) ω_i M φ_i (M φ_i)ᵀ),   B' = (1 + g) B.
@@ -18,6 +22,8 @@ from ccd_casadi.lti.state_space import StateSpace, strictly_proper
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered
 from ccd_casadi.support.arrays import Array
+
+STIFF = 1e7  # λ_max/λ_min from which on the modes are the coordinates
 
 
 def as_written(
@@ -60,11 +66,19 @@ def as_written(
     zeta = system.damping_ratio or 0.0
     D = damping * (system.D + (pushes * (2.0 * zeta * ratio * np.sqrt(lam))) @ pushes.T)
     M, B, C = system.M, (1.0 + gain) * system.B, system.C
-    sides = _seen(shapes, rigid, B, C)
+    sides, soft = _seen(shapes, rigid, B, C), lam[~rigid]
+    stiff = bool(len(soft)) and soft.max() > STIFF * soft.min()
+    if sides is None and stiff:
+        sides = shapes, shapes
     if sides is not None:
         left, right = sides
         M, K, D = (left.T @ part @ right for part in (M, K, D))
         B, C = left.T @ B, C @ right
+    if stiff:  # exactly, where products with K would lose it
+        M, K = (
+            np.eye(len(M)),
+            np.diag(np.append(np.zeros(len(M) - len(soft)), (ratio**2 * lam)[~rigid])),
+        )
     n, rates = len(M), np.linalg.solve(M, np.hstack([K, D, B]))
     A = np.zeros((2 * n, 2 * n))
     A[:n, n:] = np.eye(n)

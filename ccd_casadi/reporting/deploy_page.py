@@ -6,7 +6,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.files import Root, sections_of
+from ccd_casadi.deployment.deploy_files import Root, sections_of
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import (
     ChannelOrders,

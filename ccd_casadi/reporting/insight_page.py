@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.insight import Front, bandwidth_of, natural_hz
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.pareto import Front, bandwidth_of, natural_hz
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import Iterate
+from ccd_casadi.codesign.formulation import FormulationRound
 from ccd_casadi.drawing.content import (
     Band,
     Curve,
@@ -37,7 +37,7 @@ LEAST_BAND = 3.0  # standardised residuals shown at least, either way
 
 
 def history_blocks(
-    iterates: Sequence[Iterate], problem: CoDesignProblem, result: Mapping[str, Any],
+    iterates: Sequence[FormulationRound], problem: CoDesignProblem, result: Mapping[str, Any],
     theta: tuple[float, ...], tolerance: float, *, lifted: bool,
 ) -> tuple[Words, Table]:  # fmt: skip
     """ω_b and J predicted and true, round by round, the verified design last, and the error."""

@@ -9,9 +9,9 @@ import numpy as np
 from ccd_casadi.analysis.loop_figures import force_response, largest_force_step, rest_time
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
-from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
-from ccd_casadi.analysis.setpoint import UNLIMITED, cycle_of, setpoint
-from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
+from ccd_casadi.analysis.move_limits import LIMITS
+from ccd_casadi.analysis.setpoint import Motor, cycle_of, setpoint
+from ccd_casadi.deployment.on_hardware import OnHardware, SimulationOptions
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.paint import tables_of
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
@@ -34,7 +34,9 @@ FIGURES: dict[str, Callable[[Move], float]] = {  # of a move, in a table
     "settled after, ms": lambda m: 1e3 * m.settled,
     "RMS error, µm": lambda m: 1e6 * m.rms_error,
     "peak error, µm": lambda m: 1e6 * m.peak_error,
-    "largest error of the last quarter, µm": lambda m: 1e6 * m.last_error(WATCHED),
+    "largest error of the last quarter, µm": lambda m: (
+        1e6 * m.last_error(SimulationOptions().watched)
+    ),
     "peak force, N": lambda m: float(m.peak_force.max()),
     "at the limit, %": lambda m: 100.0 * m.saturated,
 }
@@ -50,7 +52,7 @@ def move_figure(problem: CoDesignProblem, theta: Sequence[float], view: LoopView
         name, other = "with feedforward up to snap", ", that of [move]"
         ahead: Array | None = motion.forward
     else:
-        profile, window = setpoint(LIMITS), WINDOW
+        profile, window = setpoint(LIMITS), LIMITS.window
         modal = free_modal(problem, mechanics(plant_of(problem), theta))
         name, ahead = "with mass feedforward", mass_feedforward(modal, 0)
         other = " (another: [move] in the case, or the options of robustness)"
@@ -95,7 +97,7 @@ def cycle_chapter(
         panels.append(c.Panel("heat that is allowed (W)", "move and settling (ms)", (curve,),
                               levels=(here,)))  # fmt: skip
     settling = None if settled is None else late
-    limited_force = motor.peak_current[0] < UNLIMITED
+    limited_force = motor.peak_current[0] < Motor.unlimited
     known = (ms[-1], 1e3 * profile.duration, settling, limited_force, own.required)
     words = paragraph("report.cycle", told, *known)
     lines = c.Lines((tuple(panels[:2]), tuple(panels[2:])), "A cycle of the motor", (2.4, 2.4))

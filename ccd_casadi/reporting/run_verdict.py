@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from ccd_casadi.analysis.loop_figures import PERIODS
+from ccd_casadi.analysis.loop_figures import LoopFigureOptions
 from ccd_casadi.codesign.verdict import OwnSet, State
 from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page, VerdictLine
 from ccd_casadi.drawing.paint import block_html, page_html, write_page
@@ -231,12 +231,12 @@ def loop_concerns(
         if overshoot > options.overshoot:
             usual = f"usual: at most {100.0 * options.overshoot:g}"
             found.append(f"a step overshoots by {100.0 * overshoot:.3g} % ({usual})")
-        settled = result["settling_ms"]
+        settled, followed = result["settling_ms"], LoopFigureOptions().periods
         if settled is None:
             found.append("a step does not settle within 2 %")
-        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > PERIODS:
+        elif settled * 1e-3 * result.get("bandwidth_hz", 0.0) > followed:
             late = f"only after {with_unit(1e-3 * settled, 's')}"
-            found.append(f"a step settles {late}, {PERIODS:g} periods of the bandwidth or more")
+            found.append(f"a step settles {late}, {followed:g} periods of the bandwidth or more")
     reach = result.get("sensitivity_peak_between_lines")  # of a measured response
     if reach is not None and reach > max(1.0, options.between_lines * result["sensitivity_peak"]):
         where = result.get("sensitivity_peak_between_lines_hz")

@@ -23,7 +23,7 @@ from ccd_casadi.reporting.facts import binding, facts, gain_words, paragraph
 from ccd_casadi.reporting.gain_figures import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import near, nyquist_panel
 from ccd_casadi.reporting.run_verdict import head_of
-from ccd_casadi.support.text import HZ, counted, number
+from ccd_casadi.support.text import HZ, counted, number, spoken
 from ccd_casadi.synthesis.closed_loop import measure
 
 MOST_TOLERANCES, LEAST_HZ = 5, 1e-6  # that are named; with less in Hz a tolerance costs nothing
@@ -191,9 +191,9 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
             legend=None, y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
          nyquist_panel(hz, shown, bounds.S_max, HEIGHT, ("the first", "the others"))),
-        (over_hz("|G| (m/N)", curves["G"], ends),
+        (over_hz(spoken("|G| (m/N)"), curves["G"], ends),
          over_hz("|L| (–)", curves["L"], ends, levels=(c.Level(1.0, "1"), at))),
-        (over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),
+        (over_hz(spoken("|KS| (N/m)"), curves["KS"], ends, levels=(at,)),
          over_hz("|T| (–)", curves["T"], ends, levels=(at,))),
     )  # fmt: skip
     words = "Every bound is required on every line: S out of the shaded area, L out of the disk."

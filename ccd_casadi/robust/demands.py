@@ -3,15 +3,24 @@
 import argparse
 from dataclasses import dataclass
 
-from ccd_casadi.analysis.move_limits import LIMITS, WINDOW, MoveLimits
+from ccd_casadi.analysis.move_limits import LIMITS, MoveLimits
 from ccd_casadi.support.options import positive, valued
 
 
 @dataclass(frozen=True)
 class Demands:
-    """What to try: relative shift and tolerance, damping factors, densities, the move.
+    """The demands of a robustness study.
 
-    `sensor` in m/√Hz and `disturbance` in N/√Hz, one-sided; `window` in m; `axis` from 0.
+    Attributes
+    ----------
+    shift, damping : float, tuple of two floats
+        Of all resonances, relative, to either side; the least and the largest factor.
+    tolerance, samples : float, int
+        Of hardware, relative; random plants within it.
+    sensor, disturbance : float
+        White, one-sided: m/√Hz and N/√Hz.
+    limits, window, axis : MoveLimits, float, int
+        The move; m, within which the error has to stay; the axis that moves, from 0.
     """
 
     shift: float = 0.05
@@ -21,7 +30,7 @@ class Demands:
     sensor: float = 1.0
     disturbance: float = 1.0
     limits: MoveLimits = LIMITS
-    window: float = WINDOW
+    window: float = LIMITS.window
     axis: int = 0
 
 
@@ -41,5 +50,15 @@ MOVE_OPTIONS = [
 
 
 def move_limits(options: argparse.Namespace) -> MoveLimits:
-    """What these options ask for."""
+    """Take the limits of the move from a command's options.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+
+    Returns
+    -------
+    MoveLimits
+        SI.
+    """
     return MoveLimits(*(getattr(options, name) for name, _, _ in _MOVE[:-1]))

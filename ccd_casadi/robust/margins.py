@@ -26,8 +26,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import PlantAndController, classical_margins
 
-REST = 1e-3  # of the lowest frequency of a grid: what counts as constant
-
 
 @dataclass(frozen=True)
 class Noise:
@@ -53,9 +51,9 @@ def norms(loop: ClosedLoop) -> tuple[tuple[float, float], ...]:
 def highest(gain: Callable[[Array], Array], omega: Array) -> tuple[tuple[float, float], ...]:
     """The largest value of each row of gains (r, k), climbed from a grid in rad/s, and its ω.
 
-    Of a loop in discrete time, from far below the grid (a constant signal) to its end.
+    Of a loop in discrete time, from far below the grid to its end.
     """
-    omega = np.concatenate([REST * omega[:1], omega])
+    omega = np.concatenate([1e-3 * omega[:1], omega])  # a constant signal
     values, found = gain(omega), []
     for row, i in enumerate(values.argmax(axis=1)):
         ends = omega[max(i - 1, 0)], omega[min(i + 1, len(omega) - 1)]
@@ -84,12 +82,19 @@ def noise(loop: Loop, sensor: float, disturbance: float) -> Noise:
     return Noise(*found)
 
 
-FINE = 61  # points between the neighbours of the least disk margin found
-
-
 @dataclass(frozen=True)
 class DiskMargin:
-    """α, where it is least (Hz), and the gain (factor) and phase (degrees) that it allows."""
+    """The disk margin of a loop (balanced, σ = 0): 1/α = ‖S - ½‖∞, of channels its bound on μ.
+
+    Attributes
+    ----------
+    alpha, hz : float
+        α, and where it is least.
+
+    References
+    ----------
+    P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems Magazine 40 (2020) 78-95.
+    """
 
     alpha: float
     hz: float
@@ -135,7 +140,7 @@ def margins(respond: PlantAndController, hz: Array) -> Margins:
     """Margins of a loop from its responses in SI, on a grid in Hz that resolves resonances.
 
     The grid only brackets: crossings are bisected on the response itself, and the least disk margin
-    is looked for again between its neighbours. Of a sampled loop the grid ends at half its rate.
+    is searched again between its neighbours. Of a sampled loop the grid ends at half its rate.
     """
     loops, together = [], []
     for name in ("output", "input"):
@@ -167,13 +172,13 @@ def _loop(name: str, L: Callable[[Array], NDArray], hz: Array) -> LoopMargins:
     )
 
 
-def _least(L: Callable[[Array], NDArray], hz: Array) -> DiskMargin:
-    """The least disk margin of all channels at once on the grid, then on a finer one around it."""
+def _least(L: Callable[[Array], NDArray], hz: Array, *, points: int = 61) -> DiskMargin:
+    """The least disk margin of all channels at once on the grid, then at `points` around it."""
     for last in (False, True):
         eye = np.eye((response := L(HZ * hz)).shape[1])
         alpha = 1.0 / mu_bound(sensitivity(response) - 0.5 * eye)
         worst = int(alpha.argmin())
         found = DiskMargin(float(alpha[worst]), float(hz[worst]))
         if not last:
-            hz = np.geomspace(hz[max(worst - 1, 0)], hz[min(worst + 1, hz.size - 1)], FINE)
+            hz = np.geomspace(hz[max(worst - 1, 0)], hz[min(worst + 1, hz.size - 1)], points)
     return found

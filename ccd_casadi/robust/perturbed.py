@@ -34,12 +34,17 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool, Workers, results
 from ccd_casadi.support.terminal import Progress
 
-PER_DECADE, DECADES = 60, 6  # of a grid of compliance, below the Nyquist frequency
-
 
 @dataclass(frozen=True)
 class SampledFigures:
-    """The loop at the sampling instants; frequencies in rad/s, NaN where the loop is unstable."""
+    """The figures of a loop at its sampling instants.
+
+    Attributes
+    ----------
+    stable, spectral_radius : bool, float
+    sensitivity_peak, sensitivity_peak_frequency, bandwidth : float
+        ‖S‖∞, where it is, and ω_b, in rad/s; NaN where the loop is unstable.
+    """
 
     stable: bool
     spectral_radius: float
@@ -49,7 +54,17 @@ class SampledFigures:
 
 
 def sampled_figures(S: StateSpace) -> SampledFigures:
-    """Stability by eigenvalues, ‖S‖∞ and ω_b by level tests confirmed on the response."""
+    """Measure a sampled loop: stability by eigenvalues, ‖S‖∞ and ω_b by level tests.
+
+    Parameters
+    ----------
+    S : StateSpace
+        In discrete time.
+
+    Returns
+    -------
+    SampledFigures
+    """
     poles = np.linalg.eigvals(S.A)
     radius = float(np.abs(poles).max())
     if not radius < 1.0:
@@ -58,7 +73,17 @@ def sampled_figures(S: StateSpace) -> SampledFigures:
 
 
 def worst_figures(parts: Sequence[SampledFigures]) -> SampledFigures:
-    """The figures of a loop that is these, side by side: the worst of each."""
+    """Take the worst of each figure of loops that run side by side.
+
+    Parameters
+    ----------
+    parts : sequence of SampledFigures
+
+    Returns
+    -------
+    SampledFigures
+        The bandwidth is NaN where one has none.
+    """
     top = max(parts, key=lambda f: f.sensitivity_peak)
     stable = all(f.stable for f in parts)
     radius = max(f.spectral_radius for f in parts)
@@ -70,20 +95,34 @@ def worst_figures(parts: Sequence[SampledFigures]) -> SampledFigures:
     )
 
 
-def sampled_compliance(plant: StateSpace, S: StateSpace) -> float:
-    """max over ω up to π/T of σ_max(S(e^{jωT}) G(jω)), m/N; the plant in SI without hold and delay.
+def sampled_compliance(
+    plant: StateSpace, S: StateSpace, *, decades: int = 6, per_decade: int = 60
+) -> float:
+    """Find the compliance of a sampled loop, max over ω <= π/T of σ_max(S(e^{jωT}) G(jω)).
 
-    A sinusoidal force f beside the held one acts without a break: the outputs at the instants are
-    S G f. What faster forces leave (aliased) is not in it. S is stable.
+    A sinusoidal force f beside the held one acts continuously: the outputs at the instants are
+    S G f. The aliased effect of faster forces is not included.
+
+    Parameters
+    ----------
+    plant, S : StateSpace
+        G in SI without hold and delay; S in discrete time, stable.
+    decades, per_decade : int
+        Of the grid below π/T, and its points in each.
+
+    Returns
+    -------
+    float
+        m/N.
     """
     end = np.pi / S.period
     near = root_flanks(np.concatenate([S.rates, plant.poles]))
-    grid = frequency_grid(end * 10.0**-DECADES, end, DECADES * PER_DECADE, near)
+    grid = frequency_grid(end * 10.0**-decades, end, decades * per_decade, near)
     return highest(lambda at: sigma_max(S.response(at) @ plant.response(at))[None], grid)[0][0]
 
 
 def _bandwidth(S: StateSpace) -> float:
-    """The first ω at which σ_max(S) passes 1/√2 from below; NaN where there is none.
+    """The first ω at which σ_max(S) exceeds 1/√2; NaN where there is none.
 
     Over w the circle is the axis, where a Hamiltonian matrix has imaginary eigenvalues at the
     crossings. They are candidates, and the response itself decides. (SLICOT's AB13DD in discrete
@@ -105,7 +144,6 @@ def _bandwidth(S: StateSpace) -> float:
     return float(brentq(excess, ends[first - 1], ends[first], (), 1e-12 * ends[first], 1e-14))
 
 
-SEARCH = 120  # measurements of a search for the worst plant
 Figure = Callable[[Loop], float]
 Ends = tuple[float, float]
 
@@ -222,11 +260,13 @@ def search(
     low: Array,
     high: Array,
     label: str,
+    *,
+    steps: int = 120,
 ) -> PerturbedLoop:
     """The worst of the starts, and of a bounded Nelder and Mead search from the worst of them."""
     found: list[tuple[Array, PerturbedLoop]] = []
 
-    progress = Progress(len(starts) + SEARCH, label)
+    progress = Progress(len(starts) + steps, label)
 
     def cost(x: Array) -> float:
         item = at(x)
@@ -240,14 +280,10 @@ def search(
         for start in starts:
             cost(start)
         begin = max(found, key=lambda item: item[1].badness)[0]
-        options = {"maxfev": SEARCH, "xatol": 1e-4, "fatol": 1e-6}
+        options = {"maxfev": steps, "xatol": 1e-4, "fatol": 1e-6}
         bounds = list(zip(low, high, strict=True))
         scipy.optimize.minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options=options)
     return max((item for _, item in found), key=lambda item: item.badness)
-
-
-CORNERS = 5  # parameters up to which all corners of the tolerances are tried
-STARTS = 2
 
 
 @dataclass(frozen=True)
@@ -274,18 +310,20 @@ class Tolerances:
 
 
 def tolerances(
-    run: FinishedRun, tolerance: float, samples: int, seed: int, workers: Pool | None = None
-) -> Tolerances:
+    run: FinishedRun, tolerance: float, samples: int, seed: int, workers: Pool | None = None,
+    *, few: int = 5, starts_of_search: int = 2,
+) -> Tolerances:  # fmt: skip
     """Uniformly random θ within ± `tolerance` (relative) of the design's, and the worst θ found.
 
     The controller stays. θ may leave its bounds by the tolerance. `failed` counts hardware of
-    which the model makes no plant. `workers` share the random ones.
+    which the model makes no plant. `workers` share the random ones. Of up to `few` parameters all
+    corners are tried; the search starts from these and the worst random ones.
     """
     pool = workers or Workers(1)
     theta = np.array(run.theta)
     rng = np.random.default_rng(seed)
     unit = rng.uniform(-1.0, 1.0, (samples, theta.size))
-    if theta.size <= CORNERS:
+    if theta.size <= few:
         signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * theta.size)).reshape(theta.size, -1).T
     else:
         signs = np.empty((0, theta.size))
@@ -305,7 +343,7 @@ def tolerances(
     failed = sum(item is None for item in drawn)
     one = np.ones(theta.size)
     order = np.argsort([-1.0 if item is None else -item.badness for item in drawn])
-    starts = [*signs, *unit[order[:STARTS]]]
+    starts = [*signs, *unit[order[:starts_of_search]]]
     worst = search(at, starts, -one, one, "worst hardware")
     kept = tuple(item for item in drawn if item is not None)
     worst = max((worst, *kept), key=lambda item: item.badness)

@@ -43,17 +43,25 @@ from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.synthesis import Statics, statics
 
-NYQUIST = 0.999  # of half the sampling rate: where a grid ends
-
 
 @dataclass(frozen=True)
 class Study:
-    """The results; `peaks` are the largest values of σ_max of S, T, GS and KS with the frequencies
-    in rad/s (0: at rest), which the grid of the `view` does not decide; `moves` the move without
-    and with feedforward.
+    """The results of a robustness study.
 
-    `structured` is None where no flexible mode is in the loop, and of a controller in discrete
-    time.
+    Attributes
+    ----------
+    demands, view : Demands, LoopView
+    peaks : tuple of (value, rad/s)
+        The largest σ_max of S, T, GS and KS (0 rad/s: at rest), independent of the view's grid.
+    margins, noise, statics : Margins, Noise, Statics
+    shift, damping, modes, box : Line, Line, tuple of PerturbedLoop, PerturbedLoop
+        Plants off the model: all resonances, damping, each mode, the worst of both.
+    tolerances : Tolerances
+        Of hardware.
+    structured : StructuredBound or None
+        None where no flexible mode is in the loop, and of a controller in discrete time.
+    setpoint, moves : Setpoint, tuple of Move
+        The move without and with feedforward.
     """
 
     demands: Demands
@@ -113,7 +121,8 @@ def _study(run: FinishedRun, d: Demands, seed: int, workers: Pool | None) -> Stu
     omega_b, low = run.figures.bandwidth, run.problem.inner.omega_low
     bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
     view = loop_view([loop], bounded, bandwidth_hz=omega_b / HZ)
-    ends = [] if loop.sampling is None else [NYQUIST * 0.5 / loop.sampling.period]
+    # a grid ends just below half the rate
+    ends = [] if loop.sampling is None else [0.999 * 0.5 / loop.sampling.period]
     hz = np.append(view.hz, ends)
 
     def sizes(omega: Array) -> Array:
@@ -149,7 +158,17 @@ def _moves(
 
 
 def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:
-    """robustness.json: SI, and Hz where the name says so; shifts and tolerances are relative."""
+    """Make the content of robustness.json.
+
+    Parameters
+    ----------
+    run, study : FinishedRun, Study
+
+    Returns
+    -------
+    dict
+        SI, and Hz where the name says so; shifts and tolerances are relative.
+    """
     bound, hard, d = study.structured, study.tolerances, study.demands
     peaks = [item.peak for item in hard.judged if item.stable]
     quantiles = np.quantile(peaks, [0.5, 0.95, 1.0]) if peaks else ()
@@ -210,7 +229,17 @@ def study_dict(run: FinishedRun, study: Study) -> dict[str, Any]:
 
 
 def survival_line(run: FinishedRun, study: Study) -> VerdictLine:
-    """`survives` of the run's verdict: what the solve said, and what the study adds to it."""
+    """Update the line `survives` of a run's verdict by a study.
+
+    Parameters
+    ----------
+    run, study : FinishedRun, Study
+
+    Returns
+    -------
+    VerdictLine
+        The solve's line and figures, with those of the study.
+    """
     before, hard, d = at_solve(run.result, "survives"), study.tolerances, study.demands
     lost = hard.unstable
     said = []

@@ -1,7 +1,7 @@
 """Sampling on a Dask cluster, by the interface of the process pool: nothing lost, nothing twice.
 
 Dask runs a task again where its worker dies. Where scheduler or workers stay away the command ends,
-and the same command goes on from the samples that it has kept.
+and the same command resumes from the samples that it has kept.
 
 Messages are pickled, as Dask's own are: scheduler and workers can run what they like here, so the
 address must be one's own; docs/development/cluster.md shows TLS for it. None is stored.
@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, Self
 
 from ccd_casadi.inner_problem.problem import NUMERICS
@@ -22,15 +23,36 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.worker_process import R, T, WorkerLost, answer_message, one_blas_thread
 
-CONNECT_SECONDS = 10.0  # for the scheduler to answer at first, and for a worker to be there
-CLOSE_SECONDS = 1.0  # for a farewell that nobody needs: Ctrl-C ends within 2 s
-TICK = 0.02  # s between two looks at what has come, and at who is there
+
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Times of a connection to a cluster, s."""
+
+    connect: float = 10.0  # for the scheduler to answer at first, and for a worker to be there
+    close: float = 1.0  # at the end, when nothing depends on it: Ctrl-C ends within 2 s
+    poll: float = 0.02  # between two checks of the answers, and of the workers
+
 
 _one_at_a_time = threading.Lock()
 
 
 def pool(scheduler: str | None, count: int, patience: float) -> Pool:
-    """The cluster behind a scheduler's address, or without one `count` processes here."""
+    """The processes of a command.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address of a Dask scheduler.
+    count : int
+        Processes here, without a scheduler.
+    patience : float
+        Work that starting these is not worth, s.
+
+    Returns
+    -------
+    Pool
+        To be entered.
+    """
     return Workers(count, patience) if scheduler is None else Cluster(scheduler)
 
 
@@ -40,8 +62,11 @@ class Cluster:
     Assumes that the workers have this package, and a user's plant file under the same path.
     """
 
-    def __init__(self, address: str, absence: float = 300.0) -> None:
+    def __init__(
+        self, address: str, absence: float = 300.0, options: ClusterOptions = ClusterOptions()
+    ) -> None:
         """`absence`: s to wait for workers where all are gone."""
+        self.options = options
         self.address, self.absence, self.count = address, absence, 1
         self._client: Any = None
         self._manned, self._mapping = 0.0, False
@@ -60,13 +85,13 @@ class Cluster:
             raise self._mistake(f"is not an address; give {what}")
         try:
             self._client = distributed.Client(
-                self.address, timeout=CONNECT_SECONDS, set_as_default=False
+                self.address, timeout=self.options.connect, set_as_default=False
             )
         except Exception as error:  # whatever the transport of that address raises
             words = f"no Dask scheduler answers there ({error}); start one with `dask scheduler`"
             raise self._mistake(f"{words} and give the address that it prints") from error
         try:
-            self._client.wait_for_workers(1, timeout=CONNECT_SECONDS)
+            self._client.wait_for_workers(1, timeout=self.options.connect)
         except TimeoutError:
             self._close()
             words = f"has no workers; start some with `dask worker {self.address} --nthreads 1`"
@@ -100,7 +125,7 @@ class Cluster:
                 for future in arriving.next_batch(block=False):
                     yield self._answer(future)
                 self._survey()
-                time.sleep(TICK)
+                time.sleep(self.options.poll)
         finally:
             self._mapping = False
             with suppress(Exception):  # the connection is closed already
@@ -137,7 +162,7 @@ class Cluster:
 
     def _close(self) -> None:
         with suppress(TimeoutError, OSError):
-            self._client.close(timeout=CLOSE_SECONDS)
+            self._client.close(timeout=self.options.close)
 
     def _mistake(self, words: str) -> UserError:
         return UserError(f"--scheduler {self.address}: {words}")

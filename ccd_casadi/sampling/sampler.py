@@ -14,7 +14,7 @@ import numpy as np
 
 from ccd_casadi.inner_problem.objective import TrueQuantities, objective, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.sampling.samples import (
+from ccd_casadi.sampling.inner_samples import (
     InnerSample,
     QuantitySample,
     SynthesisCounts,
@@ -44,13 +44,21 @@ from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
 T = TypeVar("T")
-CHUNK = 8  # single designs a unit at most
-WORTH = 1e-4  # of J: a better design is worth a line of progress
 
 
 @dataclass(frozen=True)
 class TraceEntry:
-    """After `syntheses` true syntheses: θ, its feasible bandwidth (rad/s) and J; NaN if none."""
+    """One line of the record of a run.
+
+    Attributes
+    ----------
+    syntheses : int
+        True syntheses up to then.
+    theta : tuple of float
+        SI.
+    bandwidth, objective : float
+        ω_b in rad/s and J of a feasible design there; NaN if there is none.
+    """
 
     syntheses: int
     theta: tuple[float, ...]
@@ -61,9 +69,36 @@ class TraceEntry:
 class Sampler:
     """The true synthesis behind a store and a pool of workers, counting what a run spends.
 
-    `syntheses` counts every distinct design that the run asked for, whether it was computed now
+    `syntheses` counts every distinct design that the run needed, whether it was computed now
     or found in the store: the figure does not depend on interruptions.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        What is synthesised.
+    store : SampleStore
+        Open; what it holds is not computed again.
+    workers : Pool
+        Processes.
+    quiet : bool
+        Whether to show no progress on stderr.
+
+    Attributes
+    ----------
+    spent : SynthesisCounts
+        By purpose.
+    trace : list of TraceEntry
+        In the order of the syntheses.
+    solved : dict
+        The best InnerSample at each θ.
+    nearest : InnerSample or None
+        Of the infeasible ones.
+    improvements : int
+        Times that a better controller was found where one had been known.
     """
+
+    chunk = 8  # single designs a unit at most
+    reported_gain = 1e-4  # of J: a design that is better by more is reported
 
     def __init__(
         self, problem: CoDesignProblem, store: SampleStore, workers: Pool, *, quiet: bool = True
@@ -76,10 +111,10 @@ class Sampler:
         store.put_problem(self.hash, problem.identity())
         self.spent = SynthesisCounts()
         self.trace: list[TraceEntry] = []
-        self.nearest: InnerSample | None = None  # of the infeasible ones
-        self.solved: dict[tuple[float, ...], InnerSample] = {}  # the best at each θ asked for
+        self.nearest: InnerSample | None = None
+        self.solved: dict[tuple[float, ...], InnerSample] = {}
         self.whole = True  # not of a part of the box, whose best may be worse than another's
-        self.improvements = 0  # times that a better controller was found where one had been known
+        self.improvements = 0
         self._tried: dict[tuple[float, ...], list[tuple[float, ...]]] = {}  # κ, in vain
 
     def of(
@@ -192,7 +227,9 @@ class Sampler:
         if any(len(sample.gradients or ()) != slopes for sample in known.values()):
             raise self.store.damaged()
         todo = list({k: x for k, x in zip(keys, points, strict=True) if k not in known}.items())
-        size = min(CHUNK, max(1, -(-len(todo) // self.workers.count)))  # a few keep all at work
+        size = min(
+            self.chunk, max(1, -(-len(todo) // self.workers.count))
+        )  # a few keep all at work
         if plant_of(self.problem).nearby is not None:  # seconds each: none waits for seven others
             size = 1
         chunks = [todo[i : i + size] for i in range(0, len(todo), size)]
@@ -257,7 +294,9 @@ class Sampler:
         if self.quiet or np.isnan(J[before:]).all():
             return
         best = before + int(np.nanargmin(J[before:]))
-        if np.isnan(J[:before]).all() or J[best] < np.nanmin(J[:before]) - WORTH * abs(J[best]):
+        if np.isnan(J[:before]).all() or J[best] < np.nanmin(J[:before]) - self.reported_gain * abs(
+            J[best]
+        ):
             bandwidth = self.trace[best].bandwidth / HZ
             label = "best so far" if self.whole else "best of this part"
             remark(f"{label}: J {J[best]:.6g}, {bandwidth:.4g} Hz", self.quiet)

@@ -23,9 +23,18 @@ DAMAGED = "a row is damaged"
 class Sample:
     """One synthesis, certified or not; SI, frequencies in rad/s, NaN where there is no figure.
 
-    `gradients` are the flattened total derivatives (4, n_θ + 2) of (ω_b, ln‖S‖∞,
-    ln σ_max(S(jω_low)), γ_opt) to (θ, ln ω_S, ln ω_T), where they were computed. With `compliance`
-    (‖GS‖∞, m/N) its logarithm stands before γ_opt.
+    Attributes
+    ----------
+    key, outcome, reason : str
+        Of the row, and how the synthesis ended.
+    theta : tuple of float
+        SI.
+    gradients : tuple of float or None
+        Flattened total derivatives (4, n_θ + 2) of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt) to
+        (θ, ln ω_S, ln ω_T), where they were computed. With `compliance` (‖GS‖∞, m/N) its logarithm
+        comes before γ_opt.
+    seconds : float
+        That it took.
     """
 
     key: str
@@ -102,10 +111,27 @@ def decoded(text: Any) -> Any:
 
 
 def problem_hash(problem: Mapping[str, object]) -> str:
-    """SHA-256 of a mapping of plain values; exact in every float, blind to the mapping's order.
+    """SHA-256 of a mapping, exact in every float; the order of its keys does not count.
 
-    Raises ValueError for NaN and infinity, TypeError for what is no plain value.
+    Parameters
+    ----------
+    problem : mapping
+        Of plain values: text, numbers, lists and mappings.
 
+    Returns
+    -------
+    str
+        Hexadecimal.
+
+    Raises
+    ------
+    ValueError
+        A number is NaN or infinite.
+    TypeError
+        A value is not plain.
+
+    Examples
+    --------
     >>> problem_hash({"a": 1, "b": 0.1}) == problem_hash({"b": 0.1, "a": 1.0})
     True
     """
@@ -114,7 +140,18 @@ def problem_hash(problem: Mapping[str, object]) -> str:
 
 
 def hashes_of(problem: CoDesignProblem) -> tuple[str, str]:
-    """Those of a problem's single designs, and of its inner problems."""
+    """Hashes of a problem.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        The problem.
+
+    Returns
+    -------
+    designs, inner : str
+        Of its single designs, and of its inner problems.
+    """
     designs = problem_hash(problem.identity())
     return designs, problem_hash({"problem": designs, "inner": problem.inner_identity()})
 
@@ -122,13 +159,40 @@ def hashes_of(problem: CoDesignProblem) -> tuple[str, str]:
 def sample_key(
     problem: str, theta: Sequence[float], omega_S: float = 0.0, omega_T: float = 0.0
 ) -> str:
-    """The key of one synthesis of a problem, or of what is known at a whole θ (both ω 0), exact in
-    every float."""
+    """The key of one synthesis of a problem, or of what is known at a whole θ (both ω 0).
+
+    Parameters
+    ----------
+    problem : str
+        A hash.
+    theta : sequence of float
+        SI.
+    omega_S, omega_T : float
+        rad/s.
+
+    Returns
+    -------
+    str
+        Exact in every float.
+    """
     return problem_hash({"problem": problem, "theta": list(theta), "omega": [omega_S, omega_T]})
 
 
 def best_key(inner: str, theta: Sequence[float]) -> str:
-    """That of the best found at a θ from other controllers than the inner problem's own."""
+    """The key of the best found at a θ from other controllers than the inner problem's own.
+
+    Parameters
+    ----------
+    inner : str
+        Hash of the inner problem.
+    theta : sequence of float
+        SI.
+
+    Returns
+    -------
+    str
+        Exact in every float.
+    """
     return sample_key(problem_hash({"best": inner}), theta)
 
 
@@ -154,8 +218,7 @@ def _canonical(value: object) -> object:
 
 
 T = TypeVar("T")
-SCHEMA = 1
-BUSY_SECONDS = 60.0
+SCHEMA = 1  # of the tables
 
 
 class SampleStoreError(UserError):
@@ -182,12 +245,25 @@ create index if not exists results_of_problem on results (problem);
 
 
 class SampleStore(AbstractContextManager["SampleStore"]):
-    """`with SampleStore(path) as store:`; raises SampleStoreError where the file is unusable."""
+    """Samples in a file: `with SampleStore(path) as store:`.
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+    Parameters
+    ----------
+    path : path
+        Of the SQLite file, which is made where there is none.
+    busy_seconds : float
+        How long to wait for another process that writes.
+
+    Raises
+    ------
+    SampleStoreError
+        The file is not usable.
+    """
+
+    def __init__(self, path: str | Path, busy_seconds: float = 60.0) -> None:
+        self.path, self.busy_seconds = Path(path), busy_seconds
         with self.worded():
-            self._db = sqlite3.connect(self.path, timeout=BUSY_SECONDS, isolation_level=None)
+            self._db = sqlite3.connect(self.path, timeout=busy_seconds, isolation_level=None)
             try:
                 self._check()
                 self._write_ahead()
@@ -228,7 +304,7 @@ class SampleStore(AbstractContextManager["SampleStore"]):
 
     def _write_ahead(self) -> None:
         """Switch to the write-ahead log; SQLite does not wait for that lock by itself."""
-        deadline = time.monotonic() + BUSY_SECONDS
+        deadline = time.monotonic() + self.busy_seconds
         while True:
             try:
                 self._db.execute("pragma journal_mode = wal")

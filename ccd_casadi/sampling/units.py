@@ -2,7 +2,7 @@
 let it begin."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -16,23 +16,44 @@ from ccd_casadi.inner_problem.structured_plant_set import structured_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult
-from ccd_casadi.sampling.samples import InnerSample, sample_of
+from ccd_casadi.sampling.inner_samples import InnerSample, sample_of
 from ccd_casadi.sampling.store import Sample, sample_key
 from ccd_casadi.support.process_pool import Pool
 
-WORTH = 1e-3  # relative: what another branch has to promise, and what a verdict counts as better
-MORE = 2  # neighbours, beside one for each parameter
-NEAR = 0.1  # of the box: so near the best θ a surrogate has to be of one branch
-TRIES = 2  # climbs from neighbours, of a sample, that may be in vain
+
+@dataclass(frozen=True)
+class NeighbourOptions:
+    """Numbers of warm starts from neighbours.
+
+    Attributes
+    ----------
+    least_gain : float
+        Relative: what another branch has to promise, and what a verdict counts as better.
+    more : int
+        Neighbours besides one for each parameter.
+    near : float
+        Of the box: so near the best θ a surrogate has to be of one branch.
+    tries : int
+        Searches of a sample from neighbours that may be in vain.
+    """
+
+    least_gain: float = 1e-3
+    more: int = 2
+    near: float = 0.1
+    tries: int = 2
+
 
 Theta = tuple[float, ...]
 
 
 def from_neighbour(
-    problem: CoDesignProblem, known: Iterable[InnerSample], theta: Theta
+    problem: CoDesignProblem,
+    known: Iterable[InnerSample],
+    theta: Theta,
+    options: NeighbourOptions = NeighbourOptions(),
 ) -> CoDesignProblem:
     """The problem with the neighbour's controller that promises most at a new θ as a warm start."""
-    near = _nearest(problem, _usable(known), theta)
+    near = _nearest(problem, _usable(known), theta, options.more)
     if not near:
         return problem
 
@@ -43,18 +64,34 @@ def from_neighbour(
 
 
 def from_controller(problem: CoDesignProblem, kappa: Sequence[float]) -> CoDesignProblem:
-    """The problem whose value is that of the climb from one controller, κ in SI."""
+    """The problem whose value is that of the search from one controller alone.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With controllers of fixed structure.
+    kappa : sequence of float
+        κ of the controller, SI.
+
+    Returns
+    -------
+    CoDesignProblem
+        With it as the only warm start.
+    """
     structured = structured_of(problem).with_warm_start(tuple(map(float, kappa)), 1)
     return replace(problem, controller=replace(structured, starts=0))
 
 
 def promising_starts(
-    problem: CoDesignProblem, known: Iterable[InnerSample], tried: Mapping[Theta, Sequence[Theta]]
+    problem: CoDesignProblem,
+    known: Iterable[InnerSample],
+    tried: Mapping[Theta, Sequence[Theta]],
+    options: NeighbourOptions = NeighbourOptions(),
 ) -> dict[Theta, Theta]:
-    """κ to climb from at each θ whose sample falls short of what a neighbour promises.
+    """κ to start from at each θ whose sample falls short of what a neighbour promises.
 
     Only where that counts: near the best θ, or where it would be a better one. `tried`: the κ that
-    a θ was climbed from in vain.
+    were in vain at a θ.
     """
     samples = _usable(known)
     found: dict[Theta, tuple[float, Theta]] = {}
@@ -62,12 +99,14 @@ def promising_starts(
     for there in samples:
         assert best is not None
         theta, before = there.theta, tried.get(there.theta, ())
-        for one in _nearest(problem, samples, theta) if len(before) < TRIES else []:
+        near = _nearest(problem, samples, theta, options.more)
+        for one in near if len(before) < options.tries else []:
             value = _branch(one, theta, there.gradient)
-            counts = bool(box(problem).away(best.theta, theta) <= NEAR)
+            counts = bool(box(problem).away(best.theta, theta) <= options.near)
             counts = counts or objective(problem, theta, value) < objective_of(problem, best)
             gain = problem.figure.gain(value, there.value) if value > 0.0 else 0.0
-            if counts and one.kappa not in before and gain > found.get(theta, (WORTH, ()))[0]:
+            least = found.get(theta, (options.least_gain, ()))[0]
+            if counts and one.kappa not in before and gain > least:
                 found[theta] = (gain, one.kappa)
     return {theta: kappa for theta, (_, kappa) in found.items()}
 
@@ -84,14 +123,14 @@ def _branch(one: InnerSample, theta: Theta, gradient: Theta) -> float:
 
 
 def _nearest(
-    problem: CoDesignProblem, samples: Sequence[InnerSample], theta: Theta
+    problem: CoDesignProblem, samples: Sequence[InnerSample], theta: Theta, more: int
 ) -> list[InnerSample]:
     """The nearest samples at other θ."""
     others = [one for one in samples if one.theta != theta]
     if not others:
         return []
     away = box(problem).away([one.theta for one in others], theta)
-    return [others[i] for i in np.argsort(away, kind="stable")[: len(theta) + MORE]]
+    return [others[i] for i in np.argsort(away, kind="stable")[: len(theta) + more]]
 
 
 NOTHING = (np.nan, np.nan)
@@ -123,7 +162,26 @@ def mixed_unit(
 def unit_of(
     problem_key: str, theta: tuple[float, ...], result: InnerResult, inner: InnerBounds, each: float
 ) -> Unit:
-    """Rows and payload of one θ's inner problem; `each` synthesis took so many seconds."""
+    """What the store keeps of one θ's inner problem.
+
+    Parameters
+    ----------
+    problem_key : str
+        Hash of the problem.
+    theta : tuple of float
+        SI.
+    result : InnerResult
+        Of mixed sensitivity.
+    inner : InnerBounds
+        Of the loop.
+    each : float
+        Time of a synthesis, s.
+
+    Returns
+    -------
+    rows, payload : list of Sample, dict
+        One row a synthesis, and JSON values of the best.
+    """
     rows = {}
     for figures in result.rows:
         row_key = sample_key(problem_key, theta, figures.omega_S, figures.omega_T)
@@ -147,7 +205,22 @@ def structured_unit(
     problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...],
     workers: Pool | None = None,
 ) -> Unit:  # fmt: skip
-    """The best design of a fixed structure at one θ: one row, without weights' frequencies."""
+    """The best design of a fixed structure at one θ: one row, without weights' frequencies.
+
+    Parameters
+    ----------
+    problem, problem_key, key : CoDesignProblem, str, str
+        The problem, its hash, and the key of the row.
+    theta : tuple of float
+        SI.
+    workers : Pool
+        Processes that have nothing else to do.
+
+    Returns
+    -------
+    rows, payload : list of Sample, dict
+        As of `unit_of`.
+    """
     value = structured_value(problem, theta, workers)
     design, judged = value.design, value.design.certificate
     peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]

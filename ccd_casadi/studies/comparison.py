@@ -20,8 +20,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.run_verdict import advice
+from ccd_casadi.sampling.inner_samples import spent_entry
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
-from ccd_casadi.sampling.samples import spent_entry
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.studies.steepest_descent import (
     AnyDesign,

@@ -28,7 +28,7 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool

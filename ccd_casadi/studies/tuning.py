@@ -42,7 +42,7 @@ from ccd_casadi.studies.tuned_plants import (
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import Tell, silent
-from ccd_casadi.support.text import HZ
+from ccd_casadi.support.text import HZ, use_units
 from ccd_casadi.support.worker_process import one_blas_thread
 
 
@@ -124,6 +124,7 @@ def tune(
     unstable_poles: int | None = None,
     poles_at_zero: int | None = None,
     least_damping: float | None = None,
+    rotary: bool = False,
     starts: int = 24,
     seed: int = 0,
     progress: Tell | None = None,
@@ -149,6 +150,8 @@ def tune(
     unstable_poles, poles_at_zero, least_damping : int, int, float
         Of measured plants: poles in the right half plane (0) and at 0 (by the slope of the first
         lines), and the least damping ratio of a resonance that lines may hide (0.0005).
+    rotary : bool
+        Outputs are in rad and inputs in N m, in words and on pages; else m and N.
     starts, seed : int
         Of the multi-start search.
     progress, workers
@@ -173,6 +176,7 @@ def tune(
     >>> found.design.usable, found.design.structure.biquads
     (True, 0)
     """
+    use_units(*(("rad", "N m") if rotary else ("m", "N")))
     given = list(plants) if isinstance(plants, list | tuple) else [plants]
     if not given:
         raise UserError("there is no plant to tune for; give one")

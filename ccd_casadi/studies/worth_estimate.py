@@ -23,7 +23,7 @@ from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.objective import (
-    MET,
+    ConstraintOptions,
     constraint_sizes,
     objective,
     objective_of,
@@ -34,8 +34,8 @@ from ccd_casadi.inner_problem.structured_robustness import DesignOnBox
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import Evaluate, hardware_cost, mechanics
 from ccd_casadi.reporting.facts import cost_words, theta_words
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.studies.steepest_descent import baseline_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
@@ -339,7 +339,8 @@ def outlook(
     cloud = best.theta + np.vstack([reach * spread for reach in options.boxes])
     cloud = np.clip(np.vstack([expected, best.theta, cloud]), lower, upper)
     costs, constraints = (np.array(value) for value in plant_of(problem).hardware(cloud.T))
-    allowed = (constraints <= MET * constraint_sizes(problem)[:, None]).all(axis=0)
+    met = ConstraintOptions.met * constraint_sizes(problem)[:, None]
+    allowed = (constraints <= met).all(axis=0)
     steps = (cloud[:, None] - [each.theta for each in known]) / (upper - lower)
     new = np.abs(steps).max(axis=2).min(axis=1) > options.same_design
     mean, deviation = process.predict(cloud, return_std=True)

@@ -28,9 +28,6 @@ from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
-ABSENT = 1e-8  # presence of an input that is not there: √z has a slope
-SAME = 1e-7  # relative: a γ_opt² that is lower by less is the same
-
 
 @dataclass(frozen=True)
 class InputChoice:
@@ -46,7 +43,9 @@ class InputChoice:
 
 
 @one_blas_thread
-def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoice:
+def choose_inputs(
+    plant: ScaledPlant, weights: Weights, count: int, *, absent: float = 1e-8, same: float = 1e-7
+) -> InputChoice:
     """The best `count` inputs of a plant for mixed sensitivity with given weights.
 
         min γ_opt(z)   over z in {0, 1}^m with Σ z = count
@@ -59,6 +58,10 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
         W1, W2, W3, without an input disturbance.
     count : int
         At least as many as outputs.
+    absent : float
+        z of an input that is not there: √z has a slope there.
+    same : float
+        Relative: a γ_opt² that is lower by less is the same.
 
     Returns
     -------
@@ -81,7 +84,7 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
     rules = [LinearConstraint(np.append(np.ones(m), 0.0), count, count)]  # on (z, γ²)
     z, least = np.full(m, count / m), np.inf  # in equal parts, for a first bound
     while True:
-        at = np.maximum(z, ABSENT)
+        at = np.maximum(z, absent)
         value, slope = _squared(plant, weights, at)
         if np.isfinite(value):
             below = float(slope @ at) - value
@@ -94,7 +97,7 @@ def choose_inputs(plant: ScaledPlant, weights: Weights, count: int) -> InputChoi
             np.eye(m + 1)[m], integrality=np.arange(m + 1) < m, constraints=rules,
             bounds=Bounds(0.0, np.append(np.ones(m), np.inf)), options={"mip_rel_gap": 0.0},
         )  # fmt: skip
-        if found.x is None or found.fun >= least * (1.0 - SAME):
+        if found.x is None or found.fun >= least * (1.0 - same):
             break
         z = np.round(found.x[:m])
     failed = tuple(inputs for inputs, value in squared.items() if np.isnan(value))

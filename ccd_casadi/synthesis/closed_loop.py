@@ -13,7 +13,7 @@ from ccd_casadi.lti.state_space import StateSpace, equivalent_open_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import (
-    UNBOUNDED,
+    CertificateOptions,
     Design,
     DesignFigures,
     Outcome,
@@ -23,17 +23,22 @@ from ccd_casadi.synthesis.weights import Weights
 
 PlantAndController = Callable[[Array], tuple[NDArray, NDArray]]  # G (k, p, m) and K (k, m, p) at ω
 
-SECTIONS = 15  # of a bracket between two points of the grid, in ten: to rounding
-
 
 @dataclass(frozen=True)
 class ClassicalMargins:
-    """Factors `gain_down` < 1 < `gain_up` at which stability is lost (0 and inf where none is).
+    """Margins of one loop.
 
-    `phase_deg`: least change of phase, either way, at |L| = 1; `delay`: least lag there in s;
-    `crossover`: where |L| falls through 1 in the end, rad/s (`_crossover`). All are inf where |L|
-    does not cross 1.
-    `places`: where gain_down, gain_up and phase_deg are, rad/s; inf where there is no such margin.
+    Attributes
+    ----------
+    gain_down, gain_up : float
+        Factors < 1 < at which stability is lost; 0 and inf where none is.
+    phase_deg, delay : float
+        Least change of phase, either way, at |L| = 1, and least lag there in s; inf where |L| does
+        not cross 1.
+    crossover : float
+        Where |L| falls through 1 for good, rad/s (`_crossover`); inf as well.
+    places : tuple of float
+        Where gain_down, gain_up and phase_deg are, rad/s; inf where there is no such margin.
     """
 
     gain_down: float
@@ -47,11 +52,25 @@ class ClassicalMargins:
 def classical_margins(
     response: Callable[[Array], NDArray[np.complex128]], omega: Array
 ) -> ClassicalMargins:
-    """Margins of the loop 1 + L = 0 from `response`, L(jω) (k,) at any ω (k,) in rad/s.
+    """Margins of the loop 1 + L = 0.
 
-    Crossings of the negative real axis and of |L| = 1 are bracketed by neighbours in the ascending
-    `omega` and closed in on. Assumes a grid fine enough to separate them.
+    Crossings of the negative real axis and of |L| = 1 are bracketed by neighbours of the grid,
+    which has to separate them, and refined.
 
+    Parameters
+    ----------
+    response : function of (k,) array
+        L(jω) (k,) at any ω in rad/s.
+    omega : (n,) array
+        Ascending, rad/s.
+
+    Returns
+    -------
+    ClassicalMargins
+        The least ones.
+
+    Examples
+    --------
     >>> found = classical_margins(lambda w: 4.0 / (1j * w + 1.0) ** 3, np.geomspace(0.1, 10.0, 50))
     >>> round(found.gain_up, 9), round(found.crossover, 6), round(found.phase_deg, 4)
     (2.0, 1.232819, 27.1416)
@@ -97,7 +116,20 @@ def _at_least(values: Array, places: Array) -> float:
 
 
 def least_margins(respond: PlantAndController, omega: Array) -> ClassicalMargins:
-    """The least of all loops broken one at a time at the plant's inputs."""
+    """The least margins of all loops broken one at a time at the plant's inputs.
+
+    Parameters
+    ----------
+    respond : function of (k,) array
+        G (k, p, m) and K (k, m, p) at ω in rad/s, SI.
+    omega : (n,) array
+        Ascending, rad/s.
+
+    Returns
+    -------
+    ClassicalMargins
+        See `least_of`.
+    """
 
     def broken(at: Array, i: int) -> NDArray[np.complex128]:
         G, K = respond(at)
@@ -108,7 +140,18 @@ def least_margins(respond: PlantAndController, omega: Array) -> ClassicalMargins
 
 
 def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
-    """Of several loops the margins nearest to instability, and the lowest crossover."""
+    """Of several loops the margins nearest to instability, and the lowest crossover.
+
+    Parameters
+    ----------
+    each : sequence of ClassicalMargins
+        At least one.
+
+    Returns
+    -------
+    ClassicalMargins
+        Each margin with its own place.
+    """
     down = max(each, key=lambda m: m.gain_down)
     up = min(each, key=lambda m: m.gain_up)
     phase = min(each, key=lambda m: m.phase_deg)
@@ -122,12 +165,16 @@ def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
     )
 
 
-def _crossings(function: Callable[[Array], Array], values: Array, omega: Array) -> Array:
-    """Where a function changes sign, one place for every two neighbours that it does between."""
+def _crossings(
+    function: Callable[[Array], Array], values: Array, omega: Array, sections: int = 15
+) -> Array:
+    """Where a function changes sign, one place for every two neighbours that it does between.
+
+    Each of `sections` divides their interval by ten: 15 of them reach rounding."""
     at = np.flatnonzero(np.diff(np.signbit(values)))
     low, high, below = omega[at], omega[at + 1], np.signbit(values[at])
     rows = np.arange(at.size)
-    for _ in range(SECTIONS if at.size else 0):
+    for _ in range(sections if at.size else 0):
         points = np.linspace(low, high, 11, axis=1)
         inside = np.signbit(function(points[:, 1:-1].ravel())).reshape(-1, 9)
         first = np.argmax(np.column_stack([inside, ~below]) != below[:, None], axis=1)
@@ -136,7 +183,6 @@ def _crossings(function: Callable[[Array], Array], values: Array, omega: Array) 
 
 
 EPS = 2.0**-52
-ROUNDING = 1e-6  # relative: what the conversion to SI may change of a norm and of a bandwidth
 
 
 def measure(
@@ -145,41 +191,75 @@ def measure(
     weights: Weights,
     *,
     omega_low: float,
-    gamma: float = UNBOUNDED,
+    gamma: float | None = None,
     gamma_opt: float = np.nan,
     gamma_lower_bound: float = np.nan,
 ) -> DesignFigures:
-    """Rebuild the loop from an SI controller (e in, u out), certify it against `gamma`, measure S.
+    """Rebuild the loop from a controller, certify it against γ, and measure S.
 
-    The figures end where the certificate fails; ω_low in rad/s. Without `gamma` the norm is not
-    judged.
+    Parameters
+    ----------
+    plant : ScaledPlant
+        The plant; a family of it does not count.
+    controller : StateSpace
+        e in, u out, SI.
+    weights : Weights
+        Of the norm.
+    omega_low : float
+        Where |S| is reported, rad/s.
+    gamma : float
+        What the norm may not exceed; None: it is not judged.
+    gamma_opt, gamma_lower_bound : float
+        Of a synthesis, passed on to the figures.
+
+    Returns
+    -------
+    DesignFigures
+        SI; NaN from where the certificate fails.
     """
     w0, row = plant.omega_0, np.full(int(Column.COUNT), np.nan)
     row[Column.GAMMA_OPT], row[Column.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
     row[Column.LIMITED_BY_BOUND] = 0.0
     K = controller.in_units(w0, plant.force)
     A, B, C, D = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
-    judge(plant.A, plant.B, plant.C, A, B, C, D, weights.scaled(w0), weights.delta, gamma,
+    level = CertificateOptions().unbounded if gamma is None else gamma
+    judge(plant.A, plant.B, plant.C, A, B, C, D, weights.scaled(w0), weights.delta, level,
           omega_low / w0, row)  # fmt: skip
     return figures_from_row(row, weights, w0)
 
 
-def recertified_in_si(plant: ScaledPlant, design: Design, omega_low: float) -> Design:
-    """The design, no longer certified where the numbers of its controller in SI do not carry it.
+def recertified_in_si(
+    plant: ScaledPlant, design: Design, omega_low: float, *, rounding: float = 1e-6
+) -> Design:
+    """The design, no longer certified where its controller in SI is lost in rounding.
 
     What is certified in a synthesis is the controller in the plant's own units. Where the loop
     hangs on digits that doubles do not have (a plant of gain 10¹², for instance), the controller
-    that a user gets is another one: it is certified again, to its bound, as it is given away.
+    that a user gets is another one: it is certified again, to its bound, as it is written.
+
+    Parameters
+    ----------
+    plant, design : ScaledPlant, Design
+        What was made, and on what.
+    omega_low : float
+        rad/s.
+    rounding : float
+        Relative: what the conversion to SI may change of a norm and of a bandwidth.
+
+    Returns
+    -------
+    Design
+        The same, or with the outcome LOST_IN_ROUNDING.
     """
     if not design.figures.certified:
         return design
-    bound = design.figures.certificate.norm_bound * (1.0 + ROUNDING)  # the γ reached is a grid's
+    bound = design.figures.certificate.norm_bound * (1.0 + rounding)  # the γ reached is a grid's
     rng = np.random.default_rng(0)  # the way to SI and back alone may change no digit at all
     K = design.controller
     rounded = StateSpace(
         *(X * (1.0 + EPS * rng.choice([-1.0, 1.0], X.shape)) for X in (K.A, K.B, K.C, K.D))
     )
     again = measure(plant, rounded, design.weights, gamma=bound, omega_low=omega_low)
-    if again.certified and abs(again.bandwidth / design.figures.bandwidth - 1.0) <= ROUNDING:
+    if again.certified and abs(again.bandwidth / design.figures.bandwidth - 1.0) <= rounding:
         return design
     return replace(design, figures=replace(design.figures, outcome=Outcome.LOST_IN_ROUNDING))

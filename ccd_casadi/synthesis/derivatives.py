@@ -1,6 +1,7 @@
 """Total derivatives of a certified design's figures, and of every local peak of S."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -29,7 +30,6 @@ from ccd_casadi.synthesis.synthesis import (
 )
 from ccd_casadi.synthesis.weights import Weights
 
-MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple
 _WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
 
 
@@ -51,12 +51,23 @@ class DesignDerivatives:
 class Sensitivities(NotebookHtml):
     """Figures of one design with their gradients.
 
-    `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), where it was
-    asked for ln‖GS‖∞ (m/N), γ_opt. `to_theta` (4 or 5, n_θ) per unit of θ; `to_weights` maps a
-    weight's name to the derivatives to its logarithm, W_d as `disturbance` where it is given.
-    `fixed_controller` (n_θ) is dω_b/dθ with K held fixed. `simple` tells whether σ_max is a simple
-    singular value at these frequencies; where it is not, the gradient is one of several one-sided
-    ones.
+    Attributes
+    ----------
+    figures : DesignFigures
+        SI.
+    values : (4,) or (5,) array
+        ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), where it is required ln‖GS‖∞ (m/N), γ_opt.
+    to_theta : (4, n_θ) or (5, n_θ) array
+        Their derivatives per unit of θ.
+    to_weights : dict of (4,) or (5,) array
+        Derivatives to the logarithm of each weight, W_d as `disturbance` where it is given.
+    fixed_controller : (n_θ,) array
+        dω_b/dθ with K held fixed, rad/s.
+    simple : tuple of bool
+        Whether σ_max is a simple singular value at the frequencies of the three gains; where it is
+        not, the gradient is one of several one-sided ones.
+    made : DesignDerivatives or None
+        For more figures of the same design.
     """
 
     figures: DesignFigures
@@ -80,12 +91,32 @@ def sensitivities(
     omega_low: float,
     gamma_backoff: float = 1.02,
     compliance: bool = False,
+    multiple_gap: float = 1e-6,
 ) -> Sensitivities:
-    """Synthesise, certify and differentiate at one point; gradients are NaN if not certified.
+    """Synthesise, certify and differentiate at one point.
 
-    What is certified here has finite gradients; where they are not, the outcome says so.
     With a family the peak is the largest on any of it, its gradient that of the plant that has it;
-    so is ‖GS‖∞, which is among the values where `compliance` asks for it.
+    so is ‖GS‖∞.
+
+    Parameters
+    ----------
+    plant : ScaledPlant
+        With derivatives to θ.
+    weights : Weights
+        W1, W2, W3.
+    omega_low : float
+        Where |S| is reported, rad/s.
+    gamma_backoff : float
+        The controller is made at this multiple of γ_opt.
+    compliance : bool
+        Whether ‖GS‖∞ is among the values.
+    multiple_gap : float
+        Below this (σ1 - σ2)/σ1 the largest singular value counts as multiple.
+
+    Returns
+    -------
+    Sensitivities
+        Gradients are NaN if not certified; where they are not finite the outcome is NO_DERIVATIVES.
     """
     w0, count = plant.omega_0, plant.dA.shape[0]
     made_on = plant.design_plant
@@ -138,25 +169,50 @@ def sensitivities(
         to_theta=gradient[:, :count],
         to_weights={name: gradient[:, count + i] * scaled[i] for i, name in enumerate(names)},
         fixed_controller=fixed * w0,
-        simple=tuple(bool(gap > MULTIPLE_GAP) for gap in gaps),
+        simple=tuple(bool(gap > multiple_gap) for gap in gaps),
         made=made,
     )
 
 
-# Around each closed-loop pole in multiples of its width, and over the decades about ω₀: what no
-# pole of plant or loop points at is as broad as the distance between two of these.
-HALF = np.array([0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0])
-FLANKS = np.concatenate([-HALF[::-1], [0.0], HALF])
-BROAD = np.geomspace(1e-2, 1e2, 1201)
-APART = 1e-7  # relative: closer points of the grid differ in gain by rounding alone
+@dataclass(frozen=True)
+class PeakGridOptions:
+    """Numbers of the grid on which local peaks are found.
+
+    It is around each closed-loop pole, and over the decades about ω₀: what no pole of plant or loop
+    points at is as broad as the distance between two of its points.
+    """
+
+    half_widths: tuple[float, ...] = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0)  # of a pole, either way
+    decades: float = 2.0  # about ω₀, either way
+    points: int = 1201
+    apart: float = 1e-7  # relative: closer points differ in gain by rounding alone
+
+    @cached_property
+    def flanks(self) -> Array:
+        """Around a pole, in its widths."""
+        half = np.array(self.half_widths)
+        return np.concatenate([-half[::-1], [0.0], half])
+
+    @cached_property
+    def broad(self) -> Array:
+        """ω over ω₀."""
+        return np.geomspace(10.0**-self.decades, 10.0**self.decades, self.points)
 
 
 @dataclass(frozen=True)
 class LocalPeak:
-    """One local maximum of σ_max(S): ω in rad/s, ln of it, and derivatives of that logarithm.
+    """One local maximum of σ_max(S).
 
-    `member`: 0 the plant itself, i the i-th of its family. `gradient` (n_θ + 2) to θ and
-    (ln ω_S, ln ω_T).
+    Attributes
+    ----------
+    omega : float
+        rad/s.
+    member : int
+        0: on the plant itself, i: on the i-th of its family.
+    ln_gain : float
+        ln σ_max(S(jω)).
+    gradient : (n_θ + 2,) array
+        Of that, to θ and (ln ω_S, ln ω_T).
     """
 
     omega: float
@@ -173,9 +229,23 @@ def local_peaks_with_gradients(
     gamma_backoff: float,
     least: float,
 ) -> tuple[LocalPeak, ...]:
-    """All local peaks of at least `least`, largest first; none where the design has no derivatives.
+    """All local peaks of σ_max(S), of the plant and its family, with their gradients.
 
-    `design`: what `sensitivities` made of the same plant and weights; nothing is made anew.
+    Parameters
+    ----------
+    plant, weights : ScaledPlant, Weights
+        As for `sensitivities`.
+    design : Sensitivities
+        Of the same plant and weights; nothing is synthesised anew.
+    gamma_backoff : float
+        That of the design.
+    least : float
+        Gain from which a peak counts.
+
+    Returns
+    -------
+    tuple of LocalPeak
+        The largest first; empty where the design has no derivatives.
     """
     made = design.made
     if made is None or made.row[Column.CODE] != Code.CERTIFIED or made.row[Column.BALANCED]:
@@ -205,15 +275,19 @@ def local_peaks_with_gradients(
 
 
 def _peaks(
-    plant: ScaledPlant, controller: tuple[Array, Array, Array], least: float
+    plant: ScaledPlant,
+    controller: tuple[Array, Array, Array],
+    least: float,
+    options: PeakGridOptions = PeakGridOptions(),
 ) -> list[tuple[float, float]]:
     """Local maxima of σ_max(S) of at least `least`, (ω over ω₀, gain)."""
     Ak, Bk, Ck = (np.ascontiguousarray(part) for part in controller)
     Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
     poles = closed_loop(plant.system, StateSpace(Ak, Bk, Ck, Dk)).S.poles
-    near = root_flanks(poles[poles.imag > 0.0], FLANKS)
+    near = root_flanks(poles[poles.imag > 0.0], options.flanks)
     low, high = float(plant.grid[0]), float(plant.grid[-1])
-    grid = np.ascontiguousarray(frequency_grid(low, high, 2, plant.grid, BROAD, near, apart=APART))
+    grid = frequency_grid(low, high, 2, plant.grid, options.broad, near, apart=options.apart)
+    grid = np.ascontiguousarray(grid)
     G, K = prepare(plant.A, plant.B, plant.C), prepare(Ak, Bk, Ck)
     gain = sensitivity_gains(G, K, Dk, grid)
     found = []

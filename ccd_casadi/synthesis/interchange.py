@@ -28,8 +28,6 @@ from ccd_casadi.synthesis.matlab_systems import PARTS, realised, strings, system
 if TYPE_CHECKING:
     import control  # a second to import: where it is called, and not before
 
-LONGEST_NAME = 63  # of a variable in MATLAB
-
 
 @dataclass(frozen=True)
 class NamedSystem:
@@ -46,7 +44,15 @@ class NamedSystem:
 
 @dataclass(frozen=True)
 class DesignFile:
-    """What a .mat file carries: systems by name, and θ with its units."""
+    """What a .mat file carries.
+
+    Attributes
+    ----------
+    systems : mapping of NamedSystem
+        By the names of variables.
+    theta, units : mapping
+        θ by name in SI, and its units.
+    """
 
     systems: Mapping[str, NamedSystem]
     theta: Mapping[str, float] = field(default_factory=dict)
@@ -54,19 +60,54 @@ class DesignFile:
 
 
 def named_plant(plant: StateSpace) -> NamedSystem:
-    """Forces u1, … in N to displacements y1, … in m."""
+    """Name the signals of a plant: forces u1, … in N to displacements y1, … in m.
+
+    Parameters
+    ----------
+    plant : StateSpace
+        SI.
+
+    Returns
+    -------
+    NamedSystem
+        The same matrices.
+    """
     inputs, outputs = _names("u", plant.B.shape[1]), _names("y", plant.C.shape[0])
     return NamedSystem(plant, inputs, outputs, "N", "m")
 
 
 def named_controller(controller: StateSpace) -> NamedSystem:
-    """Errors e1, … = r - y in m to forces u1, … in N."""
+    """Name the signals of a controller: errors e1, … = r - y in m to forces u1, … in N.
+
+    Parameters
+    ----------
+    controller : StateSpace
+        SI.
+
+    Returns
+    -------
+    NamedSystem
+        The same matrices.
+    """
     inputs, outputs = _names("e", controller.B.shape[1]), _names("u", controller.C.shape[0])
     return NamedSystem(controller, inputs, outputs, "m", "N")
 
 
 def to_control(named: NamedSystem, name: str = "") -> "control.StateSpace":
-    """The same matrices as `control.StateSpace`, signals named, dt = period."""
+    """The same matrices as `control.StateSpace`.
+
+    Parameters
+    ----------
+    named : NamedSystem
+        With its signals.
+    name : str
+        Of the system.
+
+    Returns
+    -------
+    control.StateSpace
+        Signals named, dt = period in s.
+    """
     import control
 
     parts = [getattr(named.system, part).copy() for part in PARTS]
@@ -77,10 +118,23 @@ def to_control(named: NamedSystem, name: str = "") -> "control.StateSpace":
 
 
 def from_control(system: Any) -> StateSpace:
-    """A `control` system, in whatever form it is.
+    """A state space of a `control` system.
 
-    Raises UserError where it is no linear system, is discrete without a sampling period, or has no
-    state space that is the same plant.
+    Parameters
+    ----------
+    system : control.StateSpace or control.TransferFunction
+        Its dt is 0, None, or a period in s.
+
+    Returns
+    -------
+    StateSpace
+        With the same response.
+
+    Raises
+    ------
+    UserError
+        It is not a linear system, is discrete without a sampling period, or has no state space that
+        is the same plant.
     """
     import control
 
@@ -134,10 +188,23 @@ def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
 
 
 def write_mat(path: Path, design: DesignFile) -> None:
-    """Write the systems and θ as MATLAB version 5. Raises UserError where that cannot be done."""
+    """Write systems and θ as MATLAB version 5.
+
+    Parameters
+    ----------
+    path : Path
+        Of the .mat file.
+    design : DesignFile
+        Names of systems are variables of MATLAB.
+
+    Raises
+    ------
+    UserError
+        A name is not one for MATLAB, or the file cannot be written.
+    """
     content: dict[str, Any] = {}
     for name, named in design.systems.items():
-        if not (name.isidentifier() and name.isascii() and len(name) <= LONGEST_NAME):
+        if not (name.isidentifier() and name.isascii() and len(name) <= 63):  # as MATLAB
             raise UserError(f"{path}: {name!r} is not a name for a variable in MATLAB")
         content[name] = {
             **{part: getattr(named.system, part) for part in PARTS},

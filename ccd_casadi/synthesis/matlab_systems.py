@@ -18,9 +18,17 @@ if TYPE_CHECKING:
     import control
 
 
-AWAY, BEYOND, POINTS = 1.01, 30.0, 200  # from a root, of the outermost roots, frequencies
-OF_NUMERATOR, OF_DENOMINATOR = 1e-6, 1e-9  # relative errors of coefficients that are allowed
-UNSTABLE, AT_REST = 1e-4, 1e-6  # Re p over |p| that counts; |p| over the largest that is 0
+@dataclass(frozen=True)
+class RealisationOptions:
+    """Numbers by which a realisation is compared with its polynomials."""
+
+    beside: float = 1.01  # frequency over that of a root, and below, where responses are compared
+    beyond: float = 30.0  # of the outermost roots: ends of the grid
+    points: int = 200  # of the grid
+    numerator_error: float = 1e-6  # relative, of coefficients: what is allowed
+    denominator_error: float = 1e-9
+    unstable: float = 1e-4  # Re p over |p| that counts
+    at_rest: float = 1e-6  # |p| over the largest that is 0
 
 
 def realised(system: "control.TransferFunction") -> StateSpace:
@@ -87,47 +95,53 @@ def _by_columns(num: np.ndarray, den: np.ndarray, period: float) -> StateSpace:
     return StateSpace(A, np.vstack(drive), np.hstack(reading), D, period=period)
 
 
-def _same(num: np.ndarray, den: np.ndarray, found: StateSpace) -> bool:
+def _same(
+    num: np.ndarray,
+    den: np.ndarray,
+    found: StateSpace,
+    options: RealisationOptions = RealisationOptions(),
+) -> bool:
     """Whether response and poles are those of the polynomials."""
     if not all(np.isfinite(part).all() for part in (found.A, found.B, found.C, found.D)):
         return False
     each = [np.roots(d) for d in den.flat]
-    unstable = [_unstable(poles, found.period) for poles in each]
-    own = _unstable(found.poles, found.period)
+    unstable = [_unstable(poles, found.period, options) for poles in each]
+    own = _unstable(found.poles, found.period, options)
     if num.size == 1:
         if len(found.A) != len(each[0]) or own != unstable[0]:
             return False
     elif not max(unstable) <= own <= sum(unstable):
         return False
     roots = np.concatenate([*each, *(np.roots(n) for n in num.flat)])
-    omega = _frequencies(found.rates_of(roots), found.period)
+    omega = _frequencies(found.rates_of(roots), found.period, options)
     s = found.variable(omega)
     response = found.response(omega)
     for (i, j), n in np.ndenumerate(num):
         d = den[i, j]
         below, above = np.polyval(d, s), np.polyval(n, s)
         size, spread = np.abs(below), np.polyval(np.abs(d), np.abs(s))
-        allowed = OF_NUMERATOR * np.polyval(np.abs(n), np.abs(s))
-        allowed = (allowed + OF_DENOMINATOR * np.abs(above) * spread / size) / size
+        allowed = options.numerator_error * np.polyval(np.abs(n), np.abs(s))
+        allowed += options.denominator_error * np.abs(above) * spread / size
+        allowed = allowed / size
         if not (np.abs(response[:, i, j] - above / below) <= allowed).all():
             return False
     return True
 
 
-def _unstable(poles: np.ndarray, period: float) -> int:
+def _unstable(poles: np.ndarray, period: float, options: RealisationOptions) -> int:
     if period:
-        return int((np.abs(poles) > 1.0 + UNSTABLE).sum())
-    away = np.abs(poles) > AT_REST * np.abs(poles).max(initial=0.0)
-    return int((away & (poles.real > UNSTABLE * np.abs(poles))).sum())
+        return int((np.abs(poles) > 1.0 + options.unstable).sum())
+    away = np.abs(poles) > options.at_rest * np.abs(poles).max(initial=0.0)
+    return int((away & (poles.real > options.unstable * np.abs(poles))).sum())
 
 
-def _frequencies(rates: np.ndarray, period: float) -> Array:
+def _frequencies(rates: np.ndarray, period: float, options: RealisationOptions) -> Array:
     """About every root, and in between, in rad/s."""
     size = np.abs(rates)[np.abs(rates) > 0.0]
     size = np.append(size, [1.0 / period] if period else [] if len(size) else [1.0])
-    top = size.max() * BEYOND
-    grid = np.geomspace(size.min() / BEYOND, top, POINTS)
-    omega = np.concatenate([grid, size * AWAY, size / AWAY])
+    top = size.max() * options.beyond
+    grid = np.geomspace(size.min() / options.beyond, top, options.points)
+    omega = np.concatenate([grid, size * options.beside, size / options.beside])
     return np.unique(omega[omega <= (0.999 * np.pi / period if period else top)])
 
 
@@ -138,8 +152,6 @@ OF_NAMES = {"name", "notes", "userdata", "statename", "stateunit", "statepath", 
 DELAYS = ("InputDelay", "OutputDelay", "IODelay")
 SECONDS = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "seconds": 1.0,
            "minutes": 60.0, "hours": 3600.0, "days": 86400.0}  # fmt: skip
-SINGULAR = 1e12  # condition of E from which on its equations are algebraic
-SAME_DELAY = 1e-9  # relative
 
 
 @dataclass(frozen=True)
@@ -213,7 +225,8 @@ def system_of(path: Path, name: str, given: Mapping[str, Any]) -> MatlabSystem:
     many = [f"{n} state{'s' * (n != 1)}, {m} input{'s' * (m != 1)}, {p} output{'s' * (p != 1)}"]
     if np.size(fields.get("e", ())):
         E = reader.matrix("E")
-        if E.shape != (n, n) or not np.linalg.cond(E) < SINGULAR:
+        # from this condition on the equations of E are algebraic
+        if E.shape != (n, n) or not np.linalg.cond(E) < 1e12:
             raise reader.fail("E", "is not regular: the system has algebraic equations; reduce it")
         if (np.eye(n) != E).any():
             A, B = (np.asarray(np.linalg.solve(E, part), float) for part in (A, B))
@@ -284,7 +297,7 @@ class _Fields:
                 raise self.fail(key, "of a sampled system counts samples; give whole ones")
             total = total + (value if value.size == 1 or value.shape == own else value.reshape(own))
             of.append(key)
-        if of and np.ptp(total) > SAME_DELAY * total.max():
+        if of and np.ptp(total) > 1e-9 * total.max():
             raise self.fail(of[-1], "differs between channels; give each path the same, or lines")
         return unit * float(total.flat[0]) if of else 0.0
 

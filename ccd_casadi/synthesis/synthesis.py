@@ -17,18 +17,39 @@ from ccd_casadi.support.text import HZ, display_unit, spoken, with_unit
 from ccd_casadi.support.worker_process import one_blas_thread
 from ccd_casadi.synthesis.weights import Weights
 
-DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
-# |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
-INTEGRATOR = 1e-6
 
-RESTING = 1e-6  # of ω_low: where a plant with a pole at 0 is at rest
+@dataclass(frozen=True)
+class StaticsOptions:
+    """Numbers of a loop at rest.
+
+    Attributes
+    ----------
+    differentiator : float
+        |K(0)| under this share of |K(jω_b)| holds little at rest.
+    integrator : float
+        |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an
+        hour.
+    resting : float
+        Of ω_low: where a plant with a pole at 0 is evaluated at rest.
+    """
+
+    differentiator: float = 0.1
+    integrator: float = 1e-6
+    resting: float = 1e-6
 
 
 @dataclass(frozen=True)
 class Statics:
-    """Least singular value of K(0) (N/m), largest of GS(0) (m/N), |K(0)| over |K| at ω_b.
+    """A loop at rest.
 
-    Infinite, 0 and infinite of a controller that integrates. `low` is that of GS at `low_hz`.
+    Attributes
+    ----------
+    stiffness, compliance : float
+        Least singular value of K(0) in N/m, largest of GS(0) in m/N; of an integrator inf and 0.
+    share : float
+        |K(0)| over |K(jω_b)|; of an integrator inf.
+    low, low_hz : float
+        Largest singular value of GS in m/N at this frequency.
     """
 
     stiffness: float
@@ -40,7 +61,7 @@ class Statics:
     @property
     def differentiates(self) -> bool:
         """Whether the controller is almost a differentiator."""
-        return self.share < DIFFERENTIATOR
+        return self.share < StaticsOptions().differentiator
 
     @property
     def words(self) -> str:
@@ -62,25 +83,44 @@ class Statics:
 
 
 def statics(
-    plant: StateSpace, controller: StateSpace, *, bandwidth: float, omega_low: float
+    plant: StateSpace,
+    controller: StateSpace,
+    *,
+    bandwidth: float,
+    omega_low: float,
+    options: StaticsOptions = StaticsOptions(),
 ) -> Statics:
-    """Of a continuous plant, at rest close to 0, and a controller in SI; ω_b, ω_low in rad/s.
+    """Stiffness and compliance of a loop at rest.
 
     Of a controller in discrete time the rest is z = 1; hold and delay, which turn nothing at
     ω_low, are left out there.
+
+    Parameters
+    ----------
+    plant, controller : StateSpace
+        The plant continuous; SI.
+    bandwidth, omega_low : float
+        ω_b and the lowest frequency that counts, rad/s.
+    options : StaticsOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    Statics
+        SI.
     """
 
     def at(omega: float) -> np.ndarray:
         return controller.response(np.array([omega]))[0]
 
     def compliance(omega: float, K: np.ndarray) -> float:
-        G = plant.response(np.array([max(omega, RESTING * omega_low)]))[0]
+        G = plant.response(np.array([max(omega, options.resting * omega_low)]))[0]
         return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))
 
     low = compliance(omega_low, at(omega_low))
     poles, T = controller.poles, controller.period
     rates = np.abs(poles - 1.0) / T if T else np.abs(poles)
-    if rates.size and rates.min() <= INTEGRATOR * bandwidth:
+    if rates.size and rates.min() <= options.integrator * bandwidth:
         return Statics(np.inf, 0.0, np.inf, low, omega_low / HZ)
     K0 = at(0.0)
     gains = np.linalg.svd(K0, compute_uv=False)
@@ -89,8 +129,22 @@ def statics(
 
 
 def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> str:
-    """‖GS‖∞, GS at rest (0: an integrator) and at the lowest frequency that counts, all in m/N.
+    """A sentence of what a force moves.
 
+    Parameters
+    ----------
+    most, at_rest, low : float
+        ‖GS‖∞, GS at rest (0: an integrator) and at the lowest frequency that counts, m/N.
+    low_hz : float
+        That one, Hz.
+
+    Returns
+    -------
+    str
+        In units that are easy to read.
+
+    Examples
+    --------
     >>> compliance_words(2e-6, 0.0, 5e-7, 1.0)
     '2 um/N at most, 0.5 um/N at 1 Hz, none at rest (an integrator)'
     >>> compliance_words(64e-3, 59e-3, 5.5e-3, 1.0)
@@ -103,9 +157,6 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
     return f"{factor * most:.4g} {unit} at most, {at_low}, {rest}"
 
 
-WITHIN = 1e-3  # relative: where the maximum is, from where the norm was found
-
-
 @dataclass(frozen=True)
 class Compliance:
     """‖GS‖∞ in m/N, its frequency in rad/s (0: at rest), and the plant that has it."""
@@ -115,15 +166,32 @@ class Compliance:
     plant: ScaledPlant
 
 
-def compliance_of(plant: ScaledPlant, controller: StateSpace) -> Compliance:
-    """‖GS‖∞ with a controller in SI (e in, u out); infinite where the loop is not stable."""
+def compliance_of(
+    plant: ScaledPlant, controller: StateSpace, *, within: float = 1e-3
+) -> Compliance:
+    """The largest compliance of a loop, ‖GS‖∞.
+
+    Parameters
+    ----------
+    plant : ScaledPlant
+        Itself, without its family.
+    controller : StateSpace
+        e in, u out, SI.
+    within : float
+        Relative: how far from the frequency of the norm its maximum is refined.
+
+    Returns
+    -------
+    Compliance
+        Infinite where the loop is not stable.
+    """
     loop = closed_loop(plant.plant_si(), controller).GS
     gain, omega = hinf_norm(loop)
     if not np.isfinite(gain) or omega <= 0.0:
         return Compliance(gain, omega, plant)
     at, top = refine_peak(
         lambda w: float(gains(loop, np.array([w]))[0]),
-        omega * np.exp(-WITHIN), omega * np.exp(WITHIN),
+        omega * np.exp(-within), omega * np.exp(within),
     )  # fmt: skip
     if top >= gain:
         gain, omega = top, at
@@ -135,11 +203,21 @@ def compliance_over_family(plant: ScaledPlant, controller: StateSpace) -> Compli
     return max((compliance_of(each, controller) for each in plant.members), key=lambda c: c.gain)
 
 
-UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
+@dataclass(frozen=True)
+class CertificateOptions:
+    """Numbers of the certificate of a closed loop.
+
+    Attributes
+    ----------
+    unbounded : float
+        A level of γ that no weighted loop reaches: the loop is measured, its norm not judged.
+    """
+
+    unbounded: float = 1e9
 
 
 class Outcome(StrEnum):
-    """How a synthesis ended. Only CERTIFIED designs are ever used; the value says why not."""
+    """How a synthesis ended. Only CERTIFIED designs are ever used; the value gives the reason."""
 
     CERTIFIED = "certified"
     GAMMA_NOT_CONVERGED = "the search for gamma_opt did not converge"
@@ -173,10 +251,20 @@ _OUTCOMES = {code: Outcome[code.name] for code in Code}
 
 @dataclass(frozen=True)
 class Certificate:
-    """Evidence from the rebuilt loop: stability, and the norm against the bound it had to meet."""
+    """Evidence from the rebuilt loop: stability, and the norm against the bound it had to meet.
+
+    Attributes
+    ----------
+    stable, max_real_pole : bool, float
+        The largest real part of a pole in 1/s.
+    norm, norm_bound : float
+        Of the weighted closed loop.
+    passed : bool
+        Whether it is stable and within the bound.
+    """
 
     stable: bool
-    max_real_pole: float  # 1/s
+    max_real_pole: float
     norm: float
     norm_bound: float
     passed: bool
@@ -184,7 +272,27 @@ class Certificate:
 
 @dataclass(frozen=True)
 class DesignFigures:
-    """What one synthesis gave, in SI (rad/s); NaN where it ended before the figure was known."""
+    """What one synthesis gave; NaN where it ended before the figure was known.
+
+    Attributes
+    ----------
+    omega_S, omega_T : float
+        Of its weights, rad/s.
+    outcome : Outcome
+        Whether it is certified, or why not.
+    gamma_opt, gamma_lower_bound, gamma : float
+        The optimum, γ_jω that no controller goes below, and the norm that was reached.
+    limited_by_bound : bool
+        Whether γ_opt = γ_jω.
+    bandwidth, sensitivity_peak_frequency : float
+        rad/s.
+    sensitivity_peak, sensitivity_low : float
+        ‖S‖∞, and σ_max(S) at ω_low.
+    certificate : Certificate
+        Of the closed loop.
+    compliance : float
+        ‖GS‖∞ in m/N, where it was required.
+    """
 
     omega_S: float
     omega_T: float
@@ -192,13 +300,13 @@ class DesignFigures:
     gamma_opt: float
     gamma_lower_bound: float
     gamma: float
-    limited_by_bound: bool  # γ_opt = γ_jω, the limit that no controller passes
+    limited_by_bound: bool
     bandwidth: float
     sensitivity_peak: float
     sensitivity_peak_frequency: float
     sensitivity_low: float
     certificate: Certificate
-    compliance: float = float("nan")  # ‖GS‖∞ in m/N, where it was asked for
+    compliance: float = float("nan")
 
     @property
     def certified(self) -> bool:
@@ -208,7 +316,17 @@ class DesignFigures:
 
 @dataclass(frozen=True)
 class Design(NotebookHtml):
-    """A synthesis with its controller, input e = r - y, output u, in SI."""
+    """A synthesis with its controller.
+
+    Attributes
+    ----------
+    figures : DesignFigures
+        SI.
+    weights : Weights
+        By which it was made.
+    controller : StateSpace
+        Input e = r - y, output u, SI.
+    """
 
     figures: DesignFigures
     weights: Weights
@@ -280,7 +398,22 @@ def sweep(
     gamma_backoff: float = 1.02,
     compliance: bool = False,
 ) -> list[DesignFigures]:
-    """A certified design at every (ω_S, ω_T) of a grid, rad/s; ω_T varies fastest."""
+    """A certified design at every (ω_S, ω_T) of a grid.
+
+    Parameters
+    ----------
+    plant, weights : ScaledPlant, Weights
+        As for `synthesise`; ω_S and ω_T of the weights do not count.
+    omega_S, omega_T : (k,), (l,) array
+        rad/s.
+    omega_low, gamma_backoff, compliance
+        As for `synthesise`.
+
+    Returns
+    -------
+    list of DesignFigures
+        k l of them; ω_T varies fastest.
+    """
     w0 = plant.omega_0
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     points = [weights.at(float(s), float(t)) for s in S for t in T]
@@ -327,7 +460,7 @@ def over_family(
 
     own, worst = row.copy(), plant
     for member in plant.members[1:]:
-        other = assessed(member, UNBOUNDED)
+        other = assessed(member, CertificateOptions().unbounded)
         if other[Column.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
             figures = figures_from_row(own, weights, w0)
             return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member
@@ -338,7 +471,22 @@ def over_family(
 
 
 def figures_from_row(row: Array, weights: Weights, omega_0: float) -> DesignFigures:
-    """A kernel's row of scaled figures in SI."""
+    """A kernel's row of scaled figures in SI.
+
+    Parameters
+    ----------
+    row : (Column.COUNT,) array
+        Frequencies over ω₀.
+    weights : Weights
+        Of the design.
+    omega_0 : float
+        rad/s.
+
+    Returns
+    -------
+    DesignFigures
+        SI.
+    """
     code = Code(int(row[Column.CODE]))
     pole = float(row[Column.MAX_REAL_POLE]) * omega_0
     return DesignFigures(

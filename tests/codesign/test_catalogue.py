@@ -23,17 +23,17 @@ from ccd_casadi.codesign.catalogue import best_of_lists, restricted
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Direct
 from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.outer_search import search_outer
 from ccd_casadi.codesign.outer_structured import StructuredOuter
 from ccd_casadi.codesign.result import write_run
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
-from ccd_casadi.codesign.search import search_outer
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
+from ccd_casadi.sampling.inner_samples import SynthesisCounts
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import SynthesisCounts
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.json_files import plain
 from ccd_casadi.support.process_pool import Workers

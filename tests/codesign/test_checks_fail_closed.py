@@ -17,7 +17,7 @@ from oracles.helpers import problem
 
 from ccd_casadi.codesign import outer_mixed, outer_structured
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.result import result_dict
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.survival import Survival
@@ -31,7 +31,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.synthesis import second_engine
-from ccd_casadi.synthesis.second_engine import Comparison
+from ccd_casadi.synthesis.second_engine import EngineComparison
 from ccd_casadi.synthesis.synthesis import Outcome
 
 NAN = math.nan
@@ -49,7 +49,8 @@ def sound() -> Verified:
 
 def verdict_of(verified: Verified) -> tuple[dict[str, str], str]:
     """States of the lines by name, and the status, of what reads back as strict JSON."""
-    found = result_dict(Terms("direct", 1e-3, 0), FormulationResult(verified.point), verified, {})
+    terms = RunTerms("direct", 1e-3, 0)
+    found = result_dict(terms, FormulationResult(verified.point), verified, {})
     found = json.loads(json.dumps(found, allow_nan=False))
     states = {name: line["state"] for name, line in found["verdict"].items()}
     assert (found["status"] == "verified") == ("failed" not in states.values())
@@ -68,9 +69,9 @@ def with_figures(item: Any, **changes: object) -> Any:
 
 
 FAULTS: list[tuple[str, Callable[[Any], Any]]] = [
-    ("certified", lambda d: replace(d, second=Comparison(1, denied="another norm"))),
-    ("certified", lambda d: replace(d, second=Comparison(1, unknown="no answer"))),
-    ("certified", lambda d: replace(d, second=Comparison(0))),
+    ("certified", lambda d: replace(d, second=EngineComparison(1, denied="another norm"))),
+    ("certified", lambda d: replace(d, second=EngineComparison(1, unknown="no answer"))),
+    ("certified", lambda d: replace(d, second=EngineComparison(0))),
     ("certified", lambda d: replace(d, feasible=False)),
     ("certified", lambda d: with_figures(d, outcome=Outcome.LEVEL_TEST_FAILED)),
     ("optimal", lambda d: replace(d, inner_gap=NAN)),

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from oracles.helpers import few, problem
 
 from ccd_casadi.codesign.formulations import Direct
-from ccd_casadi.codesign.kkt import TrueDesign
+from ccd_casadi.codesign.lifted_kkt import TrueDesign
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.inner_problem.objective import (
-    ACTIVE,
-    MET,
+    ConstraintOptions,
     TrueQuantities,
     binding,
     constraint_shares,
@@ -67,8 +66,8 @@ def test_what_is_met_and_what_is_active_is_the_same_in_every_unit(
         assert shares[1] == pytest.approx((theta[0] - theta[1]) / 30.0, rel=1e-9, abs=1e-13)
         found.append((violated(case, theta), binding(case, theta)))
     assert found[0] == found[1] == found[2]
-    assert ("least mass" in found[0][0]) == (share > MET)
-    assert ("least mass" in found[0][1]) == (share >= -ACTIVE)
+    assert ("least mass" in found[0][0]) == (share > ConstraintOptions.met)
+    assert ("least mass" in found[0][1]) == (share >= -ConstraintOptions.active)
 
 
 def test_a_constraint_that_nothing_meets_is_named_in_every_unit(in_unit) -> None:
@@ -88,7 +87,7 @@ def test_an_optimum_is_the_same_in_every_unit(in_unit) -> None:
         x, kkt = solution.verified.x, solution.verified.kkt
         assert "least mass" in solution.verified.active
         assert "least mass" in kkt.active
-        assert kkt.primal <= MET
+        assert kkt.primal <= ConstraintOptions.met
         assert TrueDesign(TrueQuantities(case), x).acceptable
         mu = kkt.multipliers["least mass"] * unit
         ends.append((*solution.verified.theta, mu))

@@ -14,9 +14,8 @@ from ccd_casadi.cases.case import load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import run
 from ccd_casadi.codesign.formulations import (
-    MANY,
-    SAMPLES,
     Direct,
+    SurrogateLimits,
     formulation_of,
     slow_words,
     usual_name,
@@ -26,9 +25,10 @@ from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
-from ccd_casadi.sampling.samples import InnerSample, SynthesisCounts
+from ccd_casadi.sampling.inner_samples import InnerSample, SynthesisCounts
 
 ROOT = Path(__file__).parents[2]
+LIMITS = SurrogateLimits()
 CASE = load_case(ROOT / "runs" / "two_mass.toml")
 CHAIN = """
 import casadi as ca
@@ -80,11 +80,12 @@ def test_the_usual_formulation_has_an_end() -> None:
     """Nested as long as its plan is small and its surrogate worth a fit, else direct."""
     spread = replace(CASE, sampling=replace(CASE.sampling, design="sobol", points=64))
     for count in range(1, 40):
-        on_grid = CASE.sampling.points**count <= SAMPLES and count <= MANY
+        on_grid = CASE.sampling.points**count <= LIMITS.samples and count <= LIMITS.parameters
         assert usual_name(CASE, count) == ("nested" if on_grid else "direct")
-        assert usual_name(spread, count) == ("nested" if count <= MANY else "direct")
+        assert usual_name(spread, count) == ("nested" if count <= LIMITS.parameters else "direct")
         assert not slow_words(formulation_of(CASE, usual_name(CASE, count)), count)
-        assert bool(slow_words(formulation_of(CASE, "lifted"), count)) == (count > MANY)
+        slow = bool(slow_words(formulation_of(CASE, "lifted"), count))
+        assert slow == (count > LIMITS.parameters)
     assert "\n" not in slow_words(formulation_of(CASE, "lifted"), 23)
     assert usual_name(CASE, 2) == "nested"
 

@@ -10,11 +10,11 @@ import pytest
 from oracles.helpers import problem
 
 from ccd_casadi.codesign.formulation import GlobalCheck
-from ccd_casadi.codesign.outer import End, Outer, Place
-from ccd_casadi.codesign.search import _starts, global_check
+from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign
+from ccd_casadi.codesign.outer_search import _starts, global_check
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from surrogates import design
 
 
@@ -70,7 +70,7 @@ def looked(
     )  # fmt: skip
     here, kkt = path[-1], SimpleNamespace(stationarity=0.0)
     end = SimpleNamespace(x=np.array(here.theta), objective=objective_of(case, here), kkt=kkt)
-    return global_check(cast(Outer, outer), cast(End, end), 8, 0)
+    return global_check(cast(Outer, outer), cast(PolishedDesign, end), 8, 0)
 
 
 @pytest.mark.parametrize("worse", [0.02, 0.06])

@@ -12,9 +12,9 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.insight import Front, pareto_front
 from ccd_casadi.codesign.kinked import polish
 from ccd_casadi.codesign.outer import Place
+from ccd_casadi.codesign.pareto import Front, pareto_front
 from ccd_casadi.codesign.post_optimal import post_optimal
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.drawing.content import Lines
@@ -23,8 +23,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.insight import main
 from ccd_casadi.reporting.insight_page import front_answer, front_figure
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from oracles.helpers import HZ, problem
 
-from ccd_casadi.codesign.judgement import second_on_weighted
+from ccd_casadi.codesign.final_judgement import second_on_weighted
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.objective import final_design
 

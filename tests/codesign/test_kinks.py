@@ -19,8 +19,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.optim.pieces import Local, descend
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 
 J0 = -700.0
 SEEDS = st.integers(0, 2**32 - 1)

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign import search
+from ccd_casadi.codesign import outer_search as search
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.gaussian_processes import with_sample
-from ccd_casadi.codesign.outer import End, Outer
+from ccd_casadi.codesign.outer import Outer, PolishedDesign
 from ccd_casadi.codesign.result import predicted_value
 from ccd_casadi.optim.kkt import KktCertificate
-from ccd_casadi.sampling.samples import SynthesisCounts
+from ccd_casadi.sampling.inner_samples import SynthesisCounts
 from surrogates import fit
 
 
@@ -49,7 +49,8 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     case allows none."""
     X = np.linspace(0.0, 1.0, 6)[:, None]
     process = fit(X, 1.0 + X[:, 0], lower=[0.0], upper=[1.0])
-    end = End(np.array([0.5]), 2.5, -1.0, KktCertificate(0.0, 0.0, 0.0, {}, (), None, ()), 0.0)
+    kkt = KktCertificate(0.0, 0.0, 0.0, {}, (), None, ())
+    end = PolishedDesign(np.array([0.5]), 2.5, -1.0, kkt, 0.0)
     spent = (SimpleNamespace(),) * (rounds + 1)
     outcome = FormulationResult(end.x, spent, (process,), None, False, "")  # type: ignore[arg-type]
     outer = SimpleNamespace(
@@ -59,7 +60,7 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     )  # fmt: skip
     monkeypatch.setattr(search, "global_check", lambda *_: SimpleNamespace(x=None))
     options = SimpleNamespace(box_points=0, max_refinements=rounds, tolerance=1e-3)
-    learnt_of, *_ = search._looked(outer, outcome, end, options, 0)
+    learnt_of, *_ = search._after_global_check(outer, outcome, end, options, 0)
     assert abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0) > 0.1
     learnt = abs(predicted_value(learnt_of, end.x, end.value) / end.value - 1.0) < 1e-3
     assert learnt is (rounds > 0)

@@ -9,7 +9,7 @@ from scipy.linalg import null_space
 from test_kkt import MODEL, point
 
 from ccd_casadi.codesign.kinked import polish
-from ccd_casadi.codesign.kkt import NEAR, TrueDesign, active_at, newton_step
+from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign, active_at, newton_step
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.plant_source import PlantSource
@@ -91,6 +91,6 @@ def test_a_polish_from_near_by_finds_the_same_design(
 
 def test_a_step_past_the_basin_is_none(inside_the_box) -> None:
     case = inside_the_box[0]
-    x = away(inside_the_box, 20.0 * NEAR)
+    x = away(inside_the_box, 20.0 * LiftedKktOptions().longest_newton_step)
     quantities = TrueQuantities(case)
     assert newton_step(TrueDesign(quantities, x)) is None

@@ -9,11 +9,11 @@ from oracles.helpers import HZ, few, problem
 from test_kinks import pieces
 
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
+from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.optim import kkt
 from ccd_casadi.optim import pieces as of_pieces
-from ccd_casadi.optim.kkt import AT_FIRST, INSIDE, KEPT, solve_elastic, solve_quadratic
+from ccd_casadi.optim.kkt import QuadraticOptions, solve_elastic, solve_quadratic
 from ccd_casadi.support.arrays import Array
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -46,8 +46,8 @@ def test_an_answer_keeps_its_rows_and_is_optimal(seed: int) -> None:
     found = solve_quadratic(H, c, A, upper, low, high)
     assert found is not None
     x, mu = found.x, found.multipliers
-    assert (A @ x - upper).max() <= KEPT
-    assert max((low - x).max(), (x - high).max()) <= INSIDE
+    assert (A @ x - upper).max() <= QuadraticOptions.row_error
+    assert max((low - x).max(), (x - high).max()) <= QuadraticOptions.bound_error
     slope = H @ x + c + A.T @ mu  # what the bounds carry
     ends = np.where(slope > 0.0, low, np.where(np.isfinite(high), high, x))
     dual = -0.5 * x @ H @ x - mu @ upper + slope @ ends
@@ -61,7 +61,7 @@ def test_of_thousands_of_rows_none_is_left_out(seed: int) -> None:
     """The row that holds the step is the last one in the order: the answer keeps it as if all were
     in one programme, and it has the multiplier."""
     rng = np.random.default_rng(seed)
-    n, m, radius = 8, 10 * AT_FIRST, 10.0 ** rng.uniform(-4, -1)
+    n, m, radius = 8, 10 * QuadraticOptions.first_rows, 10.0 ** rng.uniform(-4, -1)
     slopes = rng.normal(size=(m, n))
     value = -radius * (1.0 + np.abs(slopes).sum(1))  # out of reach
     c, ends = rng.normal(size=n), (np.full(n, -radius), np.full(n, radius))
@@ -115,7 +115,7 @@ def test_a_failed_programme_is_no_optimum_on_kinks(failing, count: int) -> None:
     start = np.array([60.0, 66.0, *np.log([500.0 * HZ, 45.0 * HZ])])
     failing(count)
     end = descend(quantities, start, steps=40)
-    assert TrueDesign(quantities, end).kkt.stationarity <= SMOOTH
+    assert TrueDesign(quantities, end).kkt.stationarity <= LiftedKktOptions().smooth
 
 
 @pytest.mark.parametrize("count", [1, 3])

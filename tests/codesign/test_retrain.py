@@ -14,7 +14,7 @@ from oracles.busy import HANGS
 
 import ccd_casadi as ccd
 from ccd_casadi.codesign.outer_mixed import MixedOuter
-from ccd_casadi.codesign.retraining import FOLDER, LOCK, Job, Outcome, only_job, version_names
+from ccd_casadi.codesign.retraining import FOLDER, LOCK, Job, RetrainingEnd, only_job, version_names
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
@@ -30,7 +30,7 @@ FIRST = 12  # samples that a first fit takes: three an input
 
 def job(
     folder: Path, formulation: str = "lifted", problem: CoDesignProblem | None = None, **more: Any
-) -> tuple[Outcome, list[Solution]]:
+) -> tuple[RetrainingEnd, list[Solution]]:
     """A job that keeps result.json alone, and the solutions that it wrote."""
     written: list[Solution] = []
 
@@ -47,18 +47,18 @@ def job(
 
 
 @pytest.fixture(scope="module")
-def retrained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome, Solution]:
+def retrained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RetrainingEnd, Solution]:
     folder = tmp_path_factory.mktemp("run")
     outcome, (solution,) = job(folder)
     return folder, outcome, solution
 
 
 @pytest.fixture
-def copy(retrained: tuple[Path, Outcome, Solution], tmp_path: Path) -> Path:
+def copy(retrained: tuple[Path, RetrainingEnd, Solution], tmp_path: Path) -> Path:
     return Path(shutil.copytree(retrained[0], tmp_path / "run"))
 
 
-def test_few_syntheses_reach_the_optimum(retrained: tuple[Path, Outcome, Solution]) -> None:
+def test_few_syntheses_reach_the_optimum(retrained: tuple[Path, RetrainingEnd, Solution]) -> None:
     _, outcome, solution = retrained
     assert (outcome.status, outcome.reason) == ("verified", "converged")
     assert outcome.spent <= 60
@@ -91,7 +91,7 @@ def test_a_run_keeps_the_name_of_its_formulation(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_job_resumes(
-    retrained: tuple[Path, Outcome, Solution], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    retrained: tuple[Path, RetrainingEnd, Solution], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, asked = Sampler.quantities, []
 
@@ -154,7 +154,9 @@ def test_near_duplicates_are_fitted_once(tmp_path: Path) -> None:
 # ---- versions, and one job at a time -------------------------------------------------------------
 
 
-def test_a_surrogate_is_kept_with_its_error(retrained: tuple[Path, Outcome, Solution]) -> None:
+def test_a_surrogate_is_kept_with_its_error(
+    retrained: tuple[Path, RetrainingEnd, Solution],
+) -> None:
     folder, *_ = retrained
     (name,) = version_names(folder)
     processes, extra = load(folder / FOLDER / f"{name}.json")

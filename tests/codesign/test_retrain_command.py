@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ccd_casadi.codesign import retraining
-from ccd_casadi.codesign.retraining import LOCK, Outcome, only_job
+from ccd_casadi.codesign.retraining import LOCK, RetrainingEnd, only_job
 from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.support.worker_process import WorkerLost
 from surrogates.retrain import main
@@ -65,7 +65,7 @@ def test_exit_codes(
     status: str,
     code: int,
 ) -> None:
-    ended = Outcome(status, "budget", 3, 20, "0001")
+    ended = RetrainingEnd(status, "budget", 3, 20, "0001")
     monkeypatch.setattr(retraining.Job, "run", lambda self, write: ended)
     assert main([str(folder), "--quiet"]) == code
     assert capsys.readouterr() == ("", f"{folder}: {status} (budget)\n")

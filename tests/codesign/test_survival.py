@@ -12,11 +12,10 @@ from oracles.helpers import problem
 
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
 from ccd_casadi.codesign.survival import (
-    FACTORS,
     PEAK,
-    REACH,
     LoopsOffModel,
     Survival,
+    SurvivalOptions,
     loops_off_model,
     reach,
     survival,
@@ -174,14 +173,14 @@ def test_no_range_hides_a_peak_or_an_instability(seed: int) -> None:
         return StateSpace(joint, np.vstack([B @ K.D, K.B]), out, np.eye(1))
 
     for end in (low, high):
-        if abs(end) < REACH:
+        if abs(end) < SurvivalOptions().reach:
             beyond = end + np.sign(end or 1.0) * max(3e-4 * abs(end), 3e-9)
             assert hinf_norm(loop(beyond))[0] > S_max * (1.0 + 0.5 * PEAK)
     for end, inner in zip(found.stable_shift, found.S_max_shift, strict=True):
         assert abs(inner) <= abs(end)
         places = np.append(np.linspace(0.0, end, 60), end)
         assert all(np.linalg.eigvals(loop(float(s)).A).real.max() < 0.0 for s in places)
-        if abs(end) < REACH:
+        if abs(end) < SurvivalOptions().reach:
             beyond = end * (1.0 + 3e-4) + np.sign(end) * 3e-9
             assert np.linalg.eigvals(loop(float(beyond)).A).real.max() > -1e-6
 
@@ -211,7 +210,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
         assert stable
         assert peak <= S_max * (1.0 + PEAK) * (1.0 + 1e-7)
     for end in (low, high):
-        if abs(end) < REACH:
+        if abs(end) < SurvivalOptions().reach:
             stable, peak = judged(end + np.sign(end or 1.0) * max(3e-4 * abs(end), 3e-9))
             assert not stable or peak > S_max * (1.0 + 0.5 * PEAK)
 
@@ -311,8 +310,8 @@ def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: boo
     )
     good = perturbed.PerturbedLoop((0.0,), True, 1.0, 1.0, -1.0)
     with mock.patch.object(perturbed, "judge", return_value=good):
-        line = perturbed.shift_line(run, REACH, 2)
-        damped = perturbed.damping_line(run, *FACTORS, 2)
+        line = perturbed.shift_line(run, SurvivalOptions().reach, 2)
+        damped = perturbed.damping_line(run, *SurvivalOptions().factors, 2)
     assert line.stable == pytest.approx(found.stable_shift, rel=1e-3, abs=1e-6)
     assert line.within == pytest.approx(found.S_max_shift, rel=1e-3, abs=1e-6)
     assert damped.stable == pytest.approx(found.stable_damping, rel=1e-3)

@@ -12,10 +12,15 @@ from oracles.shipped_designs import RESULTS
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.formulations import usual_name
-from ccd_casadi.codesign.joint_model import PENALTY, JointModel, JointPoint, proposed
+from ccd_casadi.codesign.joint_model import JointModel, JointModelOptions, JointPoint, proposed
 from ccd_casadi.codesign.outer import Place
 from ccd_casadi.codesign.outer_structured import StructuredOuter
-from ccd_casadi.codesign.theta_joint import POLL, joint_search, objectives_beside, polled
+from ccd_casadi.codesign.theta_joint import (
+    JointSearchOptions,
+    joint_search,
+    objectives_beside,
+    polled,
+)
 from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.inner_problem.objective import hardware_at, objective_of
@@ -82,8 +87,7 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
     models = nearby(problem, [theta], theta)
     if bent:
         models = (curved(mechanics(plant_of(problem), theta), theta),)
-    model = JointModel(problem, models, at, 0.1)
-    model.bent = bent
+    model = JointModel(problem, models, at, 0.1, curved_plants=bent)
     family, start = model.loops, model.start
     z, kappa, tau = model.parts(start)
     loops = family(z)
@@ -126,7 +130,7 @@ def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
         first = sampler.values(np.array(problem.start))[0]
         at = JointPoint(first.theta, first.kappa, first.bandwidth)
         models = nearby(problem, [at.theta], at.theta)
-        promised, whole = (proposed(problem, models, at, 0.05, least) for least in (1e-7, 1e-10))
+        promised, whole = (proposed(problem, models, at, 0.05, least) for least in (None, 1e-10))
         assert promised.gain > 0.8 * whole.gain > 0.0
         _, best, settled = joint_search(sampler, np.array(problem.start))
         assert settled
@@ -153,7 +157,11 @@ def test_a_poll_has_the_best_place_along_the_axes(theta: tuple[float, float]) ->
     at = JointPoint(theta, tuple(STORED["sections"]["kappa"]), 2.0 * np.pi * 20.0)
     models = nearby(problem, (), theta)
     width = np.subtract(problem.upper, problem.lower)
-    steps = [sign * POLL * row for row in np.diag(width) for sign in (1.0, -1.0)]
+    steps = [
+        sign * JointSearchOptions().poll_step * row
+        for row in np.diag(width)
+        for sign in (1.0, -1.0)
+    ]
     places = [place for step in steps if ((place := theta + step) >= problem.lower).all()]
     J = [JointModel(problem, models, replace(at, theta=tuple(place)), 0.0).adapted()[1]
          for place in places]  # fmt: skip
@@ -195,7 +203,7 @@ def test_breaking_a_constraint_costs_more_than_the_hardware_that_it_saves() -> N
     own = hardware_at(problem, model.middle)
     assert len(own.constraints)
     saved = np.abs(own.cost_gradient).max() / model.unit
-    rise = PENALTY * (model.weight[:, None] * np.abs(own.slopes)).max(axis=1)
+    rise = JointModelOptions().penalty * (model.weight[:, None] * np.abs(own.slopes)).max(axis=1)
     assert (rise >= saved).all()
     assert model.weight.max() > 1.0
 

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.helpers import few
 
-from ccd_casadi.optim.kkt import AT_FIRST, damped_bfgs, symmetric_rank_one
+from ccd_casadi.optim.kkt import QuadraticOptions, damped_bfgs, symmetric_rank_one
 from ccd_casadi.optim.trust_region import (
-    End,
     Iterate,
-    Model,
+    Minimum,
     Radius,
     Rows,
     Step,
+    TrustRegionModel,
     best_step,
     minimise,
 )
@@ -26,7 +26,7 @@ WIDE = 10.0
 Update = Callable[[Array, Array, Array], Array]
 
 
-class Smooth(Model[Array]):
+class Smooth(TrustRegionModel[Array]):
     """½ (x - a)ᵀ Q (x - a) within rows b + A x + ½ xᵀ R x <= 0, known where |x - hole| > size."""
 
     def __init__(
@@ -62,7 +62,7 @@ class Smooth(Model[Array]):
             change = change + (self.R @ (there.x - here.x)).T @ step.multipliers
         return self.learn(H, there.x - here.x, change)
 
-    def run(self, x: Array, penalty: float = 100.0) -> End[Array]:
+    def run(self, x: Array, penalty: float = 100.0) -> Minimum[Array]:
         start = self.at(x)
         assert start is not None
         H = np.eye(len(x)) if self.learn else self.Q
@@ -181,7 +181,7 @@ def test_the_radius_follows_the_gain() -> None:
 
 def test_rows_far_below_their_bounds_push_out_none_that_holds_the_step() -> None:
     """min ½ (x - 3)² within x <= 1, beside more steep rows than a programme begins with."""
-    far = 2 * AT_FIRST
+    far = 2 * QuadraticOptions.first_rows
     A = np.concatenate([np.full((far, 1), 100.0), np.ones((1, 1))])
     b = np.append(np.full(far, -150.0), -1.0)
     model = Smooth(np.eye(1), np.full(1, 3.0), b, A, np.zeros((far + 1, 1, 1)))
@@ -194,7 +194,7 @@ def test_rows_far_below_their_bounds_push_out_none_that_holds_the_step() -> None
 
 def test_rows_that_are_just_passed_push_out_none_that_is_passed_by_far() -> None:
     """From x = 0 with 1 - x <= 0 unmet, beside more flat rows that are hardly passed."""
-    flat = 2 * AT_FIRST
+    flat = 2 * QuadraticOptions.first_rows
     A = np.concatenate([np.full((flat, 1), 1e-3), -np.ones((1, 1))])
     b = np.append(np.full(flat, 1e-2), 1.0)
     model = Smooth(np.eye(1), np.full(1, -1.0), b, A, np.zeros((flat + 1, 1, 1)))

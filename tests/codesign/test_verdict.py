@@ -19,13 +19,13 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.formulation import GlobalCheck
 from ccd_casadi.codesign.formulations import formulation_of
-from ccd_casadi.codesign.kinked import BASIN, descend
-from ccd_casadi.codesign.kkt import SMOOTH, TrueDesign
+from ccd_casadi.codesign.kinked import PeakDescentOptions, descend
+from ccd_casadi.codesign.lifted_kkt import LiftedKktOptions, TrueDesign
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.result_entries import kept_words, robust_dict
 from ccd_casadi.codesign.robust_check import survived
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.survival import REACH, Survival, loops_of
+from ccd_casadi.codesign.survival import Survival, SurvivalOptions, loops_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.content import Verdict
 from ccd_casadi.drawing.paint import block_html
@@ -94,10 +94,13 @@ def test_the_look_at_the_box_is_said() -> None:
     assert "none better at 20 fresh" in optimal_line(1e-9, look=replace(look, x=None)).words
 
 
+REACH = SurvivalOptions().reach
+
+
 @given(low=st.floats(-REACH, 0.0), high=st.floats(0.0, REACH))
 def test_a_narrow_range_of_resonances_is_warned(low: float, high: float) -> None:
     line = v.survives(replace(SOUND, stable_shift=(low, high)), S_max=2.0)
-    narrow = low > -v.LEAST_SHIFT or high < v.LEAST_SHIFT
+    narrow = low > -v.VerdictOptions().least_shift or high < v.VerdictOptions().least_shift
     assert line.state is (v.State.WARNED if narrow else v.State.PASSED)
     assert line.figures["stable_shift"] == [low, high]
 
@@ -265,14 +268,14 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
     assert (end <= upper).all()
     found = TrueDesign(quantities, end)
     assert found.acceptable
-    assert found.kkt.stationarity <= SMOOTH
+    assert found.kkt.stationarity <= LiftedKktOptions().smooth
     J = found.objective
     assert TrueDesign(quantities, start).objective > J
     assert len(quantities.designs) < 40
     # another that knows this end stops near it, and goes on past one that is worse than it is
     again, past = TrueQuantities(case), TrueQuantities(case)
     near = descend(again, start, ended=[(end, J)])
-    assert np.abs((near - end) / (upper - lower)).max() <= BASIN
+    assert np.abs((near - end) / (upper - lower)).max() <= PeakDescentOptions().basin
     assert len(again.designs) < len(quantities.designs)
     through = descend(past, start, ended=[(end, J + 1e9)])
     np.testing.assert_array_equal(through, end)

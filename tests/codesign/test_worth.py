@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi import HZ, Lifted, load_case, problem_of, solve
-from ccd_casadi.fixed_structure.multi_start import LocalOptimum
+from ccd_casadi.fixed_structure.multi_start import BandwidthOptimum
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box, plant_of, true_inner
 from ccd_casadi.plants.plant import hardware_cost
@@ -79,7 +79,7 @@ def test_a_round_is_expected_to_gain_less_the_more_true_designs_there_are(tmp_pa
 )
 def test_what_a_search_may_have_missed_is_stated(monkeypatch, count, with_plants, expected) -> None:
     """The next local optimum, where one search alone found the best, and worse plants."""
-    ends = SimpleNamespace(local_optima=(LocalOptimum(10.0, count), LocalOptimum(8.0, 4)))
+    ends = SimpleNamespace(local_optima=(BandwidthOptimum(10.0, count), BandwidthOptimum(8.0, 4)))
     searched = SimpleNamespace(design=ends)
     wider = SimpleNamespace(value_from=lambda *at: SimpleNamespace(value=with_plants))
     plants = () if with_plants is None else ((0, (0.03,)),)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import beta
 
-from ccd_casadi.analysis.yield_bound import CONFIDENCE, Yield, yield_bound
+from ccd_casadi.analysis.yield_bound import Yield, YieldOptions, yield_bound
 
 
 @given(st.integers(1, 5000), st.data(), st.floats(0.5, 1.0 - 1e-7))
@@ -40,7 +40,7 @@ def test_words_round_the_share_down() -> None:
     found = Yield(1500, 1500)
     stated = float(found.words.split("at least ")[1].split(" %")[0]) / 100.0
     assert stated <= found.least < stated + 1e-4
-    assert found.entry["confidence"] == CONFIDENCE
+    assert found.entry["confidence"] == YieldOptions().confidence
 
 
 @pytest.mark.parametrize(("survived", "draws"), [(-1, 3), (4, 3)])

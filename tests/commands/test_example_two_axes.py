@@ -22,7 +22,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_search import prepared
 from ccd_casadi.reporting.facts import channel_words
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.errors import UserError
 
 ROOT = Path(__file__).parents[2]

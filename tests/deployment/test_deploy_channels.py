@@ -16,7 +16,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deploy import main as deploy_main
-from ccd_casadi.deployment.files import deployment_dict
+from ccd_casadi.deployment.deploy_files import deployment_dict
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import _judged, deploy
 from ccd_casadi.deployment.robust_set import as_written, members

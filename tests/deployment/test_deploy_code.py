@@ -11,7 +11,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from oracles.helpers import few
 
-from ccd_casadi.deployment.files import Section, sections_of
+from ccd_casadi.deployment.deploy_files import Section, sections_of
 from ccd_casadi.deployment.realisation import (
     LoopChannel,
     Realisation,

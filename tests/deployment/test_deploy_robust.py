@@ -10,8 +10,8 @@ import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
-from ccd_casadi.deployment.outcome import SAMPLED_EXCESS, Deployment
-from ccd_casadi.deployment.pipeline import deploy
+from ccd_casadi.deployment.outcome import Deployment
+from ccd_casadi.deployment.pipeline import DeploymentOptions, deploy
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.loop import sampled
@@ -70,7 +70,8 @@ def test_what_is_verified_holds_between_the_plants_too(
     assert found.stable
     shifts = np.random.default_rng(0).uniform(-0.02, 0.02, 30)
     worst = max(peaks(run, found, [*shifts, -0.02, 0.02]))
-    assert worst <= (1.0 + SAMPLED_EXCESS) * run.problem.inner.S_max * (1.0 + 1e-4)
+    allowed = 1.0 + DeploymentOptions().sampled_excess
+    assert worst <= allowed * run.problem.inner.S_max * (1.0 + 1e-4)
     assert worst <= found.worst.figures.sensitivity_peak * (1.0 + 1e-4)
     assert {item.at.shift for item in found.members} >= {-0.02, 0.02}
 
@@ -103,7 +104,7 @@ def test_a_rate_enough_for_the_nominal_plant_alone_is_not_enough(
     for rate in np.array([0.75, 0.95]) * needed:
         found = deploy(run, Timing(float(rate), lead=True))
         wrong = max(peaks(run, found, np.linspace(-0.02, 0.02, 9)))
-        if wrong > (1.0 + SAMPLED_EXCESS) * run.problem.inner.S_max:
+        if wrong > (1.0 + DeploymentOptions().sampled_excess) * run.problem.inner.S_max:
             assert not found.passed
             failed += 1
             words = found.shortfalls[0]

@@ -16,7 +16,7 @@ from test_deploy_code import of_one_channel, random_controller
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.setpoint import feedforward, setpoint
-from ccd_casadi.deployment.on_hardware import PARTS, Electronics, move
+from ccd_casadi.deployment.on_hardware import Electronics, SimulationOptions, move
 from ccd_casadi.deployment.realisation import (
     Realisation,
     back_calculation,
@@ -191,7 +191,7 @@ def test_an_unlimited_move_is_the_linear_loop() -> None:
                              found.position[:, None, None])  # fmt: skip
         exact = move(stage(), K, delay, PROFILE).error
         np.testing.assert_allclose(exact, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)
-    late = made(K, hardware=Electronics(jitter=PERIOD / PARTS))
+    late = made(K, hardware=Electronics(jitter=PERIOD / SimulationOptions().parts))
     np.testing.assert_array_equal(made(K, hardware=Electronics()).error, found.error)
     assert 0.0 < np.abs(late.error - found.error).max() < 1e-2 * found.peak_error
 

@@ -144,7 +144,7 @@ class VerifiedRule(Verified):
 class RuleOuter(ThetaOuter):
     kkt_level = VerifiedRule.kkt_level
 
-    def verified(self, end: outer_room.End, rounds: int) -> VerifiedRule:
+    def verified(self, end: outer_room.PolishedDesign, rounds: int) -> VerifiedRule:
         theta = tuple(map(float, self.theta_of(end.x)))
         K, figures = ByRule(self.problem).at(theta)
         feasible = self.problem.inner.feasible(figures) and not violated(self.problem, theta)

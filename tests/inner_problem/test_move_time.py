@@ -12,7 +12,7 @@ from oracles.differences import slopes
 from ccd_casadi.analysis.move import simulate, with_motion
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import _Crossing
-from ccd_casadi.analysis.setpoint import STEP, UNLIMITED, Motion, Motor, cycle_of
+from ccd_casadi.analysis.setpoint import Motion, MotionOptions, Motor, cycle_of
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.controller_problem import MOVE_TIME
@@ -59,7 +59,7 @@ def test_a_rigid_body_moves_bang_bang() -> None:
 
 
 def test_a_longer_motor_gives_force_as_the_root_of_mass_and_power() -> None:
-    one, four = (replace(MOTOR, size="m", peak_current=(UNLIMITED,)) for _ in range(2))
+    one, four = (replace(MOTOR, size="m", peak_current=(Motor.unlimited,)) for _ in range(2))
     forces = [
         cycle_of(moving(motor), np.array([5.0]), mass).rms_force
         for motor, mass in ((one, 2.0), (four, 8.0))
@@ -172,8 +172,9 @@ def test_a_catalogue_is_met_at_its_motors() -> None:
     motor = Motor((20.0, 34.0), (3.0, 5.0), (9.0, 9.0), (0.4, 0.6), 50.0, "m")
     assert motor.at(0.4) == pytest.approx((20.0, 3.0, 9.0))
     assert motor.at(0.6) == pytest.approx((34.0, 5.0, 9.0))
-    k, _, _ = motor.at(0.5 + 1j * STEP)
-    assert (k.real, k.imag / STEP) == pytest.approx((27.0, 70.0))
+    step = MotionOptions().complex_step
+    k, _, _ = motor.at(0.5 + 1j * step)
+    assert (k.real, k.imag / step) == pytest.approx((27.0, 70.0))
 
 
 # ---- as a figure of the inner problem -----------------------------------------------------------

@@ -23,7 +23,7 @@ from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import structured_of, with_structured
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem, Uncertainty
 from ccd_casadi.inner_problem.structured_robustness import DesignOnBox, certify_corners
-from ccd_casadi.inner_problem.structured_search import ENOUGH, prepared, with_range
+from ccd_casadi.inner_problem.structured_search import StructuredSearchOptions, prepared, with_range
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
@@ -226,4 +226,4 @@ def test_few_starts_that_miss_are_not_the_last_word() -> None:
     assert not made.certified
     found = re.match(r"none found from (\d+) starts", made.words)
     assert found is not None
-    assert int(found[1]) >= ENOUGH
+    assert int(found[1]) >= StructuredSearchOptions.least_starts

@@ -26,17 +26,17 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
-from ccd_casadi.inner_problem import structured_robustness
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.structured_bandwidth import structured_value
 from ccd_casadi.inner_problem.structured_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions, DesignOnBox
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.limitations.limits import discs
-from ccd_casadi.limitations.multiplier import Basis
+from ccd_casadi.limitations.multiplier import MultiplierBasis
 from ccd_casadi.limitations.of_problem import limits_of_problem, opposite_corners
 from ccd_casadi.lti.loop import sampled, tustin
 from ccd_casadi.robustness import main as robustness_main
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.text import HZ, number
 from ccd_casadi.synthesis.closed_loop import measure
@@ -148,7 +148,7 @@ def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_
         centres, radii = discs(limits, v, v, bandwidth)
         share = (np.abs(T - centres) / radii)[:, below].max()
         assert 0.5 < share < 1.0 + 1e-3
-        basis = Basis((0.5 * at, 2.0 * at, 2.0 * at), (), 10.0 * at, 1, limits.beyond)
+        basis = MultiplierBasis((0.5 * at, 2.0 * at, 2.0 * at), (), 10.0 * at, 1, limits.beyond)
         h = basis.values(v)
         seen = np.trapezoid((h * T[:, None]).real, v, axis=0)
         assert np.abs(seen).max() < 1e-3 * np.trapezoid(np.abs(h * T[:, None]), v, axis=0).max()
@@ -158,15 +158,13 @@ def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_
     )
 
 
-def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(folder: Path) -> None:
     run = read_run(folder / "run")
-    monkeypatch.setattr(structured_robustness, "FRESH", 40)
+    options = BoxCheckOptions(fresh=40)
     for more, survived in ((1.0, 40), (1.05, 0)):
         bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
         made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
-        drawn = structured_robustness.DesignOnBox(run.problem, run.theta, made).fresh_yield()
+        drawn = DesignOnBox(run.problem, run.theta, made, options).fresh_yield()
         assert drawn is not None
         assert (drawn.survived, drawn.draws) == (survived, 40)
 

@@ -24,8 +24,8 @@ from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_bandwidth import require_bandwidth, structured_value
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers

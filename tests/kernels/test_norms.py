@@ -1,5 +1,8 @@
 """The H∞ norm against documented values, closed forms, and SLICOT's AB13DD."""
 
+import json
+from pathlib import Path
+
 import control
 import numpy as np
 import pytest
@@ -8,7 +11,9 @@ from hypothesis import strategies as st
 from oracles.helpers import few
 
 from ccd_casadi.lti.norms import gains, hinf_norm
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
+
+DATA = Path(__file__).parents[1] / "data"
 
 
 def space(A: object, B: object, C: object, D: object) -> StateSpace:
@@ -97,9 +102,36 @@ def test_norm_is_attained_and_nothing_on_a_grid_is_above(seed: int) -> None:
 @given(st.integers(0, 10**6))
 def test_norm_agrees_with_ab13dd(seed: int) -> None:
     import slycot
+
     system = random_system(seed)
     n, m, p = len(system.A), system.B.shape[1], system.C.shape[0]
     theirs, _ = slycot.ab13dd(
         "C", "I", "N", "D", n, m, p, system.A, np.eye(n), system.B, system.C, system.D, tol=1e-10
     )
     assert hinf_norm(system)[0] == pytest.approx(theirs, rel=1e-7)
+
+
+def test_a_flat_maximum_far_below_the_other_poles() -> None:
+    """GS of a light chain and almost a differentiator: its maximum is at 0.16 rad/s beside a pole
+    of 1e6 rad/s, and rounding moves its eigenvalues of the Hamiltonian off the axis."""
+    mass = np.array([1.27, 1.14, 1.95]) * 0.684
+    K = sum(
+        k * np.outer(e, e)
+        for k, e in [
+            (1.83744e6, np.array([1.0, -1.0, 0.0])),
+            (2.22981e6, np.array([0.0, 1.0, -1.0])),
+        ]
+    )
+    lam, shapes = np.linalg.eigh(K / np.sqrt(np.outer(mass, mass)))
+    shapes *= np.sqrt(mass)[:, None]
+    D = shapes @ np.diag(8e-4 * np.sqrt(np.maximum(lam, 0.0))) @ shapes.T
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-K / mass[:, None], -D / mass[:, None]]])
+    B, C = np.zeros((6, 1)), np.zeros((1, 6))
+    B[3], C[0, 0] = 1.0 / mass[0], 1.0
+    G = StateSpace(A, B, C, np.zeros((1, 1)))
+    stored = json.loads((DATA / "light_chain_controller.json").read_text())
+    controller = space(*(stored[name] for name in "ABCD"))
+    loop = closed_loop(G, controller).GS
+    assert np.linalg.eigvals(loop.A).real.max() < 0.0
+    most = gains(loop, np.geomspace(1e-3, 1e2, 4001)).max()
+    assert hinf_norm(loop)[0] > most * (1.0 - 1e-9)

@@ -4,13 +4,13 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from ccd_casadi.codesign.verdict import LEAST_SHIFT
+from ccd_casadi.codesign.verdict import VerdictOptions
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.structured_problem import StructuredProblem
-from ccd_casadi.inner_problem.structured_robustness import LOOSE
+from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 
-CLOSE = 1e-6
+CLOSE, LEAST = 1e-6, VerdictOptions().least_shift
 
 
 def contradictions(result: Mapping[str, Any], problem: CoDesignProblem) -> list[str]:
@@ -29,7 +29,8 @@ def _claims(r: Mapping[str, Any], problem: CoDesignProblem) -> Iterator[tuple[bo
     yield sum(r["spent"].values()) == r["syntheses"], "spent and syntheses"
     yield 0 <= r["syntheses_to_optimum"] <= r["syntheses"], "syntheses to the optimum"
 
-    certificate, S_max = r["certificate"], problem.inner.S_max * (1.0 + LOOSE * sections)
+    loose = 1.0 + BoxCheckOptions.looseness * sections
+    certificate, S_max = r["certificate"], problem.inner.S_max * loose
     certain = checks["certificate"] and checks["constraints"]
     certain = certain and checks["second_engine"] is not False
     yield failed["certified"] == (not certain), "certified line and checks"
@@ -61,7 +62,7 @@ def _survives(
     stable, within = line["stable_shift"], line["S_max_shift"]
     yield stable[0] <= within[0] <= 0.0 <= within[1] <= stable[1], "within S_max, not stable"
     yield line["stable_damping"][0] <= 1.0 <= line["stable_damping"][1], "damping of the model"
-    narrow = stable[0] > -LEAST_SHIFT or stable[1] < LEAST_SHIFT
+    narrow = stable[0] > -LEAST or stable[1] < LEAST
     yield not (narrow and line["state"] == "passed"), "a narrow range passed"
     modulus, (down, up) = line["modulus_margin"], line["gain_margin"]
     if problem.robust is not None:

@@ -16,10 +16,8 @@ from ccd_casadi.fixed_structure.channel_structure import (
 )
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import (
-    CLOSINGS,
-    FLAT,
-    NARROW,
     Brackets,
+    PeakOptions,
     assess,
     constraints,
     hessians,
@@ -170,5 +168,6 @@ def closed(
     """The kernel's false position, interpreted, on curves of this slope to ln v."""
     patch.setattr(loop_point, "rows", lambda *places: (None, np.vectorize(slope)(places[3])))
     run = getattr(loop_point.close, "py_func", loop_point.close)
-    ends = (brackets.start, brackets.low, brackets.high)
-    return run(brackets.curve, brackets.row, brackets.row, *ends, None, (FLAT, NARROW, CLOSINGS))
+    ends, own = (brackets.start, brackets.low, brackets.high), PeakOptions()
+    rules = (own.slope, own.width, own.iterations)
+    return run(brackets.curve, brackets.row, brackets.row, *ends, None, rules)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
-from ccd_casadi.sampling import store as samples
+from ccd_casadi.sampling.store import SampleStore
 
 NOBODY = 65534
 
@@ -40,7 +40,7 @@ def _locked(folder: Path, amount: float) -> Iterator[None]:
     try:
         other.execute("pragma locking_mode = exclusive")
         other.execute("begin exclusive")
-        with patch.object(samples, "BUSY_SECONDS", 0.2):
+        with patch.object(SampleStore.__init__, "__defaults__", (0.2,)):  # s that it waits
             yield
     finally:
         other.close()

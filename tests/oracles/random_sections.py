@@ -39,11 +39,11 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
-from ccd_casadi.fixed_structure.certificate import TOLERANCE
-from ccd_casadi.fixed_structure.design import MARGIN, DesignSearch, problem_for
+from ccd_casadi.fixed_structure.certificate import CertificateOptions
+from ccd_casadi.fixed_structure.design import DesignOptions, DesignSearch, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import ascend
-from ccd_casadi.fixed_structure.loop_problem import FIRST, LoopCurve
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
 from ccd_casadi.fixed_structure.multi_start import at_its_bandwidth
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -135,7 +135,8 @@ def solved(seed: int) -> dict[str, Any]:
     design: SectionsDesign | None
     if seed % WHOLE:
         asked, design = climbed(asked, seed)
-        certified, allowed = design is not None and design.certified, 2.0 * TOLERANCE
+        certified = design is not None and design.certified
+        allowed = 2.0 * CertificateOptions.tolerance
         proof = proved(asked, design) if certified and design is not None else None
         random_too = False  # the certificate is of the set; what is proven is of the box
     else:
@@ -191,7 +192,7 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     starts = stabilising(free, at_random(free, np.exp(rng.uniform(np.log(0.03), 0.0, 24)), rng))
     if not len(starts):
         return asked, None
-    peaks = assess(free, starts[0], FIRST, depth=-50.0).peaks
+    peaks = assess(free, starts[0], LoopProblem.first_tau, depth=-50.0).peaks
     assert peaks is not None
     over = {code: float(np.exp(peaks.value[peaks.curve == code].max(initial=-np.inf)))
             for code in LoopCurve}  # fmt: skip
@@ -206,13 +207,13 @@ def climbed(asked: Case, seed: int) -> tuple[Case, SectionsDesign | None]:
     drawn["S_max"] = max(drawn["S_max"], 1.2)
     asked = replace(asked, bounds=replace(asked.bounds, **drawn))
     problem = problem_for(plants, asked.structure, asked.bounds, asked.sampling)
-    first = at_its_bandwidth(problem, starts[0], within=MARGIN)
+    first = at_its_bandwidth(problem, starts[0], within=DesignOptions.margin)
     end = ascend(problem, first, iterations=CLIMB)
-    point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, MARGIN)
+    point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, DesignOptions.margin)
     looked = end.evaluations
-    if point.assessment.violation > MARGIN:
+    if point.assessment.violation > DesignOptions.margin:
         end = ascend(problem, point, iterations=RESTORED, restoring=True, radius=0.05)
-        point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, MARGIN)
+        point = at_its_bandwidth(problem, end.point.kappa, end.point.tau, DesignOptions.margin)
         looked += end.evaluations
     search = DesignSearch(problem, plants, asked.sampling, seed=seed)
     return asked, search.designed(point, (), 1, looked)

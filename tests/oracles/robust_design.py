@@ -17,10 +17,9 @@ from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
-    LATTICE,
-    WITHIN,
     Excess,
     LoopOnBox,
+    WorstPlantOptions,
     lattice,
     worst_plants,
 )
@@ -54,7 +53,7 @@ def synthesise_robustly(
     starts: int = 12,
     seed: int = 0,
     rounds: int = 8,
-    count: int = LATTICE,
+    count: int = WorstPlantOptions.lattice,
 ) -> RobustDesign:
     """max ω_b with every bound on every plant of a box, as far as searches find none that fails.
 
@@ -71,7 +70,7 @@ def synthesise_robustly(
         heads, _ = worst_plants(loop, seed + turn, count)
         worst = heads[0]
         turn += 1
-        if worst.value <= WITHIN or turn > rounds:
+        if worst.value <= WorstPlantOptions.within or turn > rounds:
             break
         members = members + _apart(heads, members, uncertain.box)
         made = synthesise(uncertain.plants(members), structure, bounds, sampling=sampling,
@@ -80,8 +79,9 @@ def synthesise_robustly(
     proof: Proof | None = None
     if made.certified and made.controller is not None:
         points = [*lattice(uncertain, count, seed + 1000), (worst.option, worst.point)]
-        judged = certify(uncertain.plants(points), made.controller, bounds.looser(2.0 * WITHIN),
-                         sampling, integrator=structure.integrator)  # fmt: skip
+        looser = bounds.looser(2.0 * WorstPlantOptions.within)
+        judged = certify(uncertain.plants(points), made.controller, looser, sampling,
+                         integrator=structure.integrator)  # fmt: skip
         proof = prove(uncertain, structure, made.kappa, made.bandwidth, bounds, sampling)
     return RobustDesign(made, tuple(members), judged, proof)
 
@@ -95,6 +95,7 @@ def _apart(
     for head in heads:
         near = [np.abs((head.point - point) / width).max(initial=0.0) for option, point in
                 (*members, *found) if option == head.option]  # fmt: skip
-        if head.value > WITHIN and (not near or min(near) > 1e-4) and len(found) < AT_ONCE:
+        apart = not near or min(near) > 1e-4
+        if head.value > WorstPlantOptions.within and apart and len(found) < AT_ONCE:
             found.append((head.option, head.point))
     return found

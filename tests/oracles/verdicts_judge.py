@@ -183,8 +183,9 @@ def _claims(
         low, high = case["theta"][name]["lower"], case["theta"][name]["upper"]
         width = 1e-9 * (high - low)
         yield low - width <= value <= high + width, f"{name} outside of its bounds"
-    limit = case["plant"]["mass_limit"]
-    yield float(chain.mass.sum() * at[0]) <= limit * (1.0 + CLOSE), "the constraint is not met"
+    limit, claimed = case["plant"]["mass_limit"], r["checks"]["constraints"] is not False
+    met = float(chain.mass.sum() * at[0]) <= limit * (1.0 + CLOSE)
+    yield met or not claimed, "the constraint is not met"
 
     def of(shift: float = 0.0, factor: float = 1.0) -> Loop:
         return Loop(chain.at(*at, shift, factor), data, loop)

@@ -13,7 +13,7 @@ from oracles.helpers import HZ, problem
 
 import ccd_casadi as ccd
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.formulation import FormulationResult, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, RunTerms
 from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.design import SectionsOutcome
@@ -98,7 +98,7 @@ def test_inner_designs_show_their_figures() -> None:
 
 
 def test_a_solution_without_a_design_says_why() -> None:
-    result = infeasible_dict(Terms("lifted", 1e-3, 0), "too <heavy>", {"samples": 1})
+    result = infeasible_dict(RunTerms("lifted", 1e-3, 0), "too <heavy>", {"samples": 1})
     text = shown(Solution(result, FormulationResult(), None))
     assert "No feasible design: too <heavy>" in text
 

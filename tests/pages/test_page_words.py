@@ -14,7 +14,7 @@ from ccd_casadi import reporting
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.formulation import Iterate
+from ccd_casadi.codesign.formulation import FormulationRound
 from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.deployment.outcome import against, deployed_line
 from ccd_casadi.deployment.robust_set import MemberLoop
@@ -78,7 +78,7 @@ def test_what_varies_is_shown_as_a_range_and_not_as_a_value() -> None:
 def test_rounds_are_shown_in_the_units_of_the_page() -> None:
     problem = problem_of(load_case("runs/rib_stage.toml"))
     theta = problem.start
-    item = Iterate(theta, HZ * 60.0, HZ * 55.0, -2.0, -1.9, 0.05, 0.1, 0.1)
+    item = FormulationRound(theta, HZ * 60.0, HZ * 55.0, -2.0, -1.9, 0.05, 0.1, 0.1)
     result = {"surrogate_bandwidth_hz": 60.0, "bandwidth_hz": 60.0 * (1.0 - 1e-9), "objective": -2}
     words, table = history_blocks([item], problem, result, theta, 1e-3, lifted=False)
     assert table.head[1] == "h (mm)"

@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccd_casadi.lti.loop import sampled
+from ccd_casadi.lti.state_space import StateSpace, balanced, closed_loop
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import FREE, Perturbation, modal_plant, without_hidden_rigid_modes
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rigid_modes import natural_modes
+from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
@@ -110,3 +111,53 @@ def test_free_motions_that_nothing_drives_or_reads_are_left_out_and_halves_are_r
     read = replace(system, C=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     with pytest.raises(PlantError, match="measured and not driven"):
         without_hidden_rigid_modes(modal_plant(read, FREE))
+
+
+@settings(max_examples=10, deadline=None)
+@given(link=st.floats(8.0, 10.0), node=st.floats(-6.0, -4.0), soft=st.floats(6.0, 8.0))
+def test_the_loop_of_the_plant_as_written_keeps_its_slow_poles_beside_a_stiff_link(
+    link, node, soft
+) -> None:
+    """In the chain's own coordinates double precision says that loops of this kind are unstable."""
+    masses, stiffness = np.array([100.0, 70.0, 10.0**node]), 10.0 ** np.array([soft, link])
+    system = chain(masses, stiffness, damping=0.01)
+    crossing = 0.1 * np.sqrt(10.0**soft / 100.0)
+    gain, lead, slow = 170.0 * crossing**2, 3.0, 1e-3 * crossing
+    roll_off = 1e8
+    rates = np.array([0.0, lead * crossing, roll_off])
+    read = [
+        gain / lead * slow,
+        -gain * (lead - 1.0 / lead) * lead * crossing,
+        gain * lead * roll_off,
+    ]
+    controller = StateSpace(-np.diag(rates), np.ones((3, 1)), np.array([read]), np.zeros((1, 1)))
+    loop = closed_loop(as_written(system), controller)
+    found = np.linalg.eigvals(balanced(loop.A, loop.B_r, loop.C_y)[0])
+    with mp.workdps(60):
+        root = [mp.sqrt(m) for m in masses.tolist()]
+        scaled = mp.matrix(3, 3)
+        for i, j in np.ndindex(3, 3):
+            scaled[i, j] = mp.mpf(system.K[i, j]) / root[i] / root[j]
+        lam, shapes = mp.eigsy(scaled)
+        A = mp.zeros(9, 9)
+        for i in range(3):
+            omega = mp.sqrt(lam[i]) if i else mp.mpf(0)
+            A[i, 3 + i], A[3 + i, i], A[3 + i, 3 + i] = 1, -(omega**2), -2 * omega / 100
+            seen = shapes[0, i] / root[0]
+            for k in range(3):
+                A[3 + i, 6 + k], A[6 + k, i] = seen * mp.mpf(float(read[k])), -seen
+        for k in range(3):
+            A[6 + k, 6 + k] = -mp.mpf(float(rates[k]))
+        true = np.array([complex(pole) for pole in mp.eig(A, right=False)])
+    slowest = true[np.argsort(np.abs(true))[:3]]
+    off = np.abs(slowest[:, None] - found).min(axis=1) / np.abs(slowest)
+    assert off.max() < 1e-4
+
+
+def test_a_rigid_body_that_is_weakly_driven_and_measured_is_kept() -> None:
+    """A thousandth of the other's force and reading is a motion that the loop has to hold."""
+    for share, kept in ((1e-3, 2), (1e-6, 2), (1e-12, 1)):
+        sides = np.diag([1.0, share])
+        T, back = driven_and_measured(sides, sides)
+        assert T.shape == (2, kept)
+        assert back @ T == pytest.approx(np.eye(kept))

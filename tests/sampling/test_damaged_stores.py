@@ -16,7 +16,6 @@ from oracles.rows import sample
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.retraining import stored_designs
-from ccd_casadi.sampling import store as module
 from ccd_casadi.sampling.store import SampleStore, SampleStoreError
 from ccd_casadi.support.errors import UserError
 
@@ -163,19 +162,18 @@ def test_a_read_only_store_is_told() -> None:
     assert len(done.stdout.splitlines()) == 1
 
 
-def test_a_lock_that_lasts_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_that_lasts_is_told(tmp_path: Path) -> None:
     path = tmp_path / "s.sqlite"
     use(path)
-    monkeypatch.setattr(module, "BUSY_SECONDS", 0.2)
     holder = sqlite3.connect(path, isolation_level=None)
-    with SampleStore(path) as store:
+    with SampleStore(path, busy_seconds=0.2) as store:
         holder.execute("begin immediate")
         began = time.monotonic()
         with pytest.raises(SampleStoreError, match="another process holds it; wait or stop"):
             store.put([sample("c")])
         assert time.monotonic() - began > 0.15, "it waited for as long as it was told"
         with pytest.raises(SampleStoreError, match="another process holds it"):
-            SampleStore(path)
+            SampleStore(path, busy_seconds=0.2)
         assert store.count() == 2, "readers are not held up by a writer"
         holder.execute("rollback")
         store.put([sample("c")])

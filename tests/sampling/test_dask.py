@@ -4,6 +4,7 @@ import json
 import os
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from test_parallel import TaskFailure, failing, square, whereabouts
 from test_sampling import THETAS, TWO_MASS, X, table
 
 from ccd_casadi.sampling import cluster as module
-from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.sampling.cluster import Cluster, ClusterOptions
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.solve import main
@@ -87,7 +88,7 @@ def test_a_worker_with_other_numerics_is_refused(
 
 
 @pytest.mark.slow
-def test_tls_by_the_settings_of_dask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tls_by_the_settings_of_dask(tmp_path: Path) -> None:
     """The certificate is made with the command `openssl`."""
     import dask
     import distributed  # noqa: F401  # its settings must be there before they are changed
@@ -98,10 +99,9 @@ def test_tls_by_the_settings_of_dask(tmp_path: Path, monkeypatch: pytest.MonkeyP
         processes.start()
         with dask.config.set(settings), Cluster(processes.address) as cluster:
             assert sorted(cluster.map_unordered(square, range(5))) == [0, 1, 4, 9, 16]
-        monkeypatch.setattr(module, "CONNECT_SECONDS", 1.0)
         for address in (processes.address, processes.address.replace("tls", "tcp")):
             with pytest.raises(UserError, match="no Dask scheduler answers there"):
-                Cluster(address).__enter__()
+                Cluster(address, options=ClusterOptions(connect=1.0)).__enter__()
     finally:
         processes.kill()
 
@@ -127,7 +127,8 @@ def test_what_is_no_address_is_told(
 def test_an_address_where_nothing_answers_is_told(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.3)
+    hasty = partial(Cluster, options=ClusterOptions(connect=0.3))
+    monkeypatch.setattr(module, "Cluster", hasty)
     address = kind.format(Processes(tmp_path).port)
     words = told(address, tmp_path, capsys)
     assert re.match(rf"--scheduler {address}: no Dask scheduler answers there \(.+\); start", words)

@@ -227,7 +227,7 @@ def main(options):
 
 if __name__ == "__main__":
     exit_on_ctrl_c()
-    ahead = ["ccd_casadi.sampling.samples"] if "--seed" in sys.argv else []
+    ahead = ["ccd_casadi.sampling.inner_samples"] if "--seed" in sys.argv else []
     sys.exit(run(main, parser("parent", ""), early=lambda options: ahead))
 """
 

@@ -15,7 +15,7 @@ from oracles.helpers import HZ, INNER, problem
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.sampling import sampler as module
 from ccd_casadi.sampling import units
-from ccd_casadi.sampling.sampler import CHUNK, Sampler
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 
@@ -57,7 +57,7 @@ def test_rows_do_not_depend_on_the_number_of_workers(
     """Nor on the order that is asked for; they go out in chunks and come back in that order."""
     path, first = sampled
     order = np.random.default_rng(0).permutation(len(X))
-    assert len(X) > CHUNK
+    assert len(X) > Sampler.chunk
     with Workers(2) as workers:
         with SampleStore(tmp_path / "s.sqlite") as store:
             sampler = Sampler(problem(), store, workers)

@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
 
-from ccd_casadi.analysis.loop_figures import AROUND, _dip, bandwidth_dip, loop_entry
+from ccd_casadi.analysis.loop_figures import LoopFigureOptions, _dip, bandwidth_dip, loop_entry
 from ccd_casadi.fixed_structure import ShapeEnd, Structure, certify, synthesise_sections
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.text import HZ
 
-HALF_POWER = 2.0**-0.5
+AROUND, HALF_POWER = LoopFigureOptions().places, 2.0**-0.5
 EASY = replace(BOUNDS, S_max=2.0, compliance_max=None)
 
 

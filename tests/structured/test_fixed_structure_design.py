@@ -18,7 +18,7 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
-from ccd_casadi.fixed_structure.certificate import judged
+from ccd_casadi.fixed_structure.certificate import CertificateOptions, judged
 from ccd_casadi.fixed_structure.design import bandwidth_envelope, in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, optimality
@@ -355,13 +355,12 @@ def test_a_mode_without_damping_that_no_force_drives_is_never_stable(
         assert not judged([other.plant_si()], K, bounds, sampling, False)[0].stable
 
 
-def test_plants_judged_together_are_each_as_alone(design, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plants_judged_together_are_each_as_alone(design) -> None:
     """Of several sizes and in batches, an unstable one among them, with one grid for each."""
     louder = replace(design.controller, C=3.0 * design.controller.C)
     plants = [plant(0.01 * i, 0.5 + 0.1 * i) for i in range(4)]
     plants[2:2] = [rigid(110.0), plant(-0.3, 1e-3)]
-    monkeypatch.setattr(certificate, "AT_ONCE", 3)
-    together = certify(plants, louder, EASY).plants
+    together = certify(plants, louder, EASY, options=CertificateOptions(batch=3)).plants
     assert {one.stable for one in together} == {True, False}
     for own, one in zip(plants, together, strict=True):
         alone = certify([own], louder, EASY).plants[0]

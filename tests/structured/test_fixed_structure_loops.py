@@ -31,7 +31,7 @@ from ccd_casadi.fixed_structure.figures import (
     to_theta,
 )
 from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
-from ccd_casadi.fixed_structure.loop_problem import LoopCurve, Places
+from ccd_casadi.fixed_structure.loop_problem import LoopCurve, RowPlaces
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.kernels import sections
 from ccd_casadi.lti.loop import in_w, sampled
@@ -367,5 +367,5 @@ def test_a_plant_that_answers_nothing_raises_nothing() -> None:
     v = np.geomspace(0.01, 1.0, 5)
     found = by_curve(silent, kappa, 0.0, silent.curves, np.tile(v, (1, 1)))
     assert (found[LoopCurve.T] == -np.inf).all()
-    rows = Places(np.full(5, int(LoopCurve.T)), np.zeros(5, int), v)
+    rows = RowPlaces(np.full(5, int(LoopCurve.T)), np.zeros(5, int), v)
     assert not np.isfinite(evaluate_rows(silent, kappa, 0.0, rows)[1]).any()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from ccd_casadi.fixed_structure.figures import hidden_peaks, local_peaks
-from ccd_casadi.fixed_structure.loop_problem import PER_DECADE
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.kernels.sections import LoopCurve
 
-STEP = np.log(10.0) / PER_DECADE
+STEP = np.log(10.0) / LoopProblem.per_decade
 HALF = 0.09  # of the distance of the maxima in ln v: one in five shows on no grid
 
 

@@ -3,10 +3,12 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from oracles.fixed_structure_channels import loop as channel_loop
 from oracles.fixed_structure_channels import plant as channel_plant
 from oracles.fixed_structure_loops import BOUNDS, FAST, loop, plant
+from scipy.linalg import block_diag
 
 from ccd_casadi.codesign.verdict import OwnSet, State, survives
 from ccd_casadi.fixed_structure import Sampling, Structure, certificate, certify
@@ -14,8 +16,9 @@ from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.fixed_structure.box_proof import NOT_APPLICABLE, Proof, ProofOutcome
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
-from ccd_casadi.synthesis.second_engine import AGREEMENT, compared, second_opinion
+from ccd_casadi.synthesis.second_engine import SecondEngineOptions, compared, second_opinion
 
+AGREEMENT = SecondEngineOptions().agreement
 WIDE = replace(BOUNDS, S_max=50.0, weighted_level=1e6, compliance_max=1.0)
 
 
@@ -108,3 +111,24 @@ def test_what_no_proof_covers_is_not_passed(outcome: ProofOutcome) -> None:
             assert proof.unasked in proof.words
         assert ("proven for the whole box" in proof.words) == proof.proven
     assert survives(None, S_max=2.0, own=OwnSet.SEARCHED).state is State.UNKNOWN
+
+
+@pytest.mark.parametrize("resonance_hz", [300.0, 620.0])
+def test_a_compliance_that_a_resonance_beyond_half_the_rate_exceeds_is_said_with_its_frequency(
+    resonance_hz: float,
+) -> None:
+    """Sampled at 1 kHz a mode at 620 Hz answers to the loop as one at 380 Hz, to a force at 620."""
+    w, low, zeta, mass = 2.0 * np.pi * resonance_hz, 2.0 * np.pi * 100.0, 1e-3, 25.0
+    A = block_diag([[0.0, 1.0], [-(low**2), -0.6 * low]], [[0.0, 1.0], [-(w**2), -2.0 * zeta * w]])
+    B, C = np.array([[0.0, 1.0, 0.0, 1.0]]).T, np.array([[1.0 / mass, 0.0, 0.3 / mass, 0.0]])
+    K = StateSpace(*(np.array([[part]]) for part in (0.0, 1.0, 1e4, 0.0)))
+    bounds = replace(WIDE, compliance_max=1e-9)
+    found = certify([StateSpace(A, B, C, np.zeros((1, 1)))], K, bounds, Sampling(1e3))
+    G = 0.3 / mass / (2.0 * zeta * w**2)  # the mode's own answer at its resonance
+    if resonance_hz < 500.0:
+        assert found.plants[0].GS_beyond == 0.0
+        assert "beyond half" not in found.words
+    else:
+        assert found.plants[0].GS_beyond == pytest.approx(w, rel=1e-3)
+        assert found.plants[0].GS < 1.1 * G
+        assert "620 Hz, at a resonance beyond half the sampling rate" in found.words

@@ -11,13 +11,15 @@ from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Struc
 from ccd_casadi.fixed_structure.affine import Affine
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
-from ccd_casadi.fixed_structure.certificate_responses import LoopTable
+from ccd_casadi.fixed_structure.certificate_responses import LoopResponses
 from ccd_casadi.fixed_structure.channel_structure import given_decoupling
-from ccd_casadi.fixed_structure.discs import Terms, quotient
+from ccd_casadi.fixed_structure.discs import RankOneDiscs, quotient
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.loop import sampled, tustin
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.support.arrays import Array
 
 # two carts of two masses, a weak spring and unlike places of drive and reading between them
 STIFFNESS = 7e7 * np.array(
@@ -98,12 +100,11 @@ def test_an_unstable_plant_of_the_box_is_never_proven() -> None:
     assert not proof.stable
 
 
-@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
-@pytest.mark.parametrize("integrator", [True, False])
-def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
-    """|S| at random points of random boxes lies between what is said of the box."""
-    rng, count, unit = np.random.default_rng(5), 60, 4000.0
-    own = replace(ONE, integrator=integrator)
+def random_boxes(
+    sampling: Sampling | None, integrator: bool, count: int, rng: np.random.Generator
+) -> tuple[LoopFamily, Boxes, Array, StateSpace]:
+    """Loops, boxes of any size, their ends (2, 1 + n_p, N) in rad/s and SI, and the controller."""
+    unit, own = 4000.0, replace(ONE, integrator=integrator)
     part = KAPPA[: len(ONE.names)] if integrator else np.delete(KAPPA[: len(ONE.names)], 1)
     structure = replace(BOTH, structures=(own, own))
     kappa = np.tile(part, 2)
@@ -127,7 +128,17 @@ def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
     scale = np.ones((len(low), 1))
     scale[0] = (period or 1.0) / unit
     chart = np.full(count, Chart.LOW if sampling is None else Chart.SAMPLED)
-    found = family.enclose(Boxes(chart, low * scale, high * scale))
+    return family, Boxes(chart, low * scale, high * scale), np.array([low, high]), K
+
+
+@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
+@pytest.mark.parametrize("integrator", [True, False])
+def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
+    """|S| at random points of random boxes lies between what is said of the box."""
+    rng, count = np.random.default_rng(5), 60
+    family, boxes, (low, high), K = random_boxes(sampling, integrator, count, rng)
+    bounds = family.bounds
+    found = family.enclose(boxes)
     assert found.bounded.mean() > 0.5
     assert bounds.weighted_level is not None
     assert bounds.compliance_max is not None
@@ -145,16 +156,75 @@ def test_discs_hold_over_boxes_of_any_size(sampling, integrator) -> None:
             G, own = free, K
             if sampling is not None:
                 G, own = sampled(free, sampling.period, sampling.delay), tustin(K, sampling.period)
-            table = LoopTable([free], [G], own, sampling, bounds).at(np.array([0]), at[None, :1])
+            table = LoopResponses([free], [G], own, sampling, bounds)
+            table = table.at(np.array([0]), at[None, :1])
             for name, (figure, limit) in limits.items():
                 k, value = found.names.index(name), table[figure][0, 0] / limit
                 assert found.lowest[k, i] * (1.0 - 1e-9) <= value
                 assert value <= found.highest[k, i] * (1.0 + 1e-9)
-    small = (half / wide).max(axis=0) < 1e-3
+    wide = np.concatenate([[1.0], BOX.box[1] - BOX.box[0]])[:, None]
+    small = (0.5 * (high - low) / wide).max(axis=0) < 1e-3
     for name in limits:
         k = found.names.index(name)
         spread = found.highest[k] / np.maximum(found.lowest[k], 1e-9)
         assert not small.any() or np.median(spread[small]) < 1.5
+
+
+@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
+@pytest.mark.parametrize("integrator", [True, False])
+def test_every_numbered_inequality_holds_for_loops_in_the_discs(sampling, integrator) -> None:
+    """(2) to (19) of `LoopFamily.enclose`, whatever enters them drawn to its limit; those of one
+    quantity are nearly reached."""
+    rng = np.random.default_rng(11)
+    family, boxes, *_ = random_boxes(sampling, integrator, 60, rng)
+    loop = family._loop_discs(boxes)
+    kept = np.flatnonzero(loop.good)
+    assert len(kept) > 30
+
+    def size(M: np.ndarray) -> Array:
+        return np.linalg.norm(M, 2, axis=(1, 2))
+
+    def drawn_to(radius: Array, rows: int, columns: int) -> np.ndarray:
+        M = rng.normal(size=(2, len(kept), rows, columns))
+        M = M[0] + 1j * M[1]
+        return M * (radius[kept] / size(M))[:, None, None]
+
+    def on_edges(middle: np.ndarray, radius: Array) -> np.ndarray:
+        turns = np.exp(2j * np.pi * rng.random(radius[kept].shape))
+        return middle[kept] + radius[kept] * turns
+
+    (p, m), K, eye = (loop.c.shape[1], loop.b.shape[1]), loop.K[kept], np.eye(loop.c.shape[1])
+    figures = {"S": loop.S(), "T": loop.T(), "KS": loop.KS(), "GS": loop.GS()}
+    closest: dict[str, Array] = {}
+    for _ in range(30):
+        g = on_edges(loop.m, loop.r)
+        M_d = loop.y[kept, None, None] * eye + (loop.c.T * g[:, None]) @ (loop.b @ K)
+        G = (loop.c.T * on_edges(loop.g, loop.e)[:, None]) @ loop.b
+        delta_y = on_edges(0.0 * loop.y, loop.delta_y)[:, None, None]
+        y = loop.y[kept, None, None] + delta_y
+        M_1 = M_d + delta_y * eye + drawn_to(loop.delta_GK, p, p)
+        W_d, W_1 = np.linalg.inv(M_d), np.linalg.inv(M_1)
+        S_d, S_1 = loop.y[kept, None, None] * W_d, y * W_1
+        T_1E = (eye - S_1) @ drawn_to(loop.epsilon, p, p)
+        W_2 = np.linalg.inv(M_1 @ (eye + T_1E))
+        K_2 = K + drawn_to(loop.epsilon, m, m) @ K + drawn_to(loop.grain, m, p)
+        bounded = {
+            "a": W_d, "a1": W_1, "t": eye - S_d, "u1": S_1 - S_d, "q": T_1E, "a2": W_2,
+            "u2": y * W_2 - S_d,
+        }  # fmt: skip
+        lost = 1e-14 * size(M_1) * size(W_1) * (1.0 + size(S_1))  # in the differences of S here
+        for name, M in bounded.items():
+            bound = getattr(loop, name)[kept]
+            assert (size(M) <= bound * (1.0 + 1e-9) + lost).all(), name
+            closest[name] = np.maximum(closest.get(name, 0.0), size(M) / bound)
+        assert (size(W_d - loop.W[kept]) <= (loop.a * loop.d)[kept] * (1.0 + 1e-9)).all()
+        at = {"S": y * W_2, "T": eye - y * W_2, "KS": K_2 @ W_2, "GS": y * (W_2 @ G)}
+        for name, M in at.items():
+            upper, lower, *_ = (part[kept] for part in figures[name])
+            assert (lower <= size(M) * (1.0 + 1e-9)).all(), name
+            assert (size(M) <= upper * (1.0 + 1e-9)).all(), name
+    for name in ("a", "a1", "t", "q", "a2"):
+        assert np.median(closest[name]) > 0.95, name  # 0.992 at least
 
 
 def test_a_disc_holds_a_quotient_even_where_its_denominator_may_be_nought() -> None:
@@ -206,7 +276,7 @@ def wild(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def moved(
-    terms: Terms, delta: np.ndarray, A: np.ndarray, B: np.ndarray, Z: np.ndarray
+    terms: RankOneDiscs, delta: np.ndarray, A: np.ndarray, B: np.ndarray, Z: np.ndarray
 ) -> np.ndarray:
     """e of f where every w_i is δ_i times what it sees: (1 + Σ δ_i c_i q_iᵀ)u = ..."""
     delta = terms.radius * delta
@@ -223,14 +293,14 @@ def test_the_largest_norm_holds_for_all_discs_and_of_one_is_reached(p) -> None:
     rows[:, n // 2 :], inputs[: n // 2] = 0.0, 0.0
     size = np.linalg.norm(columns, axis=1) * np.linalg.norm(rows, axis=2)
     radius = 0.6 * rng.dirichlet(np.ones(n), count) / np.where(size > 0.0, size, 1.0)
-    terms = Terms(columns, rows, radius, inputs)
+    terms = RankOneDiscs(columns, rows, radius, inputs)
     most = terms.largest(A, B, Z)
     assert np.isfinite(most).all()
     for _ in range(300):
         e = moved(terms, np.exp(2j * np.pi * rng.random((count, n))), A, B, Z)
         assert (np.linalg.norm(e, 2, axis=(1, 2)) <= most).all()
     # one disc alone, far from small: what is said is what a point of its edge shows
-    one = Terms(columns[:1], rows[:, :1], 0.9 / size[:, :1], inputs[:1])
+    one = RankOneDiscs(columns[:1], rows[:, :1], 0.9 / size[:, :1], inputs[:1])
     seen = np.max([np.linalg.norm(moved(one, turn, A, B, Z), 2, axis=(1, 2))
                    for turn in np.exp(1j * ANGLES)], axis=0)  # fmt: skip
     most = one.largest(A, B, Z)
@@ -241,14 +311,14 @@ def test_the_largest_norm_holds_for_all_discs_and_of_one_is_reached(p) -> None:
 def test_where_a_disc_makes_the_loop_singular_no_norm_is_found() -> None:
     for n in (1, 2):
         eye, radii = np.tile(np.eye(n), (3, 1, 1)), np.array([[0.99], [1.0], [1.01]])
-        found = Terms(np.eye(n), -eye, np.tile(radii, n)).largest(eye, eye, eye)
+        found = RankOneDiscs(np.eye(n), -eye, np.tile(radii, n)).largest(eye, eye, eye)
         assert 100.0 * (1.0 - 1e-9) <= found[0] <= 115.0  # 112.8 of two, which are not one disc
         assert np.isinf(found[1:]).all()
 
 
 def test_channels_that_are_apart_count_apart() -> None:
     A, one = np.diag([2.0, 1.0])[None] + 0j, np.eye(2)[None]
-    terms = Terms(np.eye(2), 0.0 * one, np.array([[0.3, 0.9]]), np.eye(2))
+    terms = RankOneDiscs(np.eye(2), 0.0 * one, np.array([[0.3, 0.9]]), np.eye(2))
     assert terms.largest(A, one, one) == pytest.approx([2.3], rel=1e-2)
 
 

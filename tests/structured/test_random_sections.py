@@ -9,7 +9,7 @@ from oracles import random_sections
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop import closed_loops
-from ccd_casadi.fixed_structure.loop_problem import FIRST
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 
 
@@ -46,4 +46,4 @@ def test_loops_of_real_poles_alone_are_looked_at() -> None:
     real = drawn[(poles.imag == 0.0).all(axis=(1, 2))]
     assert len(real)
     for kappa in real:
-        assert assess(problem, kappa, FIRST).stable
+        assert assess(problem, kappa, LoopProblem.first_tau).stable

@@ -13,8 +13,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.multi_start import (
-    SAME,
-    WITHIN,
+    MultiStartOptions,
     at_its_bandwidth,
     distinct,
     reinserted,
@@ -87,7 +86,7 @@ def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
         point = started(problem, kappa)
         assert np.log(problem.low) <= point.tau <= problem.begin(kappa)
         lowered = point.tau < problem.begin(kappa)
-        assert not lowered or point.assessment.violation <= WITHIN
+        assert not lowered or point.assessment.violation <= MultiStartOptions.violation
         inside += lowered
     assert inside
 
@@ -130,13 +129,13 @@ def test_an_optimum_in_which_a_pair_cancels_is_left() -> None:
     more = problem_for([plant()], Structure(lead=2, biquads=0), EASY)
     kappa = np.insert(one.kappa, 4, np.full(2, more.box[0, 1]))
     end = at_its_bandwidth(more, kappa)
-    assert end.tau == pytest.approx(one.tau, abs=SAME)
+    assert end.tau == pytest.approx(one.tau, abs=MultiStartOptions.same)
     (moved,) = reinserted(more, [end])
     start = at_its_bandwidth(more, moved)
-    assert start.tau == pytest.approx(one.tau, abs=SAME)
+    assert start.tau == pytest.approx(one.tau, abs=MultiStartOptions.same)
     better = ascend(more, start, iterations=40).point
-    assert better.assessment.violation <= WITHIN
-    assert better.tau > one.tau + 5.0 * SAME
+    assert better.assessment.violation <= MultiStartOptions.violation
+    assert better.tau > one.tau + 5.0 * MultiStartOptions.same
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])

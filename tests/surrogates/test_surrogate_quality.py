@@ -24,7 +24,7 @@ from ccd_casadi.codesign.retraining import stored_designs
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.reporting.landscape import table_trust, trust_figure
-from ccd_casadi.sampling.samples import quantity_sample
+from ccd_casadi.sampling.inner_samples import quantity_sample
 from ccd_casadi.sampling.store import SampleStore
 from surrogates import GaussianProcess, design, errors, fit
 from surrogates.quality import Missed

@@ -13,10 +13,11 @@ from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.synthesis import second_engine
-from ccd_casadi.synthesis.second_engine import AGREEMENT, second_opinion, weighted_loop
+from ccd_casadi.synthesis.second_engine import SecondEngineOptions, second_opinion, weighted_loop
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 THETA = (60.0, 62.0)
+AGREEMENT = SecondEngineOptions().agreement
 
 
 def made(disturbance: float = 0.0, point: tuple[float, float] = (300.0, 60.0)) -> Design:

@@ -17,10 +17,10 @@ from ccd_casadi.inner_problem.objective import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.optim.kkt import (
-    ACTIVE,
     ActiveSet,
     FirstOrder,
     KktCertificate,
+    KktOptions,
     active_set,
     hessian_products,
     reduced_curvature,
@@ -30,8 +30,18 @@ from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.derivatives import LocalPeak, Sensitivities, local_peaks_with_gradients
 
 HALF_POWER = -0.5 * np.log(2.0)
-SAME_PEAK = 0.03  # ln ω within which peaks of one plant are one
 OTHER_PEAK = "S_max at "  # begins the name of a local peak besides the largest
+
+
+@dataclass(frozen=True)
+class LiftedKktOptions:
+    """Numbers of the optimality conditions of the true lifted problem."""
+
+    same_peak: float = 0.03  # ln ω within which peaks of one plant are one
+    inside: float = 2e-9  # ln: what a step aims inside S_max and S_low, to end feasible as given
+    smooth: float = 1e-6  # residual up to which nothing indicates a kink
+    accuracy: float = 1e-8  # of the terms of J, which may cancel: of ω_b
+    longest_newton_step: float = 1e-3  # of the box: a longer one leaves the basin
 
 
 @dataclass(frozen=True)
@@ -55,8 +65,9 @@ class PeakConstraint:
 
 
 def other_peaks(
-    problem: CoDesignProblem, x: Array, design: Sensitivities, band: float
-) -> tuple[PeakConstraint, ...]:
+    problem: CoDesignProblem, x: Array, design: Sensitivities, band: float,
+    options: LiftedKktOptions = LiftedKktOptions(),
+) -> tuple[PeakConstraint, ...]:  # fmt: skip
     """Local peaks of S besides the largest that are within `band` (ln) of what they must not pass.
 
     That is S_max anywhere, on every plant of a robust set, and -3 dB below ω_b, which is the first
@@ -71,7 +82,7 @@ def other_peaks(
         least=float(np.exp(min(HALF_POWER, np.log(problem.inner.S_max)) - band)),
     )
     S_max, found = np.log(problem.inner.S_max), []
-    norm = _of_norm(peaks, design)
+    norm = _of_norm(peaks, design, options.same_peak)
     for peak in peaks:
         if peak is norm:
             continue  # the row S_max itself
@@ -90,29 +101,24 @@ def other_peaks(
     return tuple(found)
 
 
-def _of_norm(peaks: tuple[LocalPeak, ...], design: Sensitivities) -> LocalPeak | None:
+def _of_norm(peaks: tuple[LocalPeak, ...], design: Sensitivities, same: float) -> LocalPeak | None:
     """The peak that ‖S‖∞ is read at: by its plant and frequency, as others may be as high."""
     if design.made is None:
         return None
     place = np.log(design.figures.sensitivity_peak_frequency)
     own = [peak for peak in peaks if peak.member == design.made.worst]
     nearest = min(own, key=lambda peak: abs(np.log(peak.omega) - place), default=None)
-    far = nearest is None or abs(np.log(nearest.omega) - place) > SAME_PEAK
+    far = nearest is None or abs(np.log(nearest.omega) - place) > same
     return None if far else nearest
-
-
-INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is feasible as given
-SMOOTH = 1e-6  # residual up to which nothing speaks of a kink
-LEVEL = 1e-8  # of the terms of J, which may cancel: what ω_b is good to
-NEAR = 1e-3  # of the box: a longer step is not of the basin that the residual spoke of
 
 
 @dataclass(frozen=True)
 class TrueDesign:
-    """The true design at x = (θ, ln ω_S, ln ω_T), and by what it is held against others."""
+    """The true design at x = (θ, ln ω_S, ln ω_T), and by what it is compared with others."""
 
     truth: TrueQuantities
     x: Array
+    options: LiftedKktOptions = LiftedKktOptions()
 
     @property
     def problem(self) -> CoDesignProblem:
@@ -157,15 +163,17 @@ class TrueDesign:
 
     def rise(self, other: "TrueDesign") -> float:
         """By how much another J is larger, over what J may differ by and still be the same."""
-        return (other.objective - self.objective) / (LEVEL * sum(map(abs, self.terms)))
+        return (other.objective - self.objective) / (
+            self.options.accuracy * sum(map(abs, self.terms))
+        )
 
 
 def kkt_certificate(here: TrueDesign, second: bool = False) -> KktCertificate:
     """First-order residuals; the second-order check too where `second` lets it synthesise."""
     plain = _certificate(here, active_at(here), second)
-    if plain.stationarity <= SMOOTH:
+    if plain.stationarity <= here.options.smooth:
         return plain
-    others = other_peaks(here.problem, here.x, here.design, ACTIVE)
+    others = other_peaks(here.problem, here.x, here.design, KktOptions.active)
     if not others:  # with them a difference of gradients would mix one peak with another
         return plain
     return _certificate(here, active_at(here, others), False)
@@ -220,7 +228,7 @@ def lagrangian_hessian(
     bounds = lifted_bounds(here.problem)
 
     def slope(z: Array) -> Array | None:
-        there = TrueDesign(here.truth, bounds.lower + bounds.width * z)
+        there = replace(here, x=bounds.lower + bounds.width * z)
         if not there.design.figures.certified:
             return None
         found = first_order(there)
@@ -232,7 +240,8 @@ def lagrangian_hessian(
 
 
 def newton_step(here: TrueDesign) -> Array | None:
-    """Where the step ends; None without a positive reduced Hessian, or past `NEAR`.
+    """Where the step ends; None without a positive reduced Hessian, or where
+    the step is too long.
 
     From a design whose certificate is of the plain conditions. The Hessian takes two true designs
     per free direction. Nocedal and Wright, Numerical Optimization, 18.1.
@@ -240,7 +249,7 @@ def newton_step(here: TrueDesign) -> Array | None:
     problem, mu, at = here.problem, here.kkt.multipliers, active_at(here)
     held = np.array([mu[name] > 0.0 for name in at.labels], bool)
     A = at.rows[held]
-    inside = np.array([INSIDE * (name in problem.inner.bounds) for name in at.labels])
+    inside = np.array([here.options.inside * (name in problem.inner.bounds) for name in at.labels])
     aim = np.where(np.arange(held.size) < at.constraints, -(at.slack + inside), 0.0)[held]
     Z = null_space(A)
     if Z.shape[1] == 0:  # a vertex
@@ -255,7 +264,7 @@ def newton_step(here: TrueDesign) -> Array | None:
     d = -Z @ np.linalg.solve(H, Z.T @ at.gradient)
     if A.size:
         d = d + np.linalg.lstsq(A, aim, rcond=None)[0]
-    if np.abs(d).max() > NEAR:
+    if np.abs(d).max() > here.options.longest_newton_step:
         return None
     bounds = lifted_bounds(problem)
     return np.clip(here.x + bounds.width * d, *bounds)

@@ -25,7 +25,7 @@ class SynthesisCounts:
 
     @contextmanager
     def on(self, purpose: str) -> Iterator[None]:
-        """What is asked for inside is spent on this."""
+        """Count the syntheses inside for this purpose."""
         before, self.purpose = self.purpose, purpose
         try:
             yield
@@ -54,10 +54,22 @@ class SynthesisCounts:
 
 
 def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
-    """Of result.json: all syntheses, by purpose, and those without which the design was not there.
+    """Of result.json: all syntheses, by purpose, and those that led to the design.
 
-    A global check over the box that `moved` the design is part of the way to it.
+    Parameters
+    ----------
+    spent : mapping
+        Syntheses by purpose.
+    moved : bool
+        Whether the global check over the box changed the design: then it led to it too.
 
+    Returns
+    -------
+    dict
+        `syntheses`, `syntheses_to_optimum` and `spent`.
+
+    Examples
+    --------
     >>> spent_entry({"samples": 24, "box_look": 600})["syntheses_to_optimum"]
     24
     """
@@ -67,16 +79,40 @@ def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]
 
 
 def with_all_spent(result: Mapping[str, Any], spent: Mapping[str, int]) -> dict[str, Any]:
-    """A result of a run of several searches with what all of them took."""
+    """A result of a run of several searches with the syntheses of all of them.
+
+    Parameters
+    ----------
+    result : mapping
+        result.json of the search that is kept.
+    spent : mapping
+        Syntheses of all, by purpose.
+
+    Returns
+    -------
+    dict
+        result.json of the run.
+    """
     moved = bool(result.get("box_look", {}).get("moved"))  # the global check led to the design
     return {**result, **spent_entry(spent, moved)}
 
 
 @dataclass(frozen=True)
 class InnerSample(InnerValue):
-    """With where it is reached, and what binds.
+    """The true value at θ, where it is reached, and what binds.
 
-    An infeasible one says what falls short, and by how much (ln) at least: `violation`.
+    Attributes
+    ----------
+    omega_S, omega_T : float
+        rad/s; NaN with a fixed structure.
+    active : tuple of str
+        Bounds on the loop that bind.
+    shortfall, violation : str, float
+        Of an infeasible one: what falls short, and by how much (ln) at least.
+    syntheses : int
+        That it took.
+    kappa : tuple of float
+        κ of a fixed structure, SI.
     """
 
     omega_S: float
@@ -85,7 +121,7 @@ class InnerSample(InnerValue):
     shortfall: str
     violation: float
     syntheses: int
-    kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
+    kappa: tuple[float, ...] = ()
 
     @property
     def x(self) -> tuple[float, ...]:
@@ -100,9 +136,18 @@ class InnerSample(InnerValue):
 
 @dataclass(frozen=True)
 class QuantitySample:
-    """Values and their derivatives (…, n_θ + 2) at x = (θ, ln ω_S, ln ω_T); NaN if uncertified.
+    """Values of one synthesis and their derivatives; NaN if it is not certified.
 
-    As `Sensitivities` has them: ω_b, ln of the bounded figures, γ_opt last.
+    Attributes
+    ----------
+    x : tuple of float
+        (θ, ln ω_S, ln ω_T), SI.
+    values : (k,) array
+        ω_b in rad/s, ln of each bounded figure, γ_opt.
+    gradients : (k, n_θ + 2) array
+        Of the values to x.
+    certified : bool
+        Whether the design may be used.
     """
 
     x: tuple[float, ...]
@@ -118,7 +163,26 @@ def sample_of(
     seconds: float,
     design: Sensitivities | None = None,
 ) -> Sample:
-    """One synthesis as a row of the store, with derivatives where `design` has them."""
+    """One synthesis as a row of the store.
+
+    Parameters
+    ----------
+    key : str
+        Of the row.
+    theta : tuple of float
+        SI.
+    figures : DesignFigures
+        SI.
+    seconds : float
+        That it took.
+    design : Sensitivities
+        With the derivatives, if these are kept.
+
+    Returns
+    -------
+    Sample
+        SI.
+    """
     gradients = None
     if design is not None:
         whole = np.hstack([design.to_theta, design.to_break_frequencies])
@@ -150,7 +214,22 @@ def inner_sample(theta: tuple[float, ...], payload: dict) -> InnerSample:
 
 
 def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerBounds) -> QuantitySample:
-    """A row with derivatives as values at x, of the figures that `inner` bounds."""
+    """A row with derivatives as values at x.
+
+    Parameters
+    ----------
+    x : tuple of float
+        (θ, ln ω_S, ln ω_T), SI.
+    sample : Sample
+        With gradients.
+    inner : InnerBounds
+        Which figures are bounded.
+
+    Returns
+    -------
+    QuantitySample
+        See there.
+    """
     assert sample.gradients is not None
     with np.errstate(invalid="ignore", divide="ignore"):
         bounded = np.log([getattr(sample, name) for name, _ in inner.bounds.values()])

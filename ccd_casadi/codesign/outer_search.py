@@ -6,42 +6,57 @@ from itertools import count
 
 import numpy as np
 
-from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, Terms
+from ccd_casadi.codesign.formulation import FormulationResult, GlobalCheck, RunTerms
 from ccd_casadi.codesign.formulations import Direct, Formulation
 from ccd_casadi.codesign.gaussian_processes import surrogate_quality
-from ccd_casadi.codesign.outer import End, Outer, Place, is_expensive
+from ccd_casadi.codesign.outer import Outer, Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.sampling.samples import InnerSample
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.support.arrays import Array
 from surrogates import design
 from surrogates.fitting import recalibrated
 
-POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
-FEW = 8  # points at most where each takes a search over the controller, seconds or more
-BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
-NEARLY = 0.03  # relative: an end of a range that is worse by less may lead to a better optimum
-CLUSTER = 0.02  # of the box: inner problems that are closer are one look
-SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
-PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
-TRIES = 4
+
+@dataclass(frozen=True)
+class GlobalCheckOptions:
+    """Numbers of the global check over the box; lengths are shares of the box of θ."""
+
+    points_per_start: int = 8  # for every local solve: each costs as much as an inner problem
+    expensive_points: int = 8  # at most where each takes a search over the controller
+    better: float = 1e-6  # relative: a J that is lower by less is the same optimum
+    nearly: float = (
+        0.03  # relative: an end of a range that is worse by less may lead to a better one
+    )
+    cluster: float = 0.02  # inner problems that are closer count once
+    same: float = 1e-3  # a point this close to the optimum starts nothing new
+    perturbation: float = (
+        0.02  # standard deviation of starts around an optimum that is not stationary
+    )
+    perturbed_starts: int = 4
 
 
-def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
-    """Look at `points` θ over the box for a J lower than that of an end.
+def global_check(
+    outer: Outer,
+    end: PolishedDesign,
+    points: int,
+    seed: int,
+    options: GlobalCheckOptions = GlobalCheckOptions(),
+) -> GlobalCheck:
+    """Evaluate `points` θ over the box for a J lower than that of an end.
 
-    What the run has solved itself counts among the points. Where these are dear no more than `FEW`
-    are made up, away from what is known: the way to one optimum says nothing of another.
+    What the run has solved itself counts among the points. Where these are expensive only a few
+    are added, away from what is known: the way to one optimum says nothing of another.
     """
     problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
     if not outer.global_check_is_cheap:
-        points = min(points, FEW)
-    samples, fresh = _spread(outer, points, seed) if points else ([], 0)
+        points = min(points, options.expensive_points)
+    samples, fresh = _spread(outer, points, seed, options.cluster) if points else ([], 0)
     able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
     values = np.array([objective_of(problem, sample) for sample in able])
-    margin = BETTER * abs(J) if np.isfinite(J) else 0.0
+    margin = options.better * abs(J) if np.isfinite(J) else 0.0
     best_x, best, begun = None, J, 0
     stationary = np.isfinite(J) and end.kkt.stationarity <= outer.kkt_level
     known = [Place(end.x, J, bool(stationary))]
@@ -56,14 +71,14 @@ def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
                 if place.objective < best - margin:
                     best_x, best = place.x, place.objective
 
-    lowest, others = _starts(problem, able, values, here)
+    lowest, others = _starts(problem, able, values, here, options.same)
     starts = [*lowest, *others] if outer.global_check_is_cheap else lowest
     if outer.global_check_is_cheap or is_expensive(problem):
-        starts = starts[: -(-points // POINTS_A_START)]
+        starts = starts[: -(-points // options.points_per_start)]
     solve_from(starts)
-    ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
+    ends = _ends(problem, here if best_x is None else outer.theta_of(best_x), options.same)
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
-        room = 0.0 if is_expensive(problem) else NEARLY * abs(best)
+        room = 0.0 if is_expensive(problem) else options.nearly * abs(best)
         least = np.inf if outer.global_check_is_cheap else best + room
         ends = outer.promising(ends, least)
         found = outer.sampler.values(ends, "search from the ends of each parameter")
@@ -81,24 +96,27 @@ def global_check(outer: Outer, end: End, points: int, seed: int) -> GlobalCheck:
     )
 
 
-def _ends(problem: CoDesignProblem, theta: Array) -> Array:
-    """θ (k, n_θ) with one parameter at a time at an end of its range, but for where it is so."""
+def _ends(problem: CoDesignProblem, theta: Array, same: float) -> Array:
+    """θ (k, n_θ) with one parameter at a time at an end of its range, where it is not there yet."""
     lower, upper = box(problem)
     found = [
         np.where(np.arange(len(theta)) == i, end, theta)
         for i in range(len(theta))
         for end in (lower[i], upper[i])
-        if abs(end - theta[i]) > SAME * (upper[i] - lower[i])
+        if abs(end - theta[i]) > same * (upper[i] - lower[i])
     ]
     allowed = [x for x in found if not violated(problem, x)]
     return np.array(allowed).reshape(-1, len(theta))
 
 
-def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
+def perturbed(
+    outer: Outer, x: Array, seed: int, options: GlobalCheckOptions = GlobalCheckOptions()
+) -> list[Array]:
     """Ends of local solves from a few starts around x: the last try where x is not stationary."""
     here, bounds = outer.theta_of(x), box(outer.problem)
     found = []
-    for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, here.size)):
+    shape = options.perturbed_starts, here.size
+    for step in np.random.default_rng(seed).normal(0.0, options.perturbation, shape):
         theta = np.clip(here + step * bounds.width, *bounds)
         sample = outer.sampler.values(theta, "perturbed starts")[0]
         place = outer.local_solve(sample, (), 1e-13) if sample.feasible else None
@@ -107,13 +125,13 @@ def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
     return found
 
 
-def _spread(outer: Outer, points: int, seed: int) -> tuple[list[InnerSample], int]:
+def _spread(outer: Outer, points: int, seed: int, cluster: float) -> tuple[list[InnerSample], int]:
     """The inner problems that the run has solved, and as many more as make up `points`; where these
-    are dear, those of a spread set that none is near. Second, how many these are."""
+    are expensive, those of a spread set that none is near. Second, how many these are."""
     sampler, bounds = outer.sampler, box(outer.problem)
     known: list[InnerSample] = []
     for sample in sampler.solved.values():
-        if all(bounds.away(sample.theta, one.theta) > CLUSTER for one in known):
+        if all(bounds.away(sample.theta, one.theta) > cluster for one in known):
             known.append(sample)
     spread = design("sobol", *bounds, points, seed)
     if outer.global_check_is_cheap:
@@ -130,7 +148,11 @@ def _spread(outer: Outer, points: int, seed: int) -> tuple[list[InnerSample], in
 
 
 def _starts(
-    problem: CoDesignProblem, samples: Sequence[InnerSample], values: Array, theta: Array
+    problem: CoDesignProblem,
+    samples: Sequence[InnerSample],
+    values: Array,
+    theta: Array,
+    same: float = GlobalCheckOptions().same,
 ) -> tuple[list[InnerSample], list[InnerSample]]:
     """Samples with a lower J than their n_θ + 1 nearest neighbours, and the rest; away from θ, the
     best first."""
@@ -141,12 +163,9 @@ def _starts(
     others: list[InnerSample] = []
     for i in np.argsort(values):
         near = np.argsort(bounds.away(thetas, thetas[i]))[1 : theta.size + 2]
-        if bounds.away(thetas[i], theta) > SAME:
+        if bounds.away(thetas[i], theta) > same:
             (lowest if (values[near] >= values[i]).all() else others).append(samples[i])
     return lowest, others
-
-
-AGAIN = 3  # times at most that a search begins with what the inner problem has found better
 
 
 @dataclass(frozen=True)
@@ -155,15 +174,16 @@ class SearchResult:
 
     outer: Outer
     outcome: FormulationResult
-    end: End | None
+    end: PolishedDesign | None
     rounds: int = 1
     look: GlobalCheck | None = None
 
 
 def search_outer(
-    outer: Outer, formulation: Formulation, seed: int, known: Array | None = None
+    outer: Outer, formulation: Formulation, seed: int, known: Array | None = None, most: int = 3
 ) -> SearchResult:
-    """Formulation and polish, again with what the inner problem at the end has found better.
+    """Formulation and polish, again with what the inner problem at the end has found better: `most`
+    rounds.
 
     `known`: x of a local optimum that another search has found, in place of the formulation.
     """
@@ -177,10 +197,10 @@ def search_outer(
         if outcome.x is None:
             return SearchResult(outer, outcome, None, rounds)
         end = outer.polished(outcome.x)
-        more = None if rounds == AGAIN else outer.extended(end)
+        more = None if rounds == most else outer.extended(end)
         if more is None:
-            outcome, found, look = _looked(outer, outcome, end, formulation, seed)
-            moved = found is not end and rounds < AGAIN
+            outcome, found, look = _after_global_check(outer, outcome, end, formulation, seed)
+            moved = found is not end and rounds < most
             more, end = outer.extended(found) if moved else None, found
         if more is None:
             break
@@ -189,9 +209,13 @@ def search_outer(
     return SearchResult(outer, outcome, end, rounds, look)
 
 
-def _looked(
-    outer: Outer, outcome: FormulationResult, end: End, formulation: Formulation, seed: int
-) -> tuple[FormulationResult, End, GlobalCheck]:
+def _after_global_check(
+    outer: Outer,
+    outcome: FormulationResult,
+    end: PolishedDesign,
+    formulation: Formulation,
+    seed: int,
+) -> tuple[FormulationResult, PolishedDesign, GlobalCheck]:
     """After the global check over the box, and a last try where the end is not stationary."""
     with outer.sampler.spent.on("box_look"):
         look = global_check(outer, end, formulation.box_points, seed)
@@ -212,7 +236,7 @@ def _looked(
     return outcome, end, look
 
 
-def best_end(ends: Sequence[End], level: float, tolerance: float) -> End:
+def best_end(ends: Sequence[PolishedDesign], level: float, tolerance: float) -> PolishedDesign:
     """The least J of those that are feasible; within the tolerance of it one that is stationary.
 
     A better design that is not stationary is kept: to call a worse one optimal would be untrue.
@@ -225,7 +249,7 @@ def best_end(ends: Sequence[End], level: float, tolerance: float) -> End:
     return min(stationary or near, key=lambda item: item.objective)
 
 
-def conclude(search: SearchResult, terms: Terms) -> Solution:
+def conclude(search: SearchResult, terms: RunTerms) -> Solution:
     """The design judged, and result.json."""
     outcome, sampler = search.outcome, search.outer.sampler
     spent = sampler.spent
@@ -240,7 +264,7 @@ def conclude(search: SearchResult, terms: Terms) -> Solution:
     return Solution(result, outcome, verified, quality)
 
 
-def conclude_at(outer: Outer, outcome: FormulationResult, terms: Terms) -> Solution:
+def conclude_at(outer: Outer, outcome: FormulationResult, terms: RunTerms) -> Solution:
     """An outcome polished and judged as it is, without a global check over the box."""
     end = None if outcome.x is None else outer.polished(outcome.x)
     return conclude(SearchResult(outer, outcome, end), terms)

@@ -14,18 +14,25 @@ from ccd_casadi.codesign.result_entries import bound_words
 from ccd_casadi.inner_problem.objective import objective_of, violated
 from ccd_casadi.inner_problem.problem import box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.inner_samples import InnerSample
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import InnerSample
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.terminal import Progress
 from ccd_casadi.support.text import HZ, versions
 from surrogates import design
 
-LOOKED_AT = 64  # θ whose hardware cost is computed, for its range
-FLAT = 1e-9  # relative: a hardware cost that moves less over the box is constant
-EXTREME = 1e-3  # share of the range of one that counts as much as all of the other, at the ends
-ROUNDED = 1e-9  # relative: a design that is faster by less is as fast
-GAIN = 1e-3  # of the triangle between two neighbours: a lesser one is none
+
+@dataclass(frozen=True)
+class FrontOptions:
+    """Numbers of the search for a front."""
+
+    costs: int = 64  # θ whose hardware cost is computed, for its range
+    constant: float = 1e-9  # relative: a hardware cost that moves less over the box is constant
+    end_weight: float = (
+        1e-3  # at the ends: share of the range of one that counts as all of the other
+    )
+    same: float = 1e-9  # relative: a design that is faster by less is as fast
+    least_gain: float = 1e-3  # of the triangle between two neighbours
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +50,17 @@ class FrontPoint(InnerSample):
 
 @dataclass(frozen=True)
 class Front:
-    """The points in order of their cost. `whole`: no weights lead to a design between two of them,
-    as far as local solves find."""
+    """The front of hardware cost against what J counts of the controller.
+
+    Attributes
+    ----------
+    points : tuple of FrontPoint
+        In order of their cost.
+    whole : bool
+        Whether no weights lead to a design between two of them, as far as local solves find.
+    syntheses : int
+        Spent by the sampler up to then.
+    """
 
     points: tuple[FrontPoint, ...]
     whole: bool
@@ -58,16 +74,40 @@ def pareto_front(
     *,
     points: int = 20,
     seed: int = 0,
+    options: FrontOptions = FrontOptions(),
 ) -> Front:
-    """The front by at most so many `points`, from `own`, the θ of a good design, on.
+    """Find the designs that are the best for some weights w1 and w2.
 
-    Raises UserError where the hardware cost is constant, or `own` has no certified design.
+    Parameters
+    ----------
+    outer_of : function of Sampler
+        The outer problem of a sampler.
+    sampler : Sampler
+        Of the problem; its weights do not count.
+    own : (n_θ,) sequence
+        θ of a good design, SI.
+    points : int
+        At most.
+    seed : int
+        Of the θ whose hardware cost gives its range.
+    options : FrontOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    Front
+        Its convex part: what no weights lead to is not found.
+
+    Raises
+    ------
+    UserError
+        The hardware cost is constant, or `own` has no certified design.
     """
     problem, plant = sampler.problem, plant_of(sampler.problem)
-    looked = np.vstack([own, design("sobol", *box(problem), LOOKED_AT, seed)])
+    looked = np.vstack([own, design("sobol", *box(problem), options.costs, seed)])
     costs = np.array([hardware_cost(plant, theta) for theta in looked])
     f_range = np.ptp(costs)
-    if not f_range > FLAT * np.abs(costs).max():
+    if not f_range > options.constant * np.abs(costs).max():
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
     allowed = [i for i in np.argsort(costs) if not violated(problem, looked[i])]
     begun = sampler.values(looked[[0, allowed[0], allowed[-1]]], "starts of the front")
@@ -90,10 +130,12 @@ def pareto_front(
         best = min(found, key=lambda place: place.objective)
         return _point(sampler, outer.theta_of(best.x), best.stationary)
 
-    straight: set[tuple[FrontPoint, FrontPoint]] = set()
+    extreme, straight = options.end_weight, set[tuple[FrontPoint, FrontPoint]]()
     with Progress(points, "points of the front", quiet=sampler.quiet) as progress:
-        ends = [solved(w / f_range, EXTREME / w / size, begun) for w in (1.0, EXTREME)]
-        kept = hull([_point(sampler, own, True), *(end for end in ends if end is not None)])
+        ends = [solved(w / f_range, extreme / w / size, begun) for w in (1.0, extreme)]
+        kept = hull(
+            [_point(sampler, own, True), *(end for end in ends if end is not None)], options.same
+        )
         while True:
             progress.advance(len(kept) - progress.done)
             pairs = [pair for pair in pairwise(kept) if pair not in straight]
@@ -105,10 +147,10 @@ def pareto_front(
             widest = int(np.argmax([np.hypot(up / size, along / f_range) for up, along in steps]))
             (light, fast), (a, b) = pairs[widest], steps[widest]
             new = solved(a, b, sampler.values(np.array([light.theta, fast.theta])))
-            if new is None or _gain(light, new, a, b) <= GAIN:
+            if new is None or _gain(light, new, a, b) <= options.least_gain:
                 straight.add((light, fast))
             else:
-                kept = hull([*kept, new])
+                kept = hull([*kept, new], options.same)
 
 
 def _gain(light: FrontPoint, new: FrontPoint, a: float, b: float) -> float:
@@ -129,13 +171,13 @@ def _point(sampler: Sampler, theta: Sequence[float] | np.ndarray, stationary: bo
     )
 
 
-def hull(points: Sequence[FrontPoint]) -> list[FrontPoint]:
+def hull(points: Sequence[FrontPoint], same: float = FrontOptions().same) -> list[FrontPoint]:
     """In order of cost, the points that are the best of all for some weights."""
     kept: list[FrontPoint] = []
     for point in sorted(points, key=lambda point: (point.hardware_cost, -point.worth)):
         if not np.isfinite(point.worth):
             continue
-        if kept and point.worth - kept[-1].worth <= ROUNDED * abs(point.worth):
+        if kept and point.worth - kept[-1].worth <= same * abs(point.worth):
             continue
         while len(kept) > 1 and _slope(kept[-2], kept[-1]) <= _slope(kept[-1], point):
             kept.pop()
@@ -148,18 +190,53 @@ def _slope(light: FrontPoint, fast: FrontPoint) -> float:
 
 
 def natural_hz(run: FinishedRun) -> tuple[float, ...]:
-    """Natural frequencies of the flexible modes at the design, Hz."""
+    """Natural frequencies of the flexible modes at the design.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        A run with a design.
+
+    Returns
+    -------
+    tuple of float
+        Hz, ascending.
+    """
     modal = run.modal()
     return tuple(float(w) / HZ for w in modal.natural[~modal.rigid])
 
 
 def bandwidth_of(run: FinishedRun) -> float:
-    """ω_b in rad/s: with sections that of every plant of the set."""
+    """ω_b of a run's design: with sections that of every plant of the set.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        A run with a design.
+
+    Returns
+    -------
+    float
+        rad/s.
+    """
     return HZ * float(run.result["bandwidth_hz"])
 
 
 def insight_dict(run: FinishedRun, front: Front, responses: PostOptimal) -> dict[str, Any]:
-    """insight.json: SI, and Hz where a key says so."""
+    """The content of insight.json: SI, and Hz where a key says so.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        The run with the optimum.
+    front, responses : Front, PostOptimal
+        What was found of it.
+
+    Returns
+    -------
+    dict
+        JSON values.
+    """
     names = run.problem.names
     points = [
         {

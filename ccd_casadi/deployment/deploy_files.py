@@ -18,15 +18,28 @@ from ccd_casadi.support.text import HZ, versions
 from ccd_casadi.synthesis.interchange import DesignFile, named_controller, named_plant, write_mat
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
-NEAR = 1.5  # ratio of zero to pole frequency up to which a pair is a notch
-FAR = 5.0  # ratio beyond which a complex pair of zeros and one of poles are not one section
-RESONANT = 0.3  # damping ratio of a pole pair under which it is no roll-off
-SLOW = 0.02  # share of ω_b under which a pole acts as an integrator
+
+@dataclass(frozen=True)
+class SectionOptions:
+    """Limits between kinds of sections."""
+
+    notch_ratio: float = 1.5  # of zero to pole frequency, up to which a pair is a notch
+    pair_ratio: float = 5.0  # beyond it a pair of zeros and one of poles are not one section
+    resonant: float = 0.3  # damping ratio of a pole pair under which it is not a roll-off
+    slow: float = 0.02  # share of ω_b under which a pole acts as an integrator
 
 
 @dataclass(frozen=True)
 class Root:
-    """A real root (damping None) or a pair: 1 + s/ω, or 1 + 2ζ s/ω + s²/ω²; ω = 2π·hz."""
+    """A real root, 1 + s/ω, or a pair of roots, 1 + 2ζ s/ω + s²/ω².
+
+    Attributes
+    ----------
+    hz : float
+        ω/2π, Hz; negative of an unstable real root.
+    damping : float or None
+        ζ; None of a real root.
+    """
 
     hz: float
     damping: float | None = None
@@ -59,16 +72,34 @@ class Sections:
     sections: tuple[Section, ...]
 
 
-def sections_of(K: StateSpace, bandwidth: float) -> Sections:
-    """The sections of a scalar K(s) with K(0) finite and not zero; ω_b in rad/s tells slow poles.
+def sections_of(
+    K: StateSpace, bandwidth: float, options: SectionOptions = SectionOptions()
+) -> Sections:
+    """The sections of a scalar controller.
 
     Complex zeros are paired with the complex poles nearest to them on a logarithmic scale, those
-    left over with two real poles, real zeros with real poles; the rest stands alone, far zeros
+    left over with two real poles, real zeros with real poles; the rest remains single, far zeros
     (which reduction puts above every frequency of use) among it.
+
+    Parameters
+    ----------
+    K : StateSpace
+        K(s) in SI; K(0) is finite and not zero.
+    bandwidth : float
+        ω_b in rad/s, by which poles are slow.
+    options : SectionOptions
+        Numbers of the method.
+
+    Returns
+    -------
+    Sections
+        Slowest pole first.
     """
     poles, zeros = _roots(K.poles), _roots(K.zeros(float(np.abs(K.poles).max())))
     gain = float((K.D - K.C @ np.linalg.solve(K.A, K.B))[0, 0])
-    pairs: list[tuple[Root | None, Root | None]] = [*_matched(zeros, poles, True, FAR)]
+    pairs: list[tuple[Root | None, Root | None]] = [
+        *_matched(zeros, poles, True, options.pair_ratio)
+    ]
     for zero in [z for z in zeros if z.damping is not None]:
         partner = _two_real(poles)
         if partner is not None:
@@ -76,7 +107,7 @@ def sections_of(K: StateSpace, bandwidth: float) -> Sections:
             pairs.append((zero, partner))
     pairs += _matched(zeros, poles, False)
     pairs += [*((zero, None) for zero in zeros), *((None, pole) for pole in poles)]
-    found = [_section(zero, pole, bandwidth / HZ) for zero, pole in pairs]
+    found = [_section(zero, pole, bandwidth / HZ, options) for zero, pole in pairs]
     found.sort(key=lambda s: abs((s.pole or s.zero or Root(0.0)).hz))
     at = K.response(np.array([bandwidth]))[0]
     return Sections(gain, float(abs(at[0, 0])), tuple(found))
@@ -127,24 +158,26 @@ def _two_real(roots: list[Root]) -> Root | None:
     return None
 
 
-def _section(zero: Root | None, pole: Root | None, bandwidth_hz: float) -> Section:
+def _section(
+    zero: Root | None, pole: Root | None, bandwidth_hz: float, options: SectionOptions
+) -> Section:
     if zero is None or pole is None:
         root = zero or pole
         assert root is not None
         order = "first-order" if root.damping is None else "second-order"
         if pole is None:
             return Section(f"{order} zero", zero, None)
-        if root.damping is not None and abs(root.damping) < RESONANT:
+        if root.damping is not None and abs(root.damping) < options.resonant:
             return Section("resonance", None, pole)
-        slow = root.damping is None and abs(root.hz) < SLOW * bandwidth_hz
+        slow = root.damping is None and abs(root.hz) < options.slow * bandwidth_hz
         return Section("integrator" if slow else f"{order} roll-off", None, pole)
     if zero.damping is None or pole.damping is None:
-        if abs(pole.hz) < SLOW * bandwidth_hz:
+        if abs(pole.hz) < options.slow * bandwidth_hz:
             return Section("integrator with zero", zero, pole)
         return Section("lead" if abs(zero.hz) < abs(pole.hz) else "lag", zero, pole)
     at_zero = 1j * HZ * np.array([zero.hz])
     depth = abs(zero.response(at_zero) / pole.response(at_zero))[0]
-    if 1.0 / NEAR < zero.hz / pole.hz < NEAR:
+    if 1.0 / options.notch_ratio < zero.hz / pole.hz < options.notch_ratio:
         kind = "notch" if abs(zero.damping) < abs(pole.damping) else "inverse notch"
         return Section(kind, zero, pole, float(20.0 * np.log10(max(depth, 1e-300))))
     return Section("complex lead" if zero.hz < pole.hz else "complex lag", zero, pole)

@@ -16,15 +16,34 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.as_written import as_written
 from ccd_casadi.plants.modal import NOMINAL
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.synthesis.second_engine import NOT_COMPARED, Comparison, compared, second_opinion
+from ccd_casadi.synthesis.second_engine import (
+    NOT_COMPARED,
+    EngineComparison,
+    compared,
+    second_opinion,
+)
 from ccd_casadi.synthesis.synthesis import Design
 
 
 def written_plants(
     problem: CoDesignProblem, theta: Sequence[float], shifts: int | None = None
 ) -> list[StateSpace]:
-    """The model at θ and the plants of a mixed-sensitivity design's set, as they were written;
-    with so many `shifts` of its resonances."""
+    """The model at θ and the plants of a mixed-sensitivity design's set, as they were written.
+
+    Parameters
+    ----------
+    problem : CoDesignProblem
+        With the plant and its set.
+    theta : (n_θ,) sequence
+        SI.
+    shifts : int or None
+        The number of shifts of its resonances; None: the set's own.
+
+    Returns
+    -------
+    list of StateSpace
+        The model first; SI, u in and y out.
+    """
     system, robust = mechanics(plant_of(problem), theta, derivatives=False), problem.robust
     places = () if robust is None else robust.perturbations(shifts)
     others = [off for off in places if off != NOMINAL]
@@ -48,7 +67,7 @@ def judge_on_model(
 
 def second_on_weighted(
     problem: CoDesignProblem, theta: Sequence[float], design: Design
-) -> Comparison:
+) -> EngineComparison:
     """Of mixed sensitivity: the norm that γ was reached with on the plant of the design, and the
     largest ‖S‖∞ and ‖GS‖∞ of its set."""
     figures = design.figures
@@ -67,7 +86,7 @@ def second_on_weighted(
 
 def second_on_set(
     problem: CoDesignProblem, theta: Sequence[float], design: SectionsDesign
-) -> Comparison:
+) -> EngineComparison:
     """Of a fixed structure: ‖S‖∞, and those of KS and T, of a continuous loop of GS too, on every
     plant that its certificate is of, as the loop runs."""
     judged, K = design.certificate, design.controller
