@@ -23,8 +23,6 @@ from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rigid_modes import driven_and_measured, natural_modes, numbered
 from ccd_casadi.support.arrays import Array
 
-STIFF = 1e7  # λ_max/λ_min from which on the modes are the coordinates
-
 
 def as_written(
     system: Mechanics,
@@ -34,6 +32,7 @@ def as_written(
     damping: float = 1.0,
     gain: float = 0.0,
     rigid_modes: int | None = None,
+    stiff: float = 1e7,
 ) -> StateSpace:
     """The state space of a plant's matrices, on or off the model.
 
@@ -45,6 +44,9 @@ def as_written(
         s, s_i in the order of the modes' numbers, d and g; of a given D the matrix is kept.
     rigid_modes : int, optional
         How many there are, where the case states it.
+    stiff : float
+        λ_max/λ_min of the flexible modes above which these are the coordinates: rounding would
+        cost the low ones their digits.
 
     Returns
     -------
@@ -67,8 +69,8 @@ def as_written(
     D = damping * (system.D + (pushes * (2.0 * zeta * ratio * np.sqrt(lam))) @ pushes.T)
     M, B, C = system.M, (1.0 + gain) * system.B, system.C
     sides, soft = _seen(shapes, rigid, B, C), lam[~rigid]
-    stiff = bool(len(soft)) and soft.max() > STIFF * soft.min()
-    if sides is None and stiff:
+    spread = bool(len(soft)) and soft.max() > stiff * soft.min()
+    if sides is None and spread:
         sides = shapes, shapes
     if sides is not None:
         left, right = sides
