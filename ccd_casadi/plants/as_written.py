@@ -76,7 +76,7 @@ def as_written(
         left, right = sides
         M, K, D = (left.T @ part @ right for part in (M, K, D))
         B, C = left.T @ B, C @ right
-    if stiff:  # exactly, where products with K would lose it
+    if spread:  # exactly, where products with K would lose it
         M, K = (
             np.eye(len(M)),
             np.diag(np.append(np.zeros(len(M) - len(soft)), (ratio**2 * lam)[~rigid])),
