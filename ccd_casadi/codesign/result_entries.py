@@ -14,7 +14,7 @@ from ccd_casadi.codesign.verdict import OwnSet
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.bounds import BINDS, key_words, kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.fixed_structure.certificate import CertificateOptions
+from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.kinds import LoopBudget, kind_of, loop_budget
@@ -167,7 +167,7 @@ def _source(item: SourceFigures, whole: BudgetFigures) -> dict[str, Any]:
     }
 
 
-WORST = 1.0 + CertificateOptions.tolerance  # figure over bound that the judge counts as met
+WORST = 1.0 + JudgeOptions.tolerance  # figure over bound that the judge counts as met
 
 
 def design_dict(

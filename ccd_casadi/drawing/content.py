@@ -399,7 +399,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class VerdictLine:
+class VerdictRow:
     """A line of a run's verdict.
 
     Attributes
@@ -419,7 +419,7 @@ class VerdictLine:
 class Verdict:
     """The lines of a verdict."""
 
-    lines: tuple[VerdictLine, ...]
+    lines: tuple[VerdictRow, ...]
 
 
 @dataclass(frozen=True)
@@ -436,7 +436,7 @@ class Head:
         Circumstances.
     lead : str
         The conclusion.
-    verdict : tuple of VerdictLine
+    verdict : tuple of VerdictRow
     decision : str
         What to do, or the answer, in a sentence or two.
     """
@@ -447,7 +447,7 @@ class Head:
     reason: str
     meta: str
     lead: str
-    verdict: tuple[VerdictLine, ...] = ()
+    verdict: tuple[VerdictRow, ...] = ()
     decision: str = ""
 
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CertificateOptions:
+class JudgeOptions:
     """Numbers of the judge.
 
     Attributes
@@ -127,7 +127,7 @@ def certify(
     *,
     integrator: bool = True,
     workers: Pool | None = None,
-    options: CertificateOptions = CertificateOptions(),
+    options: JudgeOptions = JudgeOptions(),
 ) -> SetCertificate:
     """Judge an SI controller on plants against the bounds, σ_max of each matrix.
 
@@ -140,7 +140,7 @@ def certify(
         With the bounds of single channels. The shape counts from 0 on, or from ω_low.
     sampling, workers : Sampling, Pool, optional
         None: a continuous loop; the plants are spread over them.
-    options : CertificateOptions
+    options : JudgeOptions
 
     Returns
     -------
@@ -198,7 +198,7 @@ def judged(
     bounds: Bounds,
     sampling: Sampling | None,
     integrator: bool,
-    options: CertificateOptions = CertificateOptions(),
+    options: JudgeOptions = JudgeOptions(),
 ) -> list[PlantFigures]:
     """The figures of every plant's loop; the plants have matrices of one size."""
     free = [_balanced(plant) for plant in plants]
@@ -317,7 +317,7 @@ def _raised(
 
 
 def _compliance_beyond(
-    table: LoopResponses, plants: Sequence[StateSpace], options: CertificateOptions
+    table: LoopResponses, plants: Sequence[StateSpace], options: JudgeOptions
 ) -> tuple[Array, Array]:
     """|S G| of every plant (P,) beyond half the rate, at its resonances there, and their ω: a force
     of such a frequency moves it by G, and its samples are those of a slower one."""

@@ -20,7 +20,6 @@ from ccd_casadi.fixed_structure.channel_structure import (
     is_decoupled,
 )
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
-from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
@@ -28,6 +27,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Problem,
     RowPlaces,
 )
+from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -15,7 +15,6 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import box_of, composite_problem
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Envelope, Point, ascend, envelope_of, optimality
-from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.multi_start import (
     BandwidthOptimum,
@@ -28,6 +27,7 @@ from ccd_casadi.fixed_structure.multi_start import (
     reinserted,
     run_race,
 )
+from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, redrawn, stabilising
 from ccd_casadi.fixed_structure.structure import ParameterKind, Structure
 from ccd_casadi.lti.loop import Sampling

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Columns,
@@ -16,6 +15,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     LoopProblem,
     RowPlaces,
 )
+from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops
 from ccd_casadi.kernels.loop_grid import NONE, Answers, maxima, merged, second, unseen
 from ccd_casadi.kernels.loop_point import LoopArrays, close, levels, rows
 from ccd_casadi.kernels.modes import form_slopes

@@ -18,7 +18,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import (
-    CertificateOptions,
+    JudgeOptions,
     SetCertificate,
     as_run,
     certify,
@@ -135,7 +135,7 @@ def judge_loops(
     Judgement
         With the claimed bandwidth over the judge's among its figures.
     """
-    tolerance = CertificateOptions.tolerance
+    tolerance = JudgeOptions.tolerance
     omega = np.geomspace(options.lowest, 0.999, options.frequencies) * np.pi / sampling.period
     K, own_K = coded.response(omega), as_run(controller, sampling).response(omega)
     off = float((np.linalg.norm(K - own_K, 2, (1, 2)) / np.linalg.norm(own_K, 2, (1, 2))).max())
@@ -193,7 +193,7 @@ def judge_lines(
     shares = S / np.minimum(np.sqrt(0.5) * x * room, bounds.S_max)
     figures = {"S_max": float(S.max()) / bounds.S_max, "bandwidth": float(shares.max())}
     broken = [f"{name} by {100.0 * (ratio - 1.0):.2g} %" for name, ratio in figures.items()
-              if not ratio <= 1.0 + CertificateOptions.tolerance]  # fmt: skip
+              if not ratio <= 1.0 + JudgeOptions.tolerance]  # fmt: skip
     words = f"stable and within every bound on {counted(len(hz), 'line')}"
     if broken:
         words = f"exceeds its bound on {', '.join(broken)}"

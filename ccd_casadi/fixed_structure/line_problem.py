@@ -16,7 +16,6 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
-from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
@@ -25,6 +24,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     RowPlaces,
 )
 from ccd_casadi.fixed_structure.measured_loop import winding
+from ccd_casadi.fixed_structure.plant_set import PlantSet
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.loop_grid import NONE, second

@@ -20,7 +20,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.loop import PlantSet, padded
+from ccd_casadi.fixed_structure.plant_set import PlantSet, padded
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.modes import responses

@@ -46,7 +46,7 @@ class WindingOptions:
 
 
 @dataclass(frozen=True)
-class InterpolationOptions:
+class InterpolationErrorOptions:
     """Numbers of the error between two lines."""
 
     safety: float = 2.0  # factor on the error of linear interpolation
@@ -185,7 +185,7 @@ def _worst(each: Sequence[MeasuredFigures]) -> MeasuredFigures:
 
 
 def interpolation_errors(
-    hz: Array, L: np.ndarray, options: InterpolationOptions = InterpolationOptions()
+    hz: Array, L: np.ndarray, options: InterpolationErrorOptions = InterpolationErrorOptions()
 ) -> Array:
     """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f.
 
@@ -347,7 +347,10 @@ def between(measured: MeasuredResponse, L: np.ndarray, k: np.ndarray) -> Array:
 
 
 def _clearances(
-    hz: Array, L: np.ndarray, unsure: Array, options: InterpolationOptions = InterpolationOptions()
+    hz: Array,
+    L: np.ndarray,
+    unsure: Array,
+    options: InterpolationErrorOptions = InterpolationErrorOptions(),
 ) -> Array:
     """Least σ_min(I + L) between neighbouring lines (k - 1,): on the chord, less r and `unsure`.
 

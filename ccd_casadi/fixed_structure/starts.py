@@ -17,8 +17,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, channel_plant
-from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
+from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.structure import ParameterKind
 from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant

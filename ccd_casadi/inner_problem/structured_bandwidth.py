@@ -39,7 +39,7 @@ from ccd_casadi.support.text import HZ
 
 
 @dataclass(frozen=True)
-class MoveTimeOptions:
+class MoveCheckOptions:
     """Numbers of the check of a move's time on the box of plants."""
 
     lattice: int = 100  # plants
@@ -105,7 +105,7 @@ def exact_times(
         simulate(
             Loop(plant.plant_si(), K, problem.sampling), profile, axis=0,
             forces=motion.forward, window=motion.motion.window,
-            bandwidth_hz=MoveTimeOptions.steps / profile.duration,
+            bandwidth_hz=MoveCheckOptions.steps / profile.duration,
         ).settled
         for plant in plants
     ]  # fmt: skip
@@ -117,14 +117,14 @@ def latest_plant(
 ) -> tuple[float, int, Array]:
     """The exact time on the latest plant of a lattice of the box, its option and its point."""
     uncertain = uncertain_plant(problem, theta)
-    points = lattice(uncertain, MoveTimeOptions.lattice, seed)
+    points = lattice(uncertain, MoveCheckOptions.lattice, seed)
     times = exact_times(problem, motion_of(problem, theta), uncertain.plants(points), K)
     return float(times.max()), *points[int(times.argmax())]
 
 
 def stated_time(
     problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, value: float,
-    options: MoveTimeOptions = MoveTimeOptions(),
+    options: MoveCheckOptions = MoveCheckOptions(),
 ) -> tuple[float, Yield | None]:  # fmt: skip
     """Find the time of the move that a run states, and its yield.
 
@@ -133,7 +133,7 @@ def stated_time(
     problem, theta, K : CoDesignProblem, sequence of float, StateSpace
     value : float
         The smooth time on the set, s.
-    options : MoveTimeOptions
+    options : MoveCheckOptions
 
     Returns
     -------

@@ -13,7 +13,7 @@ import numpy as np
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate, certify
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
-from ccd_casadi.fixed_structure.certificate import CertificateOptions
+from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.design import SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import (
@@ -172,7 +172,7 @@ class DesignOnBox:
         kept = [
             one.stable and one.confirmed and one.bandwidth >= least
             and all(
-                share <= 1.0 + CertificateOptions.tolerance
+                share <= 1.0 + JudgeOptions.tolerance
                 for share in (bounds.shares(one) | bounds.channel_shares(one.channels)).values()
             )
             for one in found

@@ -73,10 +73,10 @@ def _own(name: str) -> Model:
     if name == "two_mass":
         return Model(two_mass_plant, theta=("m1", "m2"), sound=True)
     if name == "cad_stage":
-        from ccd_casadi.plants.cad.plant import cad_stage
+        from ccd_casadi.plants.cad.cad_stage import cad_stage
 
         return Model(cad_stage, data="morph")
-    from ccd_casadi.plants.imported.plant import modal_table, sampled_matrices
+    from ccd_casadi.plants.imported.sampled_plant import modal_table, sampled_matrices
 
     if name == "modal_table":
         return Model(modal_table, data="table")

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from ccd_casadi.analysis.loop_figures import LoopFigureOptions
 from ccd_casadi.codesign.verdict import OwnSet, State
-from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page, VerdictLine
+from ccd_casadi.drawing.content import INDEX, Chapter, Head, Links, Page, VerdictRow
 from ccd_casadi.drawing.paint import block_html, page_html, write_page
 from ccd_casadi.reporting.facts import conclusion, run_name
 from ccd_casadi.support.process_pool import Pool
@@ -59,7 +59,7 @@ class ConcernOptions:
     between_lines: float = 1.1
 
 
-def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
+def lines_of(result: Mapping[str, Any]) -> tuple[VerdictRow, ...]:
     """Read the lines of the verdict of result.json.
 
     Parameters
@@ -68,7 +68,7 @@ def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
 
     Returns
     -------
-    tuple of VerdictLine
+    tuple of VerdictRow
         Empty for a run without a design, or older than verdicts.
     """
     verdict = result.get("verdict")
@@ -78,7 +78,7 @@ def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
     for name in LINES:
         line = verdict.get(name)
         if isinstance(line, Mapping) and line.get("state") in set(State):
-            found.append(VerdictLine(name, str(line["state"]), str(line.get("words", ""))))
+            found.append(VerdictRow(name, str(line["state"]), str(line.get("words", ""))))
     return tuple(found)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from stage import BOUNDS, solid
 
-from ccd_casadi.plants.cad.plant import cad_stage
+from ccd_casadi.plants.cad.cad_stage import cad_stage
 from ccd_casadi.plants.cad.solid import kernel, load
 
 HERE = Path(__file__).parent

@@ -18,7 +18,7 @@ import numpy as np
 import plant as drive
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.loop import PlantSet
+from ccd_casadi.fixed_structure.plant_set import PlantSet
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR
 

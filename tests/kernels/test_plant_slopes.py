@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.fixed_structure.channel_structure import Decoupling
-from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.kernels.modes import form_slopes
 from ccd_casadi.lti.loop import Sampling, sampled
 from ccd_casadi.lti.state_space import strictly_proper

@@ -39,7 +39,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
-from ccd_casadi.fixed_structure.certificate import CertificateOptions
+from ccd_casadi.fixed_structure.certificate import JudgeOptions
 from ccd_casadi.fixed_structure.design import DesignOptions, DesignSearch, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import ascend
@@ -136,7 +136,7 @@ def solved(seed: int) -> dict[str, Any]:
     if seed % WHOLE:
         asked, design = climbed(asked, seed)
         certified = design is not None and design.certified
-        allowed = 2.0 * CertificateOptions.tolerance
+        allowed = 2.0 * JudgeOptions.tolerance
         proof = proved(asked, design) if certified and design is not None else None
         random_too = False  # the certificate is of the set; what is proven is of the box
     else:

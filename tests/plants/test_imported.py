@@ -22,7 +22,7 @@ from ccd_casadi.plants.imported.interpolation import ANY, InterpolatedModes
 from ccd_casadi.plants.imported.matrices import modes_of, reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table, write_modal_table
 from ccd_casadi.plants.imported.mode_matching import frames
-from ccd_casadi.plants.imported.plant import plant_of_table
+from ccd_casadi.plants.imported.sampled_plant import plant_of_table
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.support.errors import PlantError
 

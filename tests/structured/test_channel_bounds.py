@@ -35,8 +35,8 @@ from ccd_casadi.fixed_structure.channel_structure import (
 )
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
-from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
+from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

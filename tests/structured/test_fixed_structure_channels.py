@@ -34,8 +34,8 @@ from ccd_casadi.fixed_structure.channel_structure import (
 )
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import Brackets, assess, constraints, hessians, split
-from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
+from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.support.errors import PlantError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,7 +18,7 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
-from ccd_casadi.fixed_structure.certificate import CertificateOptions, judged
+from ccd_casadi.fixed_structure.certificate import JudgeOptions, judged
 from ccd_casadi.fixed_structure.design import bandwidth_envelope, in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, optimality
@@ -360,7 +360,7 @@ def test_plants_judged_together_are_each_as_alone(design) -> None:
     louder = replace(design.controller, C=3.0 * design.controller.C)
     plants = [plant(0.01 * i, 0.5 + 0.1 * i) for i in range(4)]
     plants[2:2] = [rigid(110.0), plant(-0.3, 1e-3)]
-    together = certify(plants, louder, EASY, options=CertificateOptions(batch=3)).plants
+    together = certify(plants, louder, EASY, options=JudgeOptions(batch=3)).plants
     assert {one.stable for one in together} == {True, False}
     for own, one in zip(plants, together, strict=True):
         alone = certify([own], louder, EASY).plants[0]

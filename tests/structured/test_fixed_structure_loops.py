@@ -30,8 +30,8 @@ from ccd_casadi.fixed_structure.figures import (
     hessians,
     to_theta,
 )
-from ccd_casadi.fixed_structure.loop import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, RowPlaces
+from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops, plant_set
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 from ccd_casadi.kernels import sections
 from ccd_casadi.lti.loop import in_w, sampled

@@ -13,8 +13,8 @@ from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
-from ccd_casadi.fixed_structure.loop import all_stable, closed_loops
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve
+from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.plants.plant import mechanics

@@ -15,7 +15,7 @@ from ccd_casadi.fixed_structure.box_proof import prove
 from ccd_casadi.fixed_structure.boxes import Boxes, Chart
 from ccd_casadi.fixed_structure.channel_structure import Decoupling
 from ccd_casadi.fixed_structure.enclosure import LoopFamily
-from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.kernels.modes import form_slopes
 from ccd_casadi.lti.loop import sampled

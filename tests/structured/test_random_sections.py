@@ -8,8 +8,8 @@ from oracles import random_sections
 
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.loop import closed_loops
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
+from ccd_casadi.fixed_structure.plant_set import closed_loops
 from ccd_casadi.fixed_structure.starts import at_random, stabilising
 
 

@@ -15,8 +15,8 @@ from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.channel_structure import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess, hessians
-from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopCurve, LoopProblem
+from ccd_casadi.fixed_structure.plant_set import plant_set
 from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
