@@ -142,7 +142,17 @@ def polynomial(corners: Iterable[Corner], unit: float) -> Array:
 
 
 class SourceKind(StrEnum):
-    """The place where a source enters the loop."""
+    """The place where a source enters the loop.
+
+    Attributes
+    ----------
+    FORCE
+        At the plant's input, N.
+    FLOOR_MOTION
+        Through mass, damping and stiffness at the plant's input, m or m/s².
+    SENSOR_NOISE, SETPOINT
+        At the measured output, and the reference, m.
+    """
 
     FORCE = "force"
     FLOOR_MOTION = "floor_motion"

@@ -64,13 +64,25 @@ class State(StrEnum):
 
 
 class OwnSet(StrEnum):
-    """What is known of the loop on the case's own set of plants: `set` of the line `survives`."""
+    """What is known of the loop on the case's own set of plants: `set` of the line `survives`.
+
+    Attributes
+    ----------
+    KEPT, BROKEN
+        Every plant meets the bounds, on a box by proof; a plant exceeds one, or the proof denies.
+    UNPROVEN
+        All plants that were tried meet the bounds; the proof left some open.
+    SEARCHED
+        All plants that were tried meet them; no proof applies to all.
+    NONE
+        The case names no plant but the model.
+    """
 
     KEPT = "kept"
     BROKEN = "broken"
-    UNPROVEN = "unproven"  # kept on all plants that were tried; the proof left bounds open
-    SEARCHED = "searched"  # kept on all plants that were tried; no proof applies to all its bounds
-    NONE = "none"  # the case names no plant but the model
+    UNPROVEN = "unproven"
+    SEARCHED = "searched"
+    NONE = "none"
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,17 @@ DESIGN_FILES = ("controller.json", "design.mat")
 def write_files(
     folder: Path, run: FinishedRun, found: Deployment, seed: int, moved: OnHardware | None = None
 ) -> None:
-    """deploy.json always; controller and .mat file only of a loop that is stable everywhere."""
+    """Write deploy.json, and controller and .mat file of a loop that is stable on every plant.
+
+    Parameters
+    ----------
+    folder : Path
+    run, found : FinishedRun, Deployment
+        The run and what was deployed of it.
+    seed : int
+    moved : OnHardware or None
+        The move with the compiled controller.
+    """
     machine = {"on_hardware": None if moved is None else hardware_dict(moved)}
     write_json(folder / "deploy.json", deployment_dict(run, found, seed) | machine)
     if not found.stable:

@@ -81,10 +81,18 @@ class LoopPeaks(ChannelPeaks):
 
 
 class ShapeEnd(StrEnum):
-    """The frequency up to which the shape bounds |S|."""
+    """The frequency up to which the shape bounds |S|.
 
-    S_MAX = "S_max"  # at every frequency, up to where it meets S_max; its room opens from ω_b on
-    CROSSING = "crossing"  # below ω_b only, where all of its room is open
+    Attributes
+    ----------
+    S_MAX
+        Where it meets S_max, thus at every frequency; its room opens from ω_b on.
+    CROSSING
+        ω_b, with all of its room open.
+    """
+
+    S_MAX = "S_max"
+    CROSSING = "crossing"
 
 
 @dataclass(frozen=True)

@@ -281,7 +281,15 @@ class RowPlaces(Columns):
 
 @dataclass(frozen=True)
 class Constraints(RowPlaces):
-    """Constraints c <= 0 there: value, derivatives to κ (M, n) and τ."""
+    """Constraints c = ln(gain over bound) + margin <= 0 at M places.
+
+    Attributes
+    ----------
+    value, to_tau : array (M,)
+        c, and ∂c/∂τ.
+    to_kappa : array (M, n)
+        ∂c/∂κ.
+    """
 
     value: Array
     to_kappa: Array

@@ -21,7 +21,13 @@ from ccd_casadi.support.arrays import Array
 
 
 class ParameterKind(StrEnum):
-    """The kind of a controller's parameter, which determines its unit."""
+    """The kind of a controller's parameter, which determines its unit.
+
+    Attributes
+    ----------
+    GAIN, FREQUENCY, DAMPING
+        N/m, rad/s, and a ratio.
+    """
 
     GAIN = "gain"
     FREQUENCY = "frequency"

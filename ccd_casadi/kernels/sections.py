@@ -10,28 +10,52 @@ HALF_POWER = 0.5 * np.log(2.0)
 
 
 class LoopCurve(IntEnum):
-    """The bounded curve of a loop, and the row of its limit."""
+    """The bounded curve of a loop, and the row of its limit.
+
+    Attributes
+    ----------
+    S_MAX, S_LOW, GS
+        ‖S‖∞, |S| at ω_low and ‖GS‖∞.
+    SHAPE
+        |S| <= shape/√2 on the line through ω_i.
+    KS, T
+        Weighted: limits are the level over scale, of KS over the unit of force too.
+    CROSSING, LEVEL
+        |S| <= 1/√2 at ω_b, the end of the level; below ω_b, or below the line that ends there.
+    """
 
     S_MAX = 0
-    SHAPE = 1  # of shape/√2, on the line through ω_i
+    SHAPE = 1
     S_LOW = 2
-    KS = 3  # of the level over scale and unit of force
-    T = 4  # of the level over scale
+    KS = 3
+    T = 4
     GS = 5
-    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the level
-    LEVEL = 7  # |S| <= 1/√2 below ω_b, or below the line that ends there
+    CROSSING = 6
+    LEVEL = 7
 
 
 class Limit(IntEnum):
-    """The other rows of the limits: roots of the weights over ω₀."""
+    """The other rows of the limits.
 
-    LEAST = 8  # ω that the shape counts at least
+    Attributes
+    ----------
+    LEAST, BANDWIDTH
+        ω that the shape counts at least, and ω_i, over ω₀.
+    KS_ZERO, KS_POLE, T_ZERO, T_POLE
+        Roots of the weights over ω₀.
+    OPENS
+        1 where the room of the shape opens from ω_b on, else 0.
+    COUNT
+        The number of rows.
+    """
+
+    LEAST = 8
     KS_ZERO = 9
     KS_POLE = 10
     T_ZERO = 11
     T_POLE = 12
-    BANDWIDTH = 13  # ω_i
-    OPENS = 14  # 1 where the room of the shape opens from ω_b on, else 0
+    BANDWIDTH = 13
+    OPENS = 14
     COUNT = 15
 
 

@@ -27,7 +27,19 @@ class Code(IntEnum):
 
 
 class Column(IntEnum):
-    """Columns of a row of figures; frequencies and poles over ω₀."""
+    """Columns of a row of figures; frequencies and poles over ω₀.
+
+    Attributes
+    ----------
+    CODE
+        How the design ended, a `Code`.
+    BALANCED
+        1 where the synthesis needed balanced coordinates.
+    GAMMA_ERROR
+        Relative, what rounding and search may leave in γ_opt; infinite where unknown.
+    COUNT
+        The number of columns.
+    """
 
     CODE = 0
     GAMMA_OPT = 1
@@ -42,8 +54,8 @@ class Column(IntEnum):
     MAX_REAL_POLE = 10
     NORM = 11
     NORM_FREQUENCY = 12
-    BALANCED = 13  # 1 where the synthesis needed balanced coordinates
-    GAMMA_ERROR = 14  # relative, what rounding and search may leave in γ_opt; infinite: unknown
+    BALANCED = 13
+    GAMMA_ERROR = 14
     COUNT = 15
 
 

@@ -42,19 +42,45 @@ class RadiusOptions:
 
 @dataclass(frozen=True)
 class StepOptions:
-    """Numbers of a step: of its quadratic programmes and their merit."""
+    """Numbers of a step: of its quadratic programmes and their merit.
 
-    programmes: int = 12  # around each other, for one step
-    little: float = 1e-2  # of the gain: what one more programme has to add
-    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125)  # of the way to a programme's solution
-    settled: float = 1e-2  # of the radius: a programme that moves less is the last
-    holds: float = 1e-7  # of the penalty: multiplier of a row that holds the step
-    bends: float = 0.2  # of the sizes of a row's parts: what its unknown curvature may move it by
-    flat: float = 1e-4  # of the slopes: least curvature, which makes a linear programme definite
-    convexifying: float = 10.0  # times AᵀA of the rows that hold: changes nothing along them
-    fading: float = 0.1  # of a penalty that a larger sum of multipliers left, at each step
-    curved_penalty: float = 2.0  # over the sum of multipliers and slope, where rows are curved
-    elastic_penalty: float = 10.0  # of the programme over the merit's, where that grows
+    Attributes
+    ----------
+    programmes : int
+        Around each other, for one step.
+    little : float
+        Share of the gain that one more programme has to add.
+    shares : tuple of float
+        Of the way to a programme's solution.
+    settled : float
+        Share of the radius: a programme that moves less is the last.
+    holds : float
+        Share of the penalty: multiplier of a row that holds the step.
+    bends : float
+        Share of the sizes of a row's parts by which its unknown curvature may move it.
+    flat : float
+        Share of the slopes: least curvature, which makes a linear programme definite.
+    convexifying : float
+        Times AᵀA of the rows that hold, which changes nothing along them.
+    fading : float
+        Share of a penalty that a larger sum of multipliers left, at each step.
+    curved_penalty : float
+        Over the sum of multipliers and slope, where rows are curved.
+    elastic_penalty : float
+        Of the programme over the merit's, where that grows.
+    """
+
+    programmes: int = 12
+    little: float = 1e-2
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25, 0.125)
+    settled: float = 1e-2
+    holds: float = 1e-7
+    bends: float = 0.2
+    flat: float = 1e-4
+    convexifying: float = 10.0
+    fading: float = 0.1
+    curved_penalty: float = 2.0
+    elastic_penalty: float = 10.0
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,13 @@ Option = Callable[[argparse.ArgumentParser], object]  # adds one
 
 
 class ExitCode(IntEnum):
-    """How a command ended; `words` describes it."""
+    """How a command ended.
+
+    Attributes
+    ----------
+    words : str
+        Its description.
+    """
 
     words: str
 
