@@ -167,7 +167,7 @@ class Move:
     ----------
     time : (k,) array
         s.
-    position, acceleration : (k,) array
+    position : (k,) array
         Of the setpoint, unit of y and s.
     error : (k,) or (k, p) array
         Of the moving output, or of all.
@@ -185,7 +185,6 @@ class Move:
 
     time: Array
     position: Array
-    acceleration: Array
     error: Array
     force: Array
     feedforward: bool
@@ -371,7 +370,7 @@ def simulate(
     force = x @ closed.C_u.T + np.outer(r[0], closed.D_u[:, axis]) + r.T @ ahead
     end = r[0, -1]  # whose derivatives are zero
     rest = end - end * closed.C_y[axis] @ np.linalg.solve(np.eye(len(A)) - A, drive[:, 0])
-    return Move(time, r[0], profile.at(time)[2], error, force, forces is not None,
+    return Move(time, r[0], error, force, forces is not None,
                 profile.duration, window, rest=abs(float(rest)))  # fmt: skip
 
 

@@ -124,7 +124,7 @@ def move(
             step = over(round(following - now, 9))
             x = step[:, :n] @ x + step[:, n:] @ u_now
             now = following
-    return Move(time, wanted[0], wanted[2], error, force, forward is not None, profile.duration,
+    return Move(time, wanted[0], error, force, forward is not None, profile.duration,
                 window, saturated=clipped / count)  # fmt: skip
 
 

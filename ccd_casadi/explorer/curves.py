@@ -34,7 +34,7 @@ STEP_POINTS = 240
 STEP_PERIODS = 5.0  # of the bandwidth
 WATCHED = 2.0  # durations of the move that are shown
 NONE = np.zeros(0)
-AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, LIMITS.window)
+AT_REST = Move(NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, LIMITS.window)
 
 
 @dataclass(frozen=True)

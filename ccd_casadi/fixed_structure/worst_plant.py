@@ -182,15 +182,13 @@ def _cosines(rows: Array) -> Array:
 
 @dataclass(frozen=True)
 class Peak:
-    """A peak of one plant's loop: its curve, ln of its frequency in rad/s, its c; and the largest c
-    of that plant."""
+    """A peak of one plant's loop: its curve, ln of its frequency in rad/s, its c."""
 
     option: int
     point: Array
     curve: int
     log_omega: float
     value: float
-    largest: float
 
     def row_of(self, loops: Loops, plant: int, within: float) -> int | None:
         """The row of a plant that is this peak there: the highest `within` it in ln ω."""
@@ -260,8 +258,7 @@ def _distinct(
         key = option, curve, round(log_omega / options.near)
         many[key] += 1
         if many[key] <= options.plants_of_peak:
-            largest = float(loops.largest[plant])
-            found.append(Peak(option, point, curve, log_omega, value, largest))
+            found.append(Peak(option, point, curve, log_omega, value))
     return found
 
 
@@ -301,7 +298,7 @@ def _moved(
         else:
             continue
         if value > out[i].value:
-            out[i] = replace(out[i], point=point, log_omega=at, value=value, largest=largest)
+            out[i] = replace(out[i], point=point, log_omega=at, value=value)
     return out
 
 

@@ -9,7 +9,6 @@ the sweep, feasible or nearly so, then starts a local constrained solve with exa
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import partial
 from typing import Any
 
@@ -131,20 +130,12 @@ class InnerBounds:
         )
 
 
-class InnerStatus(StrEnum):
-    """Whether the inner problem has a certified feasible design; the value says it in words."""
-
-    SOLVED = "solved"
-    INFEASIBLE = "no certified design meets the bounds in the box of omega_S and omega_T"
-
-
 @dataclass(frozen=True)
 class InnerResult(NotebookHtml):
     """The solution of the inner problem at a θ.
 
     Attributes
     ----------
-    status : InnerStatus
     optimum : Sensitivities or None
         None if infeasible.
     active : tuple of str
@@ -157,7 +148,6 @@ class InnerResult(NotebookHtml):
         The least one, in ln of the bounds, of any certified design; zero if solved.
     """
 
-    status: InnerStatus
     optimum: Sensitivities | None
     active: tuple[str, ...]
     rows: tuple[DesignFigures, ...]
@@ -205,10 +195,9 @@ def refine(
     if best is None:
         least = min((_violation(problem, row) for row in tried if row.certified), default=np.inf)
         words = shortfall(problem, tried)
-        status = InnerStatus.INFEASIBLE
-        return InnerResult(status, None, (), tuple(tried), len(tried), words, least)
+        return InnerResult(None, (), tuple(tried), len(tried), words, least)
     active = active_constraints(problem, best.figures)
-    return InnerResult(InnerStatus.SOLVED, best, active, tuple(tried), len(tried))
+    return InnerResult(best, active, tuple(tried), len(tried))
 
 
 def evaluate(

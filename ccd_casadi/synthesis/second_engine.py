@@ -57,11 +57,6 @@ class SecondOpinion:
     norms: Mapping[str, float] = field(default_factory=dict)
     reason: str = ""
 
-    @property
-    def known(self) -> bool:
-        """Whether there is an answer to everything."""
-        return not self.reason and bool(self.norms)
-
     def contradictions(self, **claims: float) -> tuple[str, ...]:
         """What of another engine's claims this one denies: norms by name, `_` for a space.
 

@@ -137,7 +137,7 @@ def test_a_move_does_not_settle_only_where_its_error_stays(
     """What decays and was not watched for long enough has not settled within that time."""
     time = np.linspace(0.0, 0.5, 200)
     error = 2.0 * window + max(rest, 2.0 * window) * np.exp(-time)
-    made = Move(time, time, time, error, time[:, None], False, 0.2, window,
+    made = Move(time, time, error, time[:, None], False, 0.2, window,
                 rest=rest if known else np.nan)  # fmt: skip
     words = way_words("feedback alone", [made])
     assert ("does not settle" in words) == (known and rest > window)
@@ -199,7 +199,7 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
     assert shown_peak(run, found) == 3.0 * 1.75
     time = np.linspace(0.0, 8.0, 801)
     rest, error = np.zeros(801), 1e-4 * np.exp(-time)
-    move = Move(time, rest, rest, error, rest[:, None], False, 0.18, window=1e-6)
+    move = Move(time, rest, error, rest[:, None], False, 0.18, window=1e-6)
     assert shown_until(move) == pytest.approx(0.54)
     drawn = ways_figure({"one": [move]}, "")
     assert "after the figure's end 57.7 µm" in drawn.caption

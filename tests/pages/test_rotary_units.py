@@ -52,7 +52,7 @@ def test_what_holds_a_stage_on_springs_is_said_with_its_move() -> None:
     free = 10.0 * np.sin(2.0 * np.pi * time)[:, None]
 
     def words(force: np.ndarray) -> str:
-        return way_words("a", [Move(time, far, nothing, nothing, force, True, 0.5, 1e-6)])
+        return way_words("a", [Move(time, far, nothing, force, True, 0.5, 1e-6)])
 
     assert "12.5 MN hold the stage there" in words(pushed)
     assert "hold" not in words(free)
