@@ -6,17 +6,16 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import (
+from ccd_casadi.lti.frequency_grid import (
     frequency_grid,
     local_maxima,
     refine_peak,
     resonant,
-    responses_of,
     root_flanks,
-    sigma_max,
     thinned,
 )
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.state_space import responses_of, sigma_max
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import ClassicalMargins, least_margins

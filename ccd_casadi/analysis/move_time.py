@@ -24,8 +24,8 @@ from functools import cached_property
 
 import numpy as np
 
+from ccd_casadi.analysis.motor_cycle import MotionAt, MotionOptions
 from ccd_casadi.analysis.move import forward_force
-from ccd_casadi.analysis.setpoint import MotionAt, MotionOptions
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.loop import Sampling, sampled, tustin
 from ccd_casadi.lti.state_space import ClosedLoop, StateSpace, closed_loop

@@ -18,8 +18,9 @@ import numpy as np
 
 from ccd_casadi.budget.noise_process import FORCES, process
 from ccd_casadi.budget.sources import ErrorSource, SourceKind
+from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import frequency_grid, root_flanks, sensitivity
+from ccd_casadi.lti.state_space import sensitivity
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 

@@ -18,7 +18,6 @@ import numpy as np
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import read_json, sections_kappa, with_function
 from ccd_casadi.codesign.final_judgement import second_on_set
-from ccd_casadi.codesign.joint_model import with_scenarios
 from ccd_casadi.codesign.outer import Place, PolishedDesign, is_expensive
 from ccd_casadi.codesign.outer_theta import ThetaOuter, pieces_from
 from ccd_casadi.codesign.post_optimal import PostOptimal, structured_responses
@@ -33,6 +32,7 @@ from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_joint import joint_search, objectives_beside
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_structured import Costs, VerifiedStructured, costs_of
+from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.fixed_structure import SectionsDesign, SetCertificate
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess

@@ -25,7 +25,8 @@ from ccd_casadi.inner_problem.structured_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.structured_robustness import BoxCheckOptions
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.text import HZ, counted
-from ccd_casadi.synthesis.synthesis import Design, DesignFigures, compliance_words, statics
+from ccd_casadi.synthesis.statics import compliance_words, statics
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
 
 def figures_dict(figures: DesignFigures) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
 from ccd_casadi.synthesis.closed_loop import least_margins
-from ccd_casadi.synthesis.synthesis import Statics, StaticsOptions, statics
+from ccd_casadi.synthesis.statics import Statics, StaticsOptions, statics
 
 PEAK = MixedSensitivity.slack  # relative: by how much S_max may be exceeded within its range
 

@@ -21,9 +21,9 @@ from ccd_casadi.codesign.joint_model import (
     JointModelOptions,
     JointPoint,
     Proposal,
-    WorkingSet,
     proposed,
 )
+from ccd_casadi.codesign.working_set import WorkingSet
 from ccd_casadi.fixed_structure.worst_plant import WorstPlantOptions
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of

@@ -20,7 +20,8 @@ from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.robust.perturbed import SampledFigures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.text import HZ
-from ccd_casadi.synthesis.synthesis import DesignFigures, Statics
+from ccd_casadi.synthesis.statics import Statics
+from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ from ccd_casadi.robust.perturbed import sampled_compliance, sampled_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
-from ccd_casadi.synthesis.synthesis import compliance_of, statics
+from ccd_casadi.synthesis.statics import compliance_of, statics
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import missed_by
+from ccd_casadi.lti.frequency_grid import frequency_grid
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace, frequency_grid, sigma_max
+from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.gain_figures import gain_panels
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine

@@ -17,7 +17,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.structured_plant_set import structure_of, structured_of
 from ccd_casadi.inner_problem.structured_robustness import certify_corners
 from ccd_casadi.inner_problem.structured_search import prepared, with_range
-from ccd_casadi.sampling.store import Sample, hashes_of, sample_key
+from ccd_casadi.sampling.sample_keys import hashes_of, sample_key
+from ccd_casadi.sampling.store import Sample
 from ccd_casadi.sampling.units import structured_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import Tell

@@ -12,8 +12,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.certificate_responses import LoopResponses
+from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoomed
 from ccd_casadi.lti.loop import Sampling
-from ccd_casadi.lti.state_space import frequency_grid, root_flanks, zoomed
 from ccd_casadi.support.arrays import Array
 
 HALF_POWER = 1.0 / np.sqrt(2.0)  # |S| at -3 dB

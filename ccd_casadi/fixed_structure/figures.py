@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.plant_set import all_stable, closed_loops
 from ccd_casadi.kernels.loop_grid import NONE, Answers, maxima, merged, second, unseen
 from ccd_casadi.kernels.loop_point import LoopArrays, close, levels, rows
 from ccd_casadi.kernels.modes import form_slopes
-from ccd_casadi.lti.state_space import RootOptions
+from ccd_casadi.lti.frequency_grid import RootOptions
 from ccd_casadi.support.arrays import Array
 
 

@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.loop_point import LoopArrays
 from ccd_casadi.kernels.modes import responses
 from ccd_casadi.kernels.sections import HALF_POWER, Limit, LoopCurve
-from ccd_casadi.lti.state_space import root_flanks
+from ccd_casadi.lti.frequency_grid import root_flanks
 from ccd_casadi.support.arrays import Array
 
 

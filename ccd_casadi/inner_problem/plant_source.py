@@ -12,9 +12,10 @@ from importlib.machinery import PathFinder, SourceFileLoader
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.analysis.move import with_motion
-from ccd_casadi.analysis.setpoint import Motion
-from ccd_casadi.plants.differenced import fixed_model, user_plant, with_fixed
+from ccd_casadi.analysis.driven_plant import with_motion
+from ccd_casadi.analysis.motor_cycle import Motion
+from ccd_casadi.plants.differenced import user_plant
+from ccd_casadi.plants.fixed_parameters import fixed_model, with_fixed
 from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import model_named

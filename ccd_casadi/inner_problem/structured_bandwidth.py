@@ -6,9 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.analysis.move import DrivenMechanics, simulate
+from ccd_casadi.analysis.driven_plant import DrivenMechanics
+from ccd_casadi.analysis.motor_cycle import MotionAt
+from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_time import MoveTime
-from ccd_casadi.analysis.setpoint import MotionAt
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import SectionsDesign, Structure
 from ccd_casadi.fixed_structure.channel_design import synthesise_sections

@@ -7,16 +7,14 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import expm
 
+from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks, zoomed
 from ccd_casadi.lti.state_space import (
     ClosedLoop,
     StateSpace,
     closed_loop,
-    frequency_grid,
-    root_flanks,
     sensitivity,
     sigma_max,
     strictly_proper,
-    zoomed,
 )
 from ccd_casadi.support.arrays import Array
 

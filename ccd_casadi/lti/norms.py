@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigvals, solve
 
+from ccd_casadi.lti.frequency_grid import root_flanks
 from ccd_casadi.lti.loop import in_w
-from ccd_casadi.lti.state_space import StateSpace, balanced, root_flanks
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 
 

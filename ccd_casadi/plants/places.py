@@ -16,7 +16,7 @@ import scipy
 
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE, ModeShape, ModeShapes
-from ccd_casadi.plants.differenced import reparametrised
+from ccd_casadi.plants.fixed_parameters import reparametrised
 from ccd_casadi.plants.nodes import (
     NodeInterpolation,
     Position,

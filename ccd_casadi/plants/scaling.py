@@ -7,13 +7,8 @@ import numpy as np
 import scipy
 
 from ccd_casadi.kernels.gamma import plant_gain
-from ccd_casadi.lti.state_space import (
-    StateSpace,
-    balanced,
-    frequency_grid,
-    root_flanks,
-    strictly_proper,
-)
+from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
+from ccd_casadi.lti.state_space import StateSpace, balanced, strictly_proper
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError

@@ -21,8 +21,9 @@ from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
+from ccd_casadi.lti.frequency_grid import frequency_grid
 from ccd_casadi.lti.loop import Loop, Sampling
-from ccd_casadi.lti.state_space import frequency_grid, sensitivity, sigma_max
+from ccd_casadi.lti.state_space import sensitivity, sigma_max
 from ccd_casadi.reporting.facts import paragraph, paragraphs, run_name, theta_words
 from ccd_casadi.reporting.gain_figures import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks

@@ -12,8 +12,9 @@ from ccd_casadi.codesign.verified_structured import VerifiedStructured
 from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.fixed_structure.between_lines import between
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
-from ccd_casadi.fixed_structure.measured_loop import between, controller_response
+from ccd_casadi.fixed_structure.measured_loop import controller_response
 from ccd_casadi.inner_problem.controller_problem import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import SectionWords

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from ccd_casadi.budget.evaluation import Lyapunov
 from ccd_casadi.budget.noise_process import process
 from ccd_casadi.budget.sources import ErrorSource, ShapedSpectrum, SourceKind
+from ccd_casadi.lti.frequency_grid import refine_peak
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import (
     ClosedLoop,
     equivalent_open_loop,
-    refine_peak,
     responses_of,
     sensitivity,
     sigma_max,

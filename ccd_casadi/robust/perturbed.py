@@ -22,9 +22,10 @@ from ccd_casadi.codesign.survival import (
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import free_modal, plant_of
 from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
+from ccd_casadi.lti.frequency_grid import frequency_grid, root_flanks
 from ccd_casadi.lti.loop import Loop, in_w
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, frequency_grid, root_flanks, sigma_max
+from ccd_casadi.lti.state_space import StateSpace, sigma_max
 from ccd_casadi.plants.modal import ModalPlant, Perturbation
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.lti.state_space import StateSpace, closed_loop, resonant
+from ccd_casadi.lti.frequency_grid import resonant
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

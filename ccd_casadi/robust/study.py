@@ -41,7 +41,7 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.terminal import kept_quiet
 from ccd_casadi.support.text import HZ
 from ccd_casadi.support.worker_process import one_blas_thread
-from ccd_casadi.synthesis.synthesis import Statics, statics
+from ccd_casadi.synthesis.statics import Statics, statics
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,8 @@ from ccd_casadi.sampling.inner_samples import (
     quantity_sample,
     sample_of,
 )
-from ccd_casadi.sampling.store import (
-    Sample,
-    SampleStore,
-    best_key,
-    hashes_of,
-    problem_hash,
-    sample_key,
-)
+from ccd_casadi.sampling.sample_keys import best_key, hashes_of, problem_hash, sample_key
+from ccd_casadi.sampling.store import Sample, SampleStore
 from ccd_casadi.sampling.units import (
     design_unit,
     from_controller,

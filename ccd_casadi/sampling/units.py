@@ -17,7 +17,8 @@ from ccd_casadi.inner_problem.structured_problem import StructuredProblem
 from ccd_casadi.inner_problem.structured_search import with_warm_start
 from ccd_casadi.inner_problem.sweep import InnerBounds, InnerResult
 from ccd_casadi.sampling.inner_samples import InnerSample, sample_of
-from ccd_casadi.sampling.store import Sample, sample_key
+from ccd_casadi.sampling.sample_keys import sample_key
+from ccd_casadi.sampling.store import Sample
 from ccd_casadi.support.process_pool import Pool
 
 

@@ -7,14 +7,9 @@ from typing import Any
 import numpy as np
 import scipy
 
+from ccd_casadi.lti.frequency_grid import RootOptions, frequency_grid, root_flanks
 from ccd_casadi.lti.loop import delay_parts, delayed, sampled
-from ccd_casadi.lti.state_space import (
-    RootOptions,
-    StateSpace,
-    balanced,
-    frequency_grid,
-    root_flanks,
-)
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.measured import MeasuredResponse, from_control, read_frequency_response
 from ccd_casadi.plants.response_table import holds_lines
 from ccd_casadi.support.errors import UserError

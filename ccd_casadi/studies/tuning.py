@@ -20,17 +20,10 @@ from ccd_casadi.fixed_structure.measured_design import NEGATIVE, MeasuredDesign,
 from ccd_casadi.fixed_structure.measured_loop import bandwidth_within
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.kernels.sections import HALF_POWER
+from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, root_flanks, zoomed
 from ccd_casadi.lti.loop import Sampling, tustin
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import (
-    StateSpace,
-    closed_loop,
-    frequency_grid,
-    local_maxima,
-    root_flanks,
-    sigma_max,
-    zoomed,
-)
+from ccd_casadi.lti.state_space import StateSpace, closed_loop, sigma_max
 from ccd_casadi.plants.measured import MeasuredResponse
 from ccd_casadi.studies.tuned_plants import (
     LineOptions,

@@ -11,7 +11,6 @@ import numpy as np
 from scipy.special import ndtr
 
 from ccd_casadi.cases.case import Case
-from ccd_casadi.codesign.joint_model import with_scenarios
 from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import (
     NonlinearProgram,
@@ -22,6 +21,7 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.stored_searches import multistart_at, value_with_design
 from ccd_casadi.codesign.verdict import State
+from ccd_casadi.codesign.working_set import with_scenarios
 from ccd_casadi.inner_problem.objective import (
     ConstraintOptions,
     constraint_sizes,

@@ -9,21 +9,15 @@ from ccd_casadi.kernels.certified_design import design, failed_row
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gradients import LoopAt, MadeFor, figure_gradients, peak_gradients
 from ccd_casadi.kernels.sensitivity import Code, Column, sensitivity_gain, sensitivity_gains
-from ccd_casadi.lti.state_space import (
-    StateSpace,
-    closed_loop,
-    frequency_grid,
-    local_maxima,
-    refine_peak,
-    root_flanks,
-)
+from ccd_casadi.lti.frequency_grid import frequency_grid, local_maxima, refine_peak, root_flanks
+from ccd_casadi.lti.state_space import StateSpace, closed_loop
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.terminal import NotebookHtml
+from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.synthesis import (
     DesignFigures,
     Outcome,
-    compliance_over_family,
     figures_from_row,
     judged_on,
     over_family,

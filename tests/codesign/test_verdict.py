@@ -41,7 +41,8 @@ from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting import run_verdict as shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import local_peaks_with_gradients
-from ccd_casadi.synthesis.synthesis import Statics, synthesise
+from ccd_casadi.synthesis.statics import Statics
+from ccd_casadi.synthesis.synthesis import synthesise
 
 ROOT = Path(__file__).parents[2]
 KKT_LEVEL = VerifiedDesign.kkt_level

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.joint_model import WorkingSetOptions, holding
+from ccd_casadi.codesign.working_set import WorkingSetOptions, holding
 
 EQUAL, NEAR = WorkingSetOptions().equal, WorkingSetOptions().near
 ROW = st.tuples(st.integers(0, 7), st.integers(0, 2), st.floats(-1.0, 1.0), st.floats(-NEAR, NEAR))

@@ -23,7 +23,7 @@ from ccd_casadi.robust.perturbed import sampled_compliance, sampled_figures
 from ccd_casadi.robustness import main as robustness
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.text import HZ
-from ccd_casadi.synthesis.synthesis import compliance_of
+from ccd_casadi.synthesis.statics import compliance_of
 
 RUNS = Path(__file__).parents[2] / "runs"
 ONE_WAY = Timing(lead=True)

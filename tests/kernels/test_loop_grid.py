@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ccd_casadi.kernels.loop_grid import maxima, merged, unseen
-from ccd_casadi.lti.state_space import RootOptions, root_flanks
+from ccd_casadi.lti.frequency_grid import RootOptions, root_flanks
 
 APART = 1e-8
 

@@ -20,10 +20,10 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import eigh, expm
 
+from ccd_casadi.analysis.motor_cycle import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import MoveLimits
 from ccd_casadi.analysis.move_time import MoveTime
-from ccd_casadi.analysis.setpoint import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of

@@ -12,7 +12,7 @@ from ccd_casadi.deployment.given_controller import read_controller, with_control
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.text import HZ
-from ccd_casadi.synthesis.synthesis import Statics, statics
+from ccd_casadi.synthesis.statics import Statics, statics
 
 TABLE = """
 gain = 3.0e5

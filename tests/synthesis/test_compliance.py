@@ -17,7 +17,8 @@ from ccd_casadi.inner_problem.kinds import bandwidth_gradient
 from ccd_casadi.inner_problem.objective import TrueQuantities
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design, true_inner
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.synthesis.synthesis import compliance_of, compliance_words, synthesise
+from ccd_casadi.synthesis.statics import compliance_of, compliance_words
+from ccd_casadi.synthesis.synthesis import synthesise
 
 THETA = (60.0, 62.0)
 POINT = (800.0 * HZ, 40.0 * HZ)

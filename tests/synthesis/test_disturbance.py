@@ -27,7 +27,8 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.studies.backends import balance, mixed_sensitivity
 from ccd_casadi.synthesis.derivatives import sensitivities
-from ccd_casadi.synthesis.synthesis import Design, statics, synthesise
+from ccd_casadi.synthesis.statics import statics
+from ccd_casadi.synthesis.synthesis import Design, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 seeds = st.integers(0, 10**6)

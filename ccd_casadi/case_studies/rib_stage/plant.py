@@ -14,8 +14,9 @@ from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
 from ccd_casadi.case_studies.rib_stage.truncation import FORTY_FOUR, TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
-from ccd_casadi.plants.differenced import remembered, with_fixed
+from ccd_casadi.plants.differenced import remembered
 from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.fixed_parameters import with_fixed
 from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 

@@ -13,7 +13,8 @@ from ccd_casadi.drawing.svg import ModeShapes
 from ccd_casadi.plants.cad.elastic_body import Body, Material, mode_shapes, reduced, surface
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
-from ccd_casadi.plants.differenced import remembered, with_fixed
+from ccd_casadi.plants.differenced import remembered
+from ccd_casadi.plants.fixed_parameters import with_fixed
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback

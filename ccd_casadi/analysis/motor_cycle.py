@@ -1,0 +1,234 @@
+"""A motor and the move that it allows: setpoint, forces and heat of one cycle."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy
+
+from ccd_casadi.analysis.move_limits import MoveLimits
+from ccd_casadi.analysis.setpoint import Setpoint, feedforward_slopes, setpoint
+from ccd_casadi.lti.loop import Sampling
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """Numbers of a motion and its derivatives.
+
+    Attributes
+    ----------
+    complex_step : float
+        Along the imaginary axis: derivatives of analytic functions, exact to rounding.
+    spring : float
+        Of the moving force: a plant that holds its output by more has a spring.
+    """
+
+    complex_step: float = 1e-30
+    spring: float = 1e-6
+
+
+@dataclass(frozen=True)
+class Motor:
+    """One motor, or a catalogue in rising order of the moving mass.
+
+    Attributes
+    ----------
+    force_constant, resistance, peak_current, moving_mass : tuple of float
+        N/A, ohm, A and kg of each; the mass is added to the plant at every input: M + mass b bᵀ.
+    rms_power : float or None
+        Of all motors together, W; None: any.
+    size : str
+        Names the parameter of θ that is the moving mass.
+    unlimited : float
+        A peak current that does not limit, A.
+    """
+
+    unlimited: ClassVar[float] = 1e12
+
+    force_constant: tuple[float, ...]
+    resistance: tuple[float, ...]
+    peak_current: tuple[float, ...] = (unlimited,)
+    moving_mass: tuple[float, ...] = (0.0,)
+    rms_power: float | None = None
+    size: str = ""
+
+    def at(self, mass: Any) -> tuple[Any, Any, Any]:
+        """k_f, R and the peak current of the motor with this moving mass."""
+        own, columns = self.moving_mass, (self.force_constant, self.resistance, self.peak_current)
+        if len(own) == 1:
+            longer = mass / own[0] if self.size else 1.0
+            return columns[0][0] * longer, columns[1][0] * longer, columns[2][0]
+        i = int(np.clip(np.searchsorted(own, np.real(mass)) - 1, 0, len(own) - 2))
+        share = (mass - own[i]) / (own[i + 1] - own[i])
+        k, R, i_peak = ((1.0 - share) * row[i] + share * row[i + 1] for row in columns)
+        return k, R, i_peak
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A move of the first output and its motor.
+
+    Attributes
+    ----------
+    limits : MoveLimits
+        SI; an infinite acceleration is what the motor allows.
+    window : float
+        In which the move has settled, m.
+    dwell : float
+        From its end to the next, s.
+    motor : Motor or None
+        None: it does not limit.
+    """
+
+    limits: MoveLimits
+    window: float
+    dwell: float = 0.0
+    motor: Motor | None = None
+
+    @property
+    def required(self) -> bool:
+        """Whether the acceleration is given."""
+        return bool(np.isfinite(self.limits.acceleration))
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """The setpoint, the largest and the RMS force of any motor, the heat of all.
+
+    `peak_share` and `heat_share` of what the motor allows; `limits` of the move in words.
+    """
+
+    profile: Setpoint
+    peak_force: Any
+    rms_force: Any
+    power: Any = 0.0
+    peak_share: Any = 0.0
+    heat_share: Any = 0.0
+    limits: tuple[str, ...] = ()
+
+
+def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
+    """The cycle of a motion within what its motor allows.
+
+    Parameters
+    ----------
+    motion : Motion
+        With its limits.
+    forces : (m,) array
+        g per unit acceleration, kg.
+    mass : float
+        Moving mass of the motor, kg; complex for derivatives.
+
+    Returns
+    -------
+    Cycle
+        With the largest acceleration.
+    """
+    allowed, motor = motion.limits, motion.motor
+    acceleration, why = allowed.acceleration, "acceleration"
+    if motor is not None and not motion.required:
+        k, _, i_peak = motor.at(mass)
+        acceleration, why = k * i_peak / _largest(forces), "peak force"
+        if np.real(_cycle(motion, acceleration, forces, mass).heat_share) > 1.0:
+            acceleration, why = _heated(motion, np.real(acceleration), forces, mass), "heat"
+    found = _cycle(motion, acceleration, forces, mass)
+    reached = (
+        ("velocity", found.profile.velocity, allowed.velocity),
+        (why, found.profile.acceleration, acceleration),
+        ("jerk", found.profile.jerk, allowed.jerk),
+    )
+    limits = tuple(name for name, value, most in reached if np.real(value / most) > 1.0 - 1e-9)
+    return replace(found, limits=limits)
+
+
+def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle:
+    """With this acceleration at most."""
+    profile, motor = setpoint(replace(motion.limits, acceleration=acceleration)), motion.motor
+    mean = profile.squared_acceleration / (profile.durations.sum() + motion.dwell)
+    largest = _largest(forces)
+    found = Cycle(profile, largest * profile.acceleration, largest * mean**0.5)
+    if motor is None:
+        return found
+    k, R, i_peak = motor.at(mass)
+    power = R / k**2 * (forces**2).sum() * mean
+    heat_share = power / (motor.rms_power or np.inf)
+    return replace(found, power=power, peak_share=found.peak_force / (k * i_peak),
+                   heat_share=heat_share)  # fmt: skip
+
+
+def _largest(forces: Array) -> Any:
+    """The largest of their sizes."""
+    found = max(forces, key=lambda force: abs(np.real(force)))
+    return found if np.real(found) > 0.0 else -found
+
+
+def _heated(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
+    """The acceleration below `most` with which the heat is all that is allowed.
+
+    Newton's last step, at the root, gives its derivatives too.
+    """
+
+    def share(acceleration: Any) -> Any:
+        return _cycle(motion, acceleration, np.real(forces), np.real(mass)).heat_share
+
+    low = most  # far below it durations are so long that rounding fills them
+    while np.real(share(low)) > 1.0:
+        low *= 0.1
+    a = float(scipy.optimize.brentq(lambda a: np.real(share(a)) - 1.0, low, most, xtol=1e-14 * low))
+    step = MotionOptions().complex_step
+    slope = np.imag(share(a + 1j * step)) / step
+    return a - (_cycle(motion, a, forces, mass).heat_share - 1.0) / slope
+
+
+@dataclass(frozen=True)
+class MotionAt:
+    """A move of a plant at one θ.
+
+    Attributes
+    ----------
+    motion, mass : Motion, float
+        What moves, and the moving mass of its motor, kg.
+    cycle, stepped : Cycle, tuple of Cycle
+        Its cycle, and those with each parameter a step along the imaginary axis away.
+    forward, forward_slopes : (5, m), (n_θ, 5, m) array
+        Feedforward per derivative of the setpoint, and its derivatives to θ.
+    """
+
+    motion: Motion
+    mass: float
+    cycle: Cycle
+    stepped: tuple[Cycle, ...]
+    forward: Array
+    forward_slopes: Array
+
+    def slopes(self, read: Callable[[Cycle], Any]) -> Array:
+        """Derivatives (n,) of a figure of the cycle."""
+        return np.array(
+            [np.imag(read(item)) / MotionOptions().complex_step for item in self.stepped], float
+        )
+
+
+def motion_at(
+    motion: Motion, free: ScaledPlant, mass: float, place: int | None, sampling: Sampling | None,
+    options: MotionOptions = MotionOptions(),
+) -> MotionAt:  # fmt: skip
+    """Of a plant with its rigid bodies free, square; `mass` of the motor is parameter `place` of θ.
+
+    Raises UserError where a spring holds the output.
+    """
+    hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
+    F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
+    ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
+    found = cycle_of(motion, ahead[2], mass)
+    if np.abs(ahead[0]).max() * motion.limits.stroke > options.spring * found.peak_force:
+        raise UserError("move: a spring holds the output that moves, and its force is not counted")
+    step = 1j * options.complex_step
+    stepped = tuple(
+        cycle_of(motion, ahead[2] + step * slope[2], mass + step * (i == place))
+        for i, slope in enumerate(slopes)
+    )
+    return MotionAt(motion, mass, found, stepped, ahead, slopes)
