@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import expm, matrix_balance
+from scipy.linalg import matrix_balance
 
 from ccd_casadi.fixed_structure.bounds import (
     Bounds,
@@ -34,10 +34,16 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     peaks,
     with_crossings,
 )
+from ccd_casadi.fixed_structure.certificate_loops import (
+    as_run,
+    balanced_system,
+    error_response,
+    sampled,
+)
 from ccd_casadi.fixed_structure.certificate_responses import LoopResponses, norms
-from ccd_casadi.lti.loop import Sampling, delayed
+from ccd_casadi.lti.loop import Sampling
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.state_space import StateSpace, balanced, weighted
+from ccd_casadi.lti.state_space import StateSpace, weighted
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, results
 from ccd_casadi.support.text import HZ, counted
@@ -201,14 +207,14 @@ def judged(
     options: JudgeOptions = JudgeOptions(),
 ) -> list[PlantFigures]:
     """The figures of every plant's loop; the plants have matrices of one size."""
-    free = [_balanced(plant) for plant in plants]
-    K = _balanced(controller)
+    free = [balanced_system(plant) for plant in plants]
+    K = balanced_system(controller)
     G, held = free, K
     if sampling is not None:
         G, held = [sampled(one, sampling) for one in free], as_run(K, sampling)
     if plants[0].period:  # what acts on it between its instants is not known
         free = G
-    loops = [_sensitivity(one, held) for one in G]
+    loops = [error_response(one, held) for one in G]
     poles = [np.linalg.eigvals(S.A) for S in loops]
     grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
     found = [PlantFigures(False, one) for one in grown]
@@ -355,65 +361,6 @@ def _rows(
     names = ("S_peak", "S_peak_frequency", "bandwidth", "weighted_KS")
     found = [ChannelFigures(bounds.name, **dict(zip(names, row, strict=True))) for row in columns]
     return found, confirmed
-
-
-def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:
-    """S, r to e, of a plant without feedthrough; the judge's own, beside `lti.closed_loop`."""
-    A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-    B = np.vstack([G.B @ K.D, K.B])
-    C = np.hstack([-G.C, np.zeros((len(G.C), len(K.A)))])
-    return StateSpace(A, B, C, np.eye(len(G.C)))
-
-
-def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
-    """u_k to y_k with the delay as whole periods and a rest, in which the older force still acts.
-
-    The judge's own, beside `lti.hold`.
-
-    ẋ = A x + B u with u held is integrated over both parts of a period by one exponential of
-    [[A, B, 0], [0, 0, 1/T], [0, 0, 0]]-like blocks each.
-    """
-    T, (n, m) = sampling.period, G.B.shape
-    whole = int(np.floor(sampling.delay / T + 1e-9))
-    rest = max(sampling.delay - whole * T, 0.0)
-    if G.period:
-        return delayed(G.A, [0.0 * G.B] * whole + [G.B], G.C, G.period)
-    held = np.zeros((n + m, n + m))
-    held[:n, :n], held[:n, n:] = G.A, G.B
-    first, second = expm(held * rest), expm(held * (T - rest))
-    age = m * (whole + 1)  # u_{k-1} … of these periods are kept
-    A, B = np.zeros((n + age, n + age)), np.zeros((n + age, m))
-    A[:n, :n] = second[:n, :n] @ first[:n, :n]
-    A[:n, n + m * whole : n + m * (whole + 1)] = second[:n, :n] @ first[:n, n:]
-    if whole:
-        A[:n, n + m * (whole - 1) : n + m * whole] += second[:n, n:]
-    else:
-        B[:n] = second[:n, n:]
-    B[n : n + m] = np.eye(m)
-    A[n + m :, n : n + age - m] = np.eye(age - m)
-    return StateSpace(A, B, np.hstack([G.C, np.zeros((len(G.C), age))]), np.zeros((len(G.C), m)))
-
-
-def as_run(K: StateSpace, sampling: Sampling) -> StateSpace:
-    """K(z) with s = (2/T)(z - 1)/(z + 1); in discrete time it runs as it is."""
-    if K.period:
-        return K
-    one, half = np.eye(len(K.A)), 0.5 * sampling.period
-    inverse = np.linalg.inv(one - half * K.A)
-    C, D = K.C @ inverse, K.D + half * K.C @ inverse @ K.B
-    A, B = inverse @ (one + half * K.A), sampling.period * inverse @ K.B
-    return StateSpace(A, B, C, D, period=sampling.period)
-
-
-def holds(G: StateSpace, K: StateSpace, sampling: Sampling) -> bool:
-    """Whether a controller in discrete time makes the loop stable, by its eigenvalues."""
-    loop = _sensitivity(sampled(_balanced(G), sampling), _balanced(K))
-    return bool(np.abs(np.linalg.eigvals(matrix_balance(loop.A)[0])).max() < 1.0)
-
-
-def _balanced(system: StateSpace) -> StateSpace:
-    A, B, C = balanced(system.A, system.B, system.C)
-    return replace(system, A=A, B=B, C=C)
 
 
 def _size(system: StateSpace) -> float:

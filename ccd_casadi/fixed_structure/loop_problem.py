@@ -171,7 +171,7 @@ class LoopProblem:
 
     @cached_property
     def limits(self) -> Array:
-        """What gains are held against but for ω_b, (Limit.COUNT, numbers); see `kernels.limits`."""
+        """What gains are held against but for ω_b, (Limit.COUNT, numbers); see `sections.Limit`."""
         b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
         found = np.zeros((Limit.COUNT, self.first + len(b.channels)))
         found[: len(LoopCurve)] = np.inf
