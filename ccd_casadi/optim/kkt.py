@@ -404,13 +404,13 @@ def non_negative(rows: Array, goal: Array) -> tuple[Array, float]:
 
 
 def active_set(
-    z: Array, here: FirstOrder, variables: Sequence[str], *, active: float = KktOptions.active
+    z: Array, first: FirstOrder, variables: Sequence[str], *, active: float = KktOptions.active
 ) -> ActiveSet:
     """Collect the active constraints and bounds at a point of the unit box.
 
     Parameters
     ----------
-    z, here : array (n,), FirstOrder
+    z, first : array (n,), FirstOrder
         The point, and its first derivatives.
     variables : sequence of str (n,)
         Names of the components of z, by which their bounds are labelled.
@@ -421,9 +421,9 @@ def active_set(
     -------
     ActiveSet
     """
-    chosen = np.flatnonzero(here.g >= -active)
-    rows, slack, sizes = ([*each[chosen]] for each in (here.jacobian, here.g, here.sizes))
-    labels, count = [here.names[i] for i in chosen], len(chosen)
+    chosen = np.flatnonzero(first.g >= -active)
+    rows, slack, sizes = ([*each[chosen]] for each in (first.jacobian, first.g, first.sizes))
+    labels, count = [first.names[i] for i in chosen], len(chosen)
     for i, name in enumerate(variables):
         for end, value, sign in (("lower", -z[i], -1.0), ("upper", z[i] - 1.0, 1.0)):
             if value >= -active:
@@ -431,10 +431,10 @@ def active_set(
                 labels.append(f"{name} {end}")
                 slack.append(value)
                 sizes.append(1.0)
-    violation = max(0.0, float((-z).max()), float((z - 1.0).max()), *here.g)
+    violation = max(0.0, float((-z).max()), float((z - 1.0).max()), *first.g)
     A = np.array(rows).reshape(-1, z.size)
     return ActiveSet(
-        here.gradient, A, np.array(slack), np.array(sizes), tuple(labels), count, violation
+        first.gradient, A, np.array(slack), np.array(sizes), tuple(labels), count, violation
     )
 
 
@@ -485,10 +485,10 @@ def hessian_products(
         None where a gradient is missing, or clipping leaves points closer than h/2.
     """
     points = np.clip(z + step * np.concatenate([directions.T, -directions.T]), 0.0, 1.0)
-    found = [gradient for gradient in gradients(points) if gradient is not None]
+    values = [gradient for gradient in gradients(points) if gradient is not None]
     forward, backward = np.split(points, 2)
     distance = np.linalg.norm(forward - backward, axis=1)
-    if len(found) < len(points) or (distance < 0.5 * step).any():
+    if len(values) < len(points) or (distance < 0.5 * step).any():
         return None
-    at_forward, at_backward = np.split(np.array(found), 2)
+    at_forward, at_backward = np.split(np.array(values), 2)
     return np.asarray(((at_forward - at_backward) / distance[:, None]).T)

@@ -1,7 +1,7 @@
 """Margins and norms of a loop, and the RMS of its signals under white noise.
 
-Of a plant G (p outputs, m inputs) and a controller K: S = (1 + GK)⁻¹, T = 1 - S. Frequencies ω are
-in rad/s, and in Hz where a name says so.
+Of a plant G (p outputs, m inputs) and a controller K: S = (1 + GK)⁻¹, T = 1 - S. Frequencies are
+in rad/s unless a name is or ends in `hz`.
 """
 
 import math

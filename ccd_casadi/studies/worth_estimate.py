@@ -2,7 +2,7 @@
 
 Sequential: the hardware of least cost f(θ) whose first resonance meets a rule of thumb, then its
 best controller. Co-design is estimated by Bayesian optimisation of J = w₁ f(θ) + w₂ ω_b*(θ) with
-few true inner problems. Frequencies are in rad/s, and in Hz or % where a name says so.
+few true inner problems. Frequencies are in rad/s unless a name ends in _hz.
 """
 
 from collections.abc import Mapping
@@ -305,10 +305,10 @@ def worth(
         settled = ahead.delta <= tolerance * ahead.best.bandwidth
         if settled or not rounds_left:
             ends = {end.theta: end for end in (samples[0], ahead.best) if end.kappa}
-            found = {at: multistart_at(sampler, ends[at]) for at in ends if at not in searched}
-            better = [at for at in found if found[at].feasible and found[at].value > ends[at].value]
+            new = {at: multistart_at(sampler, ends[at]) for at in ends if at not in searched}
+            better = [at for at in new if new[at].feasible and new[at].value > ends[at].value]
             for at in better:
-                sampler.value_from(at, found[at].design.kappa.tolist())
+                sampler.value_from(at, new[at].design.kappa.tolist())
             if not (better and rounds_left):
                 if error := search_error(sampler, ahead.best):
                     ahead = outlook(

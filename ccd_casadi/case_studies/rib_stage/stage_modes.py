@@ -247,7 +247,7 @@ def slopes(
 ) -> tuple[Array, Array]:
     """Derivatives to θ of the k = `keep` lowest modes and of their displacements Fᵀφ.
 
-    With M-orthonormal modes, and X⁺ the inverse on the M-complement of the modes at λ_i,
+    With M-orthonormal modes, and (K - λ_i M)⁺ the inverse on the M-complement of the modes at λ_i,
 
         λ_i' = φ_iᵀ(K' - λ_i M')φ_i,
         φ_i' = -½ φ_i φ_iᵀM'φ_i - (K - λ_i M)⁺ (K' - λ_i M') φ_i.
