@@ -2,7 +2,8 @@
 
 `outer_search` calls it in this order: `prepared`, `solve_formulation` (surrogates, or local solves
 on the truth), `polished` (a local solve, then a wider search for a better controller at its θ),
-`extended` where plants exceed a bound at the design, `verified`. A kind of inner problem implements it.
+`extended` where plants exceed a bound at the design, `verified`. Each kind of inner problem
+implements it.
 
 *The truth* is the inner problem itself, in contrast to its surrogate. Lengths in x are shares of
 the box of its bounds.
