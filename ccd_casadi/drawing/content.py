@@ -416,7 +416,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class VerdictLine:
-    """One line of a run's verdict.
+    """A line of a run's verdict.
 
     Attributes
     ----------

@@ -16,28 +16,55 @@ HALF_POWER = 0.5 * np.log(2.0)  # ln √2
 
 
 class LoopCurve(IntEnum):
-    """A bounded curve of a loop, and the row of `limits` with ln of its bound."""
+    """A bounded curve of a loop, and the row of `limits` with ln of its bound.
 
-    S_MAX = 0  # peak of |S|
-    SHAPE = 1  # |S| <= shape x/√2, x = ω/ω_i: the row is ln(shape/√2)
-    S_LOW = 2  # |S| at ω_low
-    KS = 3  # |W_KS KS| <= level: over gain and unit of force of the weight
-    T = 4  # |W_T T| <= level: over the gain of the weight
-    GS = 5  # compliance
-    CROSSING = 6  # |S(jω_b)| <= 1/√2
-    LEVEL = 7  # |S| <= 1/√2 below ω_b; where the shape opens, |S| <= x/√2
+    Attributes
+    ----------
+    S_MAX, S_LOW, GS
+        Peak of |S|, |S| at ω_low, and peak of |GS|.
+    SHAPE
+        |S| <= shape x/√2, x = ω/ω_i; the row is ln(shape/√2).
+    KS, T
+        |W_KS KS| and |W_T T| <= level; the row is ln of the level over the gain of the weight, of
+        KS also over the unit of force.
+    CROSSING, LEVEL
+        |S| <= 1/√2 at ω_b, and at all ω below it; where the shape opens, LEVEL is |S| <= x/√2.
+    """
+
+    S_MAX = 0
+    SHAPE = 1
+    S_LOW = 2
+    KS = 3
+    T = 4
+    GS = 5
+    CROSSING = 6
+    LEVEL = 7
 
 
 class Limit(IntEnum):
-    """The other rows of `limits`: frequencies over ω₀, and how the shape begins."""
+    """The other rows of `limits`: frequencies over ω₀, and how the shape begins.
 
-    LEAST = 8  # the shape is constant below it: x >= least/ω_i
-    KS_ZERO = 9  # of the weights (s + zero)/(s + pole)
+    Attributes
+    ----------
+    LEAST
+        The shape is constant below this frequency.
+    BANDWIDTH
+        ω_i, the bandwidth of this channel.
+    KS_ZERO, KS_POLE, T_ZERO, T_POLE
+        Of the weights (s + zero)/(s + pole).
+    OPENS
+        1 where the factor of x grows from 1 at ω_i to `shape`, 0 where it is `shape` throughout.
+    COUNT
+        The number of rows.
+    """
+
+    LEAST = 8
+    KS_ZERO = 9
     KS_POLE = 10
     T_ZERO = 11
     T_POLE = 12
-    BANDWIDTH = 13  # ω_i: ω_b of this channel
-    OPENS = 14  # 1 where the shape's factor grows from 1 at ω_b, 0 where it is `shape` throughout
+    BANDWIDTH = 13
+    OPENS = 14
     COUNT = 15
 
 
